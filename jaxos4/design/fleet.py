@@ -1,6 +1,5 @@
 """Vehicles in closed loop that fly references through gusts, and what filter error can learn from their flights."""
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -90,8 +89,6 @@ def fly_batch(loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt
 class Fleet(eqx.Module):
     """A vehicle in gusts, and vehicles with moments of inertia that are drawn from a bracket, and gusts of their own.
 
-    Parameters and noise are estimated together: a controller answers gusts, so their errors are correlated.
-
     - `loop`: the vehicle of the airframe. `loops`: the drawn ones, as a batch. All have the controller of the airframe.
       Some fly in still air. Only they show velocity and distance.
     - `model`, `parameters`: of the filters, which know the true parameters, gusts and noise of `loop`.
@@ -155,8 +152,8 @@ class Fleet(eqx.Module):
     ) -> tuple[Float[Array, "flights n n"], Float[Array, "flights channels parameters parameters"]]:
         """The Fisher information of each flight's innovations. All that the design knows of filter error is here.
 
-        **Returns:** the information about all unknowns: the parameters, then the noise of each channel, with its weak
-        prior; and the information of each channel about the parameters.
+        **Returns:** the information about the parameters and then the noise of each channel, with its weak prior; and
+        that of each channel about the parameters. A controller answers gusts, so the errors of both are correlated.
         """
         loop, count = self.loop, self.parameters.shape[0]
         strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), _LEAST)
@@ -189,25 +186,23 @@ class Fleet(eqx.Module):
 
         Raises `InputError` for a limit that is not positive, or if a vehicle turns over or cannot hover.
         """
-        airframe = self.loop.airframe
-        hover, fastest = float(airframe.hover_speed), float(airframe.max_rotor_speed)
-        slowest, fastest = _SLOWEST * hover, fastest if math.isfinite(fastest) else _FASTEST * hover
+        airframe, hover = self.loop.airframe, float(self.loop.airframe.hover_speed)
+        slowest = _SLOWEST * hover
+        fastest = float(airframe.max_rotor_speed) if airframe.has_full_scale else _FASTEST * hover
         rotors = {"slowest": slowest, "fastest": fastest, "slew": (fastest - slowest) / self.dt}
         unknown = Envelope(**rotors, **dict.fromkeys(("angle", "rate", "velocity", "distance"), 1.0))
         hover_squares(airframe, unknown.limited(limits))
         flights = self._fly(references), self._fly(0 * references)
         if not all(np.isfinite(states).all() for _, states, _ in flights):
-            raise InputError(
-                "some of the vehicles turn over in 3-2-1-1 references; give weaker gusts or a smaller `angle`, or "
-                "narrow the `bracket`."
-            )
+            remedy = "give weaker gusts or a smaller `angle`, or narrow the `bracket`"
+            raise InputError(f"some of the vehicles turn over in 3-2-1-1 references; {remedy}.")
         needed, still = (Envelope.of(*flown) for flown in flights)
-        flown = {"velocity": needed.velocity, "distance": needed.distance}
+        own = {}
         for name in ("angle", "rate"):  # roll and pitch may do the same
             alone = np.asarray(getattr(still, name)) / _GUSTS
             roll, pitch, yaw = np.maximum(np.asarray(getattr(needed, name)), alone)
-            flown[name] = as_float(np.array([max(roll, pitch), max(roll, pitch), yaw]))
-        return Envelope(**rotors, **flown).limited(limits)
+            own[name] = np.array([max(roll, pitch), max(roll, pitch), yaw])
+        return needed.limited(rotors | own | dict(limits))
 
     def uses(self, references: Inputs, envelope: Envelope) -> dict[str, float]:
         """The largest share of each limit that a vehicle uses. A controller has no limit of slew."""

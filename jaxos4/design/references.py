@@ -1,8 +1,4 @@
-"""The design of references for a real vehicle, which flies under its controller: sums of tones, which repeat.
-
-References are roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, as `fly_closed_loop`
-takes them.
-"""
+"""The design of references, as `fly_closed_loop` takes them, for a real vehicle: sums of tones, which repeat."""
 
 import math
 from collections.abc import Mapping
@@ -55,13 +51,9 @@ class Tones(NamedTuple):
         """exp(i angle) of each tone, at times in periods."""
         return np.exp(2j * math.pi * np.outer(periods, np.arange(1, self.number + 1)))
 
-    def basis(self, periods: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points coefficients"]:
-        """Cosines of all tones, then their sines, at times in periods."""
-        return _parts(self.turns(periods))
-
 
 def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
-    """Real parts, then imaginary parts."""
+    """Cosines of all tones, then their sines."""
     return np.concatenate([np.real(turns), np.imag(turns)], axis=-1)
 
 
@@ -108,10 +100,10 @@ class References(task.AbstractTask):
     """References for a controller. The targets are Ix, Iy and Iz; a coefficient of 1 is a tone of the largest value.
 
     - `scale`: the moments of inertia [kg m^2]. `unexcited`: almost the standard deviations of the bracket.
-    - `base`: information of a flight in gusts without references, with the prior. `added`: the information that a unit
-      of each tone of each reference adds. Both are about the inertias first.
-    - `signals`: the change of the angles and rates of an axis by a unit of the coefficients of its reference, cosines
-      first, as a share of the part of the limit that gusts leave; by the name of the limit.
+    - `base`: information of a flight in gusts without references, with the prior. `added`: by a unit of each tone of
+      each reference. Both are about the inertias first.
+    - `signals`: the angles and rates of an axis by a unit of the coefficients of its reference, cosines first, as a
+      share of the part of the limit that gusts leave; by the name of the limit.
     - `largest`: the largest value of each reference. `basis`: the tones at the points of a period.
     """
 
@@ -149,7 +141,7 @@ class References(task.AbstractTask):
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`. The references have their largest values, or are reduced to a share of them."""
-        basis = self.tones.basis(np.arange(self.samples) / self.tones.period)
+        basis = _parts(self.tones.turns(np.arange(self.samples) / self.tones.period))
         inputs = with_largest(basis @ coefficients.reshape(4, -1).T, np.asarray(self.largest))
         uses, factor, still = self.fleet.uses(inputs, self.envelope), 1.0, None
         for _ in range(_MOST_REDUCTIONS):
@@ -175,12 +167,9 @@ class References(task.AbstractTask):
 
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
         """See `AbstractTask`. The bounds are those of filter error, after a flight through gusts."""
-        bounds = self.fleet.bounds({name: references for name, (references, _) in flown.items()})
-        dt = self.fleet.dt
-        return {
-            name: Designed(inputs, dt, bounds[name], uses, dt * self.tones.period)
-            for name, (inputs, uses) in flown.items()
-        }
+        bounds, dt = self.fleet.bounds({name: references for name, (references, _) in flown.items()}), self.fleet.dt
+        period = dt * self.tones.period
+        return {name: Designed(inputs, dt, bounds[name], uses, period) for name, (inputs, uses) in flown.items()}
 
 
 def design_references(
@@ -206,11 +195,10 @@ def design_references(
     **Arguments:**
 
     - `loop`: the vehicle, its controller, its gusts and its sensors.
-    - `angle`, `acceleration`: the largest reference of roll, pitch and yaw [rad] and of the vertical acceleration
-      [m/s^2].
+    - `angle`, `acceleration`: the largest reference of roll, pitch and yaw [rad], and of the vertical acceleration.
     - `limits`: some limits of an `Envelope`, by name, but not `slew`. The others are those that 3-2-1-1 references with
       the same largest values need; those of rotor speeds are the airframe's.
-    - `bracket`: the knowledge of the parameters of a `FlightModel` before the flight; by default the model's.
+    - `bracket`: of a `FlightModel`; by default the model's.
     - The others: as of `design_input`. The criterion is of the logarithms of Ix, Iy and Iz.
 
     **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
@@ -233,7 +221,7 @@ def design_references(
         unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
         largest=largest,
-        basis=as_float(tones.basis(_POINTS)),
+        basis=as_float(_parts(tones.turns(_POINTS))),
         tones=tones,
         samples=samples,
         size=8 * tones.number,

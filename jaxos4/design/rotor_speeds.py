@@ -115,17 +115,14 @@ class RotorSpeeds(task.AbstractTask):
         """The input with the largest amplitude that all vehicles can fly, also at a tenth of the sample time."""
         hover = np.asarray(self.hover)
 
-        def amplified(factor: float) -> Inputs:
+        def flown(factor: float, finer: int = 1) -> Flown:
             """The input with all accelerations multiplied."""
-            return np.sqrt(np.maximum(hover + factor * (np.square(inputs) - hover), 0.0))
-
-        def used(factor: float, finer: int = 1) -> dict[str, float]:
-            omega = amplified(factor)
+            omega = np.sqrt(np.maximum(hover + factor * (np.square(inputs) - hover), 0.0))
             states = fly_finely(self.model, self.fleet, as_float(omega), self.dt, finer)
-            return dict(sorted(self.envelope.shares(omega, states, float(self.dt)).items()))
+            return omega, dict(sorted(self.envelope.shares(omega, states, float(self.dt)).items()))
 
         def excess(factor: float, target: float) -> float:
-            return min(max(used(factor).values()), _FAR) - target
+            return min(max(flown(factor)[1].values()), _FAR) - target
 
         target = _TARGET
         for _ in range(_MOST_CORRECTIONS):
@@ -135,13 +132,12 @@ class RotorSpeeds(task.AbstractTask):
             if excess(0.0, target) >= 0:
                 high = 0.0
             elif excess(high, target) > 0:
-                found = scipy.optimize.brentq(excess, 0.0, high, (target,), _PRECISION * high)
-                high = float(found)  # type: ignore[arg-type]
-            uses = used(high, FINER)
-            if max(uses.values()) <= 1:
-                return amplified(high), uses
-            target *= _TARGET / max(uses.values())
-        return amplified(0.0), used(0.0, FINER)
+                high = float(scipy.optimize.brentq(excess, 0.0, high, (target,), _PRECISION * high))  # type: ignore[arg-type]
+            found = flown(high, FINER)
+            if max(found[1].values()) <= 1:
+                return found
+            target *= _TARGET / max(found[1].values())
+        return flown(0.0, FINER)
 
     def standard(self) -> dict[str, Flown]:
         """See `AbstractTask`. Each has the largest amplitude that all vehicles can fly."""

@@ -202,8 +202,7 @@ def check_ranges(
 ) -> None:
     """Raise `InputError` for settings that cannot be designed for.
 
-    `samples`: the fewest and the most. `cycles`: the fewest of the fastest tone. `fastest`: its largest frequency over
-    the sample rate.
+    `samples`: the fewest and the most. `cycles`: the fewest of the fastest tone. `fastest`: its frequency times `dt`.
     """
     if not (dt > 0 and samples[0] <= duration / dt <= samples[1]):
         allowed = f"{samples[0]} to {samples[1]} samples of a positive `dt`"
@@ -230,22 +229,17 @@ def write_references(designed: Designed, path: Path) -> None:
 
 def read_input(path: Path, dt: float) -> Float[np.ndarray, "samples 4"]:
     """Read rotor speeds [rad/s] with the sample time `dt` [s]. Raises `InputError` as `read_references` does."""
-    omega, step = _read(path, SPEED_NAMES)
+    omega, step = read_references(path, SPEED_NAMES)
     if (omega < 0).any() or abs(step - dt) > _PRECISION * dt:
         refuse(path, f"has a negative cell, or is not sampled every {dt:g} s; design it for this `dt`")
     return omega
 
 
-def read_references(path: Path) -> tuple[Inputs, float]:
-    """Read references and their sample time [s]. Other columns are ignored.
+def read_references(path: Path, names: tuple[str, ...] = _REFERENCE_NAMES) -> tuple[Inputs, float]:
+    """Read the columns `names`, by default references, and their sample time [s]. Other columns are ignored.
 
     **Raises:** `InputError`, one line: file, what is wrong and what to do.
     """
-    return _read(path, _REFERENCE_NAMES)
-
-
-def _read(path: Path, names: tuple[str, ...]) -> tuple[Inputs, float]:
-    """The columns `names`, and the sample time."""
     columns = read_table(path, ("t", *names)).columns
     for column in ("t", *names):
         if column not in columns:
