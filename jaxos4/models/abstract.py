@@ -30,13 +30,11 @@ class Parameter(NamedTuple):
     - `half_width`, `center`: of the default bracket, for a term's parameter: a number, or a function of the airframe.
     - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
-    - `in_forcing`: whether the forcing depends on the parameter. If not, the rate equations are linear in it. A model
-      fills it in.
+    - `in_forcing`: whether the forcing depends on it, else the rate equations are linear in it. A model fills it in.
     - `nonnegative`: whether physics forbids a negative value.
     - `scales_torque`: whether torque exceeds that of the airframe by this factor.
-    - `plain`: the usual value, at which the parameter is held unless the flights clearly contradict it. `None`: none.
-    - `contradiction`: from a value and its error, why physics or the airframe forbids it, and what to do; `None` if
-      they do not.
+    - `plain`: the usual value, at which the parameter is held unless the flights clearly contradict it.
+    - `contradiction`: from a value and its error, why physics or the airframe forbids it, and what to do.
     """
 
     name: str

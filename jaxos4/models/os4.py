@@ -1,11 +1,7 @@
 """The two models of the OS4: as the paper prints it, and the same as a rigid body.
 
-The paper's equations are here:
-
-- Eqs. (1)-(3), (7)-(9): `PublishedOS4`, rates and translation.
-- Eqs. (4)-(6): attitude, `state.attitude_rates`.
-- Eqs. (10)-(13): torques and thrust, `Airframe.mixer`; the definitions of alpha below them, `alpha_from_inertia`.
-- Eq. (14): the order of the state, `STATE_NAMES`.
+Eqs. (1)-(3) and (7)-(9) of the paper are `PublishedOS4`; (4)-(6) `state.attitude_rates`; (10)-(13) `Airframe.mixer`,
+with alpha by `alpha_from_inertia`; (14) `STATE_NAMES`.
 """
 
 import abc
@@ -91,11 +87,9 @@ class AbstractOS4(AbstractModel):
 class PublishedOS4(AbstractOS4):
     """The model exactly as the paper prints it: Eqs. (1)-(13), kept as a benchmark.
 
-    It departs from the physics of a rigid body, which is `CorrectedOS4`, in three places:
-
-    - The gyroscopic terms lack the rotor speed: alpha2 = J_R d / Ix multiplies q alone, in 1/s.
-    - Eq. (2) has alpha5 r; physics has alpha5 p.
-    - Eqs. (7)-(9) mix two earth frames.
+    It departs from the physics of a rigid body, which is `CorrectedOS4`, in three places: the gyroscopic terms lack the
+    rotor speed, so that alpha2 = J_R d / Ix multiplies q alone, in 1/s; Eq. (2) has alpha5 r, physics has alpha5 p;
+    Eqs. (7)-(9) mix two earth frames.
     """
 
     gyroscopic_unit: ClassVar[str] = "1/s"

@@ -24,14 +24,14 @@ _LEAST = 1e-6
 
 
 class Grid(NamedTuple):
-    """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that.
+    """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
 
     `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by
     `battery_voltage`, to which the airframe's rotor speeds belong.
     """
 
     dt: Scalar
-    stretch: Int[Array, " samples"]
+    recording: Int[Array, " samples"]
     first: Int[Array, " samples"]
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]
@@ -43,17 +43,15 @@ class Grid(NamedTuple):
         voltage, samples = inputs.voltage, inputs.omega.shape[0]
         voltage = None if voltage is None or battery_voltage is None else voltage / battery_voltage
         zeros = jnp.zeros(samples, dtype=int)
-        stretches = inputs.stretches or (zeros, zeros, zeros + samples - 1)
-        elapsed = inputs.dt * jnp.arange(samples)
+        stretch, first, last = inputs.stretches or (zeros, zeros, zeros + samples - 1)
+        recording, elapsed = jnp.asarray(recordings)[stretch], inputs.dt * jnp.arange(samples)
         if max(recordings) > 0:
-            recording = jnp.asarray(recordings)[stretches[0]]
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
-        return cls(inputs.dt, *stretches, elapsed, voltage)
+        return cls(inputs.dt, recording, first, last, elapsed, voltage)
 
-    def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"] | None = None) -> "Part":
+    def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Part":
         """Some samples in a row. `before`: see `Part`."""
-        first, last = (rows == edge[rows] for edge in (self.first, self.last))
-        return Part(self.dt, rows, first, last, jnp.zeros(4, self.elapsed.dtype) if before is None else before)
+        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before)
 
 
 class Part(NamedTuple):
@@ -87,8 +85,7 @@ def measured_speeds(omega: Commands, part: Part) -> Speeds:
 def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
     """The thrust of each rotor divided by b [rad^2/s^2], of speeds that change linearly over a sample.
 
-    **Returns:** the mean over the sample, which makes the mean torque; and that at the begin of the sample, where
-    measurements are: the mean before and after a jump.
+    **Returns:** the mean over the sample; and that at its begin, where measurements are: the mean of both sides.
     """
     begin, end, _ = speeds
     before = jnp.concatenate([part.before[None], end[:-1]])
@@ -97,9 +94,7 @@ def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
 
 
 def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
-    """Commands that act `delay` [s] later.
-
-    Before its first command, a stretch has its first command. After its last command, it has its last command.
+    """Commands that act `delay` [s] later. A stretch has its first command before that, and its last one after that.
 
     Cubics interpolate between samples (Catmull and Rom 1974): a delay of whole samples is exact, and the derivative in
     the delay has no jumps at which a search could end.

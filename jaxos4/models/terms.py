@@ -56,9 +56,8 @@ class Term:
     - `by_default`: takes what is available; returns whether an estimate uses the term if the user names none.
     - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
 
-    The other fields are the contributions, at least one. Each is a function. Its first argument is the quantity
-    without the term. Its second argument holds the values of the term's parameters by name. It returns the quantity
-    with the term. The contributions act in this order:
+    The other fields are the contributions, at least one. Each is a function of the quantity without the term, and of
+    the values of the term's parameters by name. It returns the quantity with the term. They act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s], a function of the numbers of the samples.
     - `speed(omega, values, part, airframe)`: the rotor speeds that follow the commands over some samples. Only one of
@@ -68,8 +67,8 @@ class Term:
     - `gyro(rates, values)`: the measured body rates [rad/s].
     - `accelerometer(force, values)`: the measured specific force [m/s^2]. It makes specific force a measurement.
 
-    If each recording has its own value of a parameter, `values` holds that of the sample's recording. This is not
-    possible in the first two contributions, which act before recordings are distinguished: `ValueError`.
+    `values` holds those of the sample's recording. The first two contributions act before recordings are distinguished:
+    `ValueError` if each recording has its own value.
     """
 
     description: str
@@ -173,16 +172,16 @@ def _drive(omega: RotorSpeeds, values: Values, part: Part, airframe: Airframe) -
     return driven(omega, motor, part)
 
 
+def _velocity(forcing: Forcing) -> Vector:
+    return _known(forcing.velocity, VELOCITY, "body_velocity")
+
+
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
     """Against the velocity along each axis for which there is a parameter."""
     drags = (values.get(f"{axis}_drag") for axis in "xyz")
     each = zip(force, drags, _velocity(forcing), strict=True)
     x, y, z = (a if drag is None else a - drag * v for a, drag, v in each)
     return x, y, z
-
-
-def _velocity(forcing: Forcing):
-    return _known(forcing.velocity, VELOCITY, "body_velocity")
 
 
 def _add_force_bias(force: Vector, values: Values) -> Vector:
@@ -259,11 +258,7 @@ TERMS: dict[str, Term] = {
     ),
     "reaction": Term(
         "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
-        (
-            Parameter(
-                "rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction, nonnegative=True
-            ),
-        ),
+        (Parameter("rotor_reaction", "1", lambda frame: 0.01 + _reaction(frame), center=_reaction, nonnegative=True),),
         angular_acceleration=_add_reaction,
     ),
     "accelerometer": Term(

@@ -1,6 +1,7 @@
 """The model of a real vehicle: the corrected OS4 and the chosen terms."""
 
 import functools
+import operator
 from collections.abc import Callable
 
 import equinox as eqx
@@ -52,8 +53,7 @@ class FlightModel(AbstractModel):
       Leave out `motor`, `lag` and `delay` if rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
       own offsets and gyro biases. All other parameters are the vehicle's.
-    - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V]. The term `voltage`
-      needs it, and `Flight.voltage`.
+    - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
 
     **Raises:** `ValueError` for a term that does not exist or is given twice, recordings that are not counted from 0,
     or a term that needs `airframe.max_rotor_speed` or `battery_voltage` if that is not known.
@@ -125,14 +125,13 @@ class FlightModel(AbstractModel):
 
         If the flight is padded (`Inputs.length`), blocks that are padding alone are not computed: they are 0.
         """
-        grid, samples = Grid.of(inputs, self.battery_voltage, self.recordings), inputs.omega.shape[0]
+        grid, before = Grid.of(inputs, self.battery_voltage, self.recordings), jnp.zeros_like(inputs.omega[0])
         if inputs.length is None:
-            found, _ = self._driven(inputs, grid, grid.part(jnp.arange(samples)), parameters)
+            found, _ = self._driven(inputs, grid, grid.part(jnp.arange(len(inputs.omega)), before), parameters)
         else:
-            found = self._driven_in_blocks(inputs, inputs.length, grid, parameters)
-        recording = jnp.asarray(self.recordings)[grid.stretch]
+            found = self._driven_in_blocks(inputs, inputs.length, grid, before, parameters)
         return found._replace(
-            recording=tuple((recording == i).astype(inputs.omega.dtype) for i in range(max(self.recordings) + 1)),
+            recording=tuple((grid.recording == i).astype(before.dtype) for i in range(max(self.recordings) + 1)),
             velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
         )
 
@@ -161,7 +160,7 @@ class FlightModel(AbstractModel):
         )
         return found, speeds.end[-1]
 
-    def _driven_in_blocks(self, inputs: Inputs, length: Count, grid: Grid, parameters) -> Forcing:
+    def _driven_in_blocks(self, inputs: Inputs, length: Count, grid: Grid, before: Array, parameters) -> Forcing:
         """`_driven` of the samples that count, block by block, so that padding takes no time."""
         samples = inputs.omega.shape[0]
 
@@ -172,7 +171,6 @@ class FlightModel(AbstractModel):
             place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * _BLOCK, axis=0)
             return jax.tree.map(place, filled, found), before
 
-        before = jnp.zeros(inputs.omega.shape[1], inputs.omega.dtype)
         zeros = jnp.zeros(-(-samples // _BLOCK) * _BLOCK, before.dtype)
         nothing = Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros)
         filled, _ = jax.lax.fori_loop(0, -(-length // _BLOCK), fill, (nothing, before))
@@ -250,12 +248,10 @@ class FlightModel(AbstractModel):
             if owner is term:
                 found.setdefault(name, []).append(parameters[place])
         shares = forcing.recording if forcing else ()
-
-        def of_recording(values: list[Scalar]) -> Samples:
-            own = (share * value for share, value in zip(shares, values, strict=True))
-            return sum(own, as_float(0.0)) if len(values) > 1 else values[0]
-
-        return {name: of_recording(values) for name, values in found.items()}
+        return {
+            name: sum(map(operator.mul, shares, values), as_float(0.0)) if len(values) > 1 else values[0]
+            for name, values in found.items()
+        }
 
     def _with_velocity(self, forcing: Forcing, state: State) -> Forcing:
         """Take the body velocity from `state` if a term needs it and it was not measured."""
