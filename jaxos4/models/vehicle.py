@@ -1,7 +1,6 @@
 """The model of a real vehicle: the corrected OS4 and the chosen terms."""
 
 import functools
-import operator
 from collections.abc import Callable
 
 import equinox as eqx
@@ -248,10 +247,12 @@ class FlightModel(AbstractModel):
             if owner is term:
                 found.setdefault(name, []).append(parameters[place])
         shares = forcing.recording if forcing else ()
-        return {
-            name: sum(map(operator.mul, shares, values), as_float(0.0)) if len(values) > 1 else values[0]
-            for name, values in found.items()
-        }
+
+        def own(values: list[Scalar]) -> Samples:
+            each = (share * value for share, value in zip(shares, values, strict=True))
+            return sum(each, as_float(0.0)) if len(values) > 1 else values[0]
+
+        return {name: own(values) for name, values in found.items()}
 
     def _with_velocity(self, forcing: Forcing, state: State) -> Forcing:
         """Take the body velocity from `state` if a term needs it and it was not measured."""
