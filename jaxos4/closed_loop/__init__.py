@@ -1,8 +1,4 @@
-"""Simulation of flights in closed loop.
-
-On a simulated flight with given rotor speeds (`jaxos4.simulate`) the inputs know nothing of the disturbances. On a real
-flight the controller answers each gust, so inputs and disturbances are correlated. This package makes such flights.
-"""
+"""Simulation of flights in closed loop: the controller answers each gust, so inputs and disturbances are correlated."""
 
 from .flight import (
     References as References,

@@ -40,11 +40,8 @@ def random_references(
     - `amplitude`: levels are uniform between -amplitude and amplitude: roll, pitch, yaw [rad], acceleration [m/s^2].
 
     **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
-
-    **Raises:** `ValueError` that names the argument.
     """
-    for name, value in (("duration", duration), ("dt", dt)):
-        setting(name, positive=True)(value)
+    setting("duration", positive=True)(duration), setting("dt", positive=True)(dt)
     if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
         raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
     time = dt * np.arange(round(duration / dt) + 1)
@@ -76,8 +73,6 @@ def fly_closed_loop(
     **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands at
     sample k, or the mean speed of each rotor until sample k + 1. Its `result` is that of `simulate`. After a failure
     the measurements are NaN and the rotor speeds are 0.
-
-    **Raises:** `ValueError` that names the argument.
     """
     shape = jnp.shape(references)
     if len(shape) != 2 or shape[0] < 2 or shape[1] != 4:
@@ -103,11 +98,7 @@ def fly_standard(
 
 
 class _Acting(NamedTuple):
-    """Rotors, gusts and wind during a step.
-
-    Forcing by the rotors and Omega_r' [rad/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind
-    along the body's axes [m/s].
-    """
+    """Rotors, Omega_r', gusts of p', q', r' and the vertical force, and wind along the body's axes during a step."""
 
     rotors: Forcing
     spin_up: Scalar
@@ -168,8 +159,7 @@ class _Vehicle(NamedTuple):
 class _Drawn(NamedTuple):
     """The random numbers of a flight, in rows for each run of the controller.
 
-    - `gusts` with the constant torque, and `winds`: at the begin and the end of each step.
-    - `noise`: of gyro, attitude and accelerometer. `own`: of the controller's own gyro.
+    `gusts` with the constant torque, `winds`, `noise` of gyro, attitude and accelerometer, `own`: of a second gyro.
     """
 
     gusts: Float[Array, "*runs ends 4"]

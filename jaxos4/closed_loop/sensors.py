@@ -26,10 +26,7 @@ class Motion(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """The gyro of the log, that of the controller, and the accelerometer, before and behind their filters.
-
-    `angles`: of the rotors [rad].
-    """
+    """Gyro of the log, that of the controller, and accelerometer, `raw` and `filtered`; `angles` of the rotors [rad]."""
 
     raw: Float[Array, "9"]
     filtered: Float[Array, "9"]
@@ -39,9 +36,8 @@ class Signals(NamedTuple):
 class Sense(NamedTuple):
     """Vibration and first-order low-pass filters, y' = (x - y) / T, exact for signals linear in each run.
 
-    - `sine`, `cosine`: the amplitude of each rotor in hover in gyro and accelerometer.
-    - `decay`, `last`: of the filters of `Signals`.
-    - `own`: whether the controller has a gyro of its own.
+    `sine`, `cosine`: the amplitude of each rotor in hover in gyro and accelerometer. `decay`, `last`: of the filters of
+    `Signals`. `own`: whether the controller has a gyro of its own.
     """
 
     hover_speed: Scalar
