@@ -41,7 +41,8 @@ def random_references(
 
     **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
     """
-    setting("duration", positive=True)(duration), setting("dt", positive=True)(dt)
+    setting("duration", positive=True)(duration)
+    setting("dt", positive=True)(dt)
     if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
         raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
     time = dt * np.arange(round(duration / dt) + 1)

@@ -26,7 +26,7 @@ class Motion(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Gyro of the log, that of the controller, and accelerometer, `raw` and `filtered`; `angles` of the rotors [rad]."""
+    """Gyro of the log, that of the controller, and accelerometer, raw and filtered; `angles` of the rotors [rad]."""
 
     raw: Float[Array, "9"]
     filtered: Float[Array, "9"]
