@@ -107,7 +107,7 @@ def as_estimate(
     covariance: Float[Array, "parameters parameters"],
     initial_state: Float[Array, " starts"],
     cost: Scalar,
-    sound: Bool[Array, ""],
+    feasible: Bool[Array, ""],
     done: Bool[Array, ""],
     reach: Scalar | float = REACH,
     prior: float | None = None,
@@ -118,7 +118,7 @@ def as_estimate(
 
     **Arguments:**
 
-    - `sound`: whether the trajectory is sound to its end. `done`: whether the search ended by itself.
+    - `feasible`: whether the trajectory did not fail before its end. `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
     - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`; by default as the problem does.
     - The others are fields of an `Estimate`.
@@ -131,13 +131,13 @@ def as_estimate(
     far = (jnp.abs(parameters - center) > (reach - 1e-2) * half_width) & free
     identifiable = unknowns.identifiable(std, problem.prior if prior is None else prior)
     finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
-    sound = sound & jnp.isfinite(cost) & finite
+    feasible = feasible & jnp.isfinite(cost) & finite
     result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
     result = RESULTS.where(far[:own].any(), RESULTS.at_bound, result)
     result = RESULTS.where(~identifiable[:own].all(), RESULTS.unidentifiable, result)
-    result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
+    result = RESULTS.where(feasible, result, RESULTS.nonfinite_trajectory)
     result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
-    answered = sound & valid
+    answered = feasible & valid
     return Estimate(
         parameters=jnp.where(answered, parameters, center),
         covariance=jnp.where(answered, covariance, jnp.inf),
@@ -169,7 +169,7 @@ def estimate_at(
         cost=curvature.shot.cost.sum(),
         rollouts=rollouts,
         sweeps=sweeps,
-        sound=curvature.shot.sound.all(),
+        feasible=curvature.shot.feasible.all(),
         done=done,
         parts=curvature.parts,
         **more,
@@ -212,7 +212,7 @@ def fit_start(
 
     A free one takes a few Gauss-Newton steps from the first measurements, whose errors are the prior.
 
-    **Returns:** initial state, cost, whether the trajectory is sound, and number of rollouts.
+    **Returns:** initial state, cost, whether the trajectory is feasible, and number of rollouts.
     """
     start, off = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
@@ -226,8 +226,8 @@ def fit_start(
     if free:
         first, known = start, 1 / jnp.square(problem.split(off))
         start, _ = jax.lax.scan(improve, first, length=_START_STEPS)
-    cost, sound = problem.shots(parameters, start)
-    return start, cost, sound, 1 + (_START_STEPS * (count + free) if free else 0)
+    cost, feasible = problem.shots(parameters, start)
+    return start, cost, feasible, 1 + (_START_STEPS * (count + free) if free else 0)
 
 
 class AbstractEstimator(eqx.Module):

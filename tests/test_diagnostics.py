@@ -124,7 +124,7 @@ def test_no_alarm_without_measurements_or_motion_or_with_rounding_errors_or_afte
     found = jaxos4.residual_diagnostics(jaxos4.evaluate(unmeasured, alpha))
     assert found.count.tolist() == [500, 500, 500, 0, 500, 500]
     diverged = jaxos4.residual_diagnostics(jaxos4.evaluate(problem, alpha.at[2].set(1e9)))
-    assert (bool(exact.sound), bool(diverged.sound)) == (True, False)
+    assert (bool(exact.feasible), bool(diverged.feasible)) == (True, False)
     assert (diverged.count == 0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((found, diverged)))
     # A channel that stands still, and rotors that do.

@@ -182,7 +182,7 @@ def test_the_likelihood_does_not_depend_on_the_segments_and_no_trajectory_runs_a
     # Nothing was measured for 3 s, in which this model would turn faster and faster.
     problem = eqx.tree_at(lambda p: p.flight.states, problem, problem.flight.states.at[150:450].set(jnp.nan))
     found = likelihood(problem, MODEL.alpha.at[1].set(-50.0), NOISE)
-    assert bool(found.sound.all())
+    assert bool(found.feasible.all())
     assert all(np.isfinite(leaf).all() for leaf in found)
 
 

@@ -69,8 +69,8 @@ def test_a_seed_without_an_answer_is_never_passed_on():
     wrong = ("network_mismatch", "nonfinite_trajectory", "unidentifiable", "at_bound")
     seeds = [seed_of(getattr(jaxos4.RESULTS, name), std=nothing) for name in wrong[:3]]
     seeds += [seed_of(jaxos4.RESULTS.at_bound, std=1e-3 * half_width)]
-    sound = seed_of(jaxos4.RESULTS.successful, alpha[4], 1e-2 * half_width)
-    stack = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *seeds, sound)
+    near_the_truth = seed_of(jaxos4.RESULTS.successful, alpha[4], 1e-2 * half_width)
+    stack = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *seeds, near_the_truth)
     found, best = seeded(states[:5], stack), identify(jaxos4.IBSS(), states, channels="all")
     assert names(found) == ["successful"] * 5
     assert best.calibration is None

@@ -113,7 +113,7 @@ def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
     )
     found, start = jaxos4.evaluate(problem, problem.model.alpha), first_state(problem)
     expected = curvatures(problem, problem.model.alpha, start)
-    assert found.sound
+    assert found.feasible
     np.testing.assert_allclose(found.cost, expected.shot.cost.sum(), rtol=1e-12)
     scale = np.sqrt(np.abs(np.asarray(expected.information)).max())
     np.testing.assert_allclose(found.information / scale**2, expected.information / scale**2, atol=1e-12)
@@ -121,7 +121,7 @@ def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
     unit = np.sqrt(np.diagonal(bound))
     np.testing.assert_allclose(found.covariance / np.outer(unit, unit), bound / np.outer(unit, unit), atol=1e-9)
     diverged = jaxos4.evaluate(problem, jnp.asarray(np.where(np.arange(8) == 2, 1e9, problem.model.alpha)))
-    assert not diverged.sound
+    assert not diverged.feasible
     assert diverged.cost == float("inf")
 
 

@@ -182,7 +182,7 @@ def test_forward_and_reverse_mode_equal_finite_differences(model_class, channels
     assert np.abs(reverse / other - 1).max() > 1e-6  # a wrong derivative would fail
     np.testing.assert_allclose(forward, reverse, rtol=1e-10, atol=1e-12 * np.abs(reverse).max())
     assert float(curvature.shot.cost) == pytest.approx(float(cost), rel=1e-13)
-    assert bool(curvature.shot.sound)
+    assert bool(curvature.shot.feasible)
     unknowns = 8 + problem.free_size
     assert curvature.information.shape == (unknowns, unknowns)
     np.testing.assert_allclose(curvature.gradient, forward[:unknowns], rtol=1e-10)
@@ -221,8 +221,8 @@ def test_a_failed_shot_is_compared_up_to_the_failure():
     def shot(problem, parameters, along):
         return jax.jvp(lambda x: problem.shots(x, jnp.asarray(start)), (parameters,), (along,))
 
-    (cost, sound), (slope, _) = shot(problem, steep, np.eye(8)[5])
-    assert not bool(sound)
+    (cost, feasible), (slope, _) = shot(problem, steep, np.eye(8)[5])
+    assert not bool(feasible)
     assert np.isfinite(cost)
     assert np.isfinite(slope)
     assert float(problem.cost(jnp.asarray(steep), jnp.asarray(start))) == np.inf

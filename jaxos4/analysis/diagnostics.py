@@ -21,7 +21,7 @@ class Diagnostics(eqx.Module):
     A p-value is the probability of residuals like these, or worse, if the fit were perfect: near 0, something is wrong.
     It is 1 for a channel with fewer than three measurements, or with rounding errors as its only residuals.
 
-    - `sound`: whether the trajectory stayed finite to its end. If not, the other fields mean nothing.
+    - `feasible`: whether the trajectory did not fail before its end. If not, the other fields mean nothing.
     - `count`: number of measured samples.
     - `rms`: of the residuals, in the channel's unit.
     - `percent`: 100 (1 - |y - x| / |y - mean y|). 100 is a perfect prediction, 0 is as good as the mean, or the channel
@@ -38,7 +38,7 @@ class Diagnostics(eqx.Module):
       System Identification, chapter 16) and is conservative (Bonferroni).
     """
 
-    sound: bool
+    feasible: bool
     count: Int[np.ndarray, " size"]
     rms: Float[np.ndarray, " size"]
     percent: Float[np.ndarray, " size"]
@@ -59,9 +59,9 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
     from scipy.special import gammainc, gammaincc  # slow to import, and few need it
 
     lags = min(_LAGS, evaluation.measured.shape[0] // 2)
-    problem, sound = evaluation.problem, evaluation.sound
+    problem, feasible = evaluation.problem, evaluation.feasible
     # A diverged trajectory counts as nothing measured.
-    measured = ~np.isnan(evaluation.measured) & sound
+    measured = ~np.isnan(evaluation.measured) & feasible
     errors, values = (np.where(measured, x, 0.0) for x in (evaluation.errors, evaluation.measured))
     sigma, count, squares = evaluation.sigma, measured.sum(axis=0), np.square(errors).sum(axis=0)
     most, known, largest = np.maximum(count, 1), count >= _FEWEST, np.abs(values).max(axis=0)
@@ -82,7 +82,7 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
     colour = autocorrelation[np.arange(count.size), np.argmax(pairs > 0, axis=1)]
     input_correlation, input_p = _dependence(errors, measured, autocorrelation, evaluation.torques, rounding, lags)
     return Diagnostics(
-        sound=sound,
+        feasible=feasible,
         count=count,
         rms=np.where(known, sigma * np.sqrt(squares / most), 0.0),
         percent=np.where(moved, 100 * (1 - sigma * np.sqrt(squares) / np.where(moved, spread, 1.0)), 0.0),

@@ -46,7 +46,7 @@ class Evaluation(NamedTuple):
     nominal: Float[np.ndarray, " parameters"]
 
     @property
-    def sound(self) -> bool:
+    def feasible(self) -> bool:
         """Whether what noise-free sensors measure is finite to its end, without a pitch angle of 90 degrees."""
         states = self.predicted[:, : self.problem.size]
         if not np.isfinite(states).all() or (np.abs(states[:, : CHANNELS["rates"]]) >= FASTEST).any():
@@ -65,8 +65,8 @@ class Evaluation(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """1/2 |W (y - x)|^2; infinite if the trajectory is not sound."""
-        return float(np.square(self.errors).sum() / 2) if self.sound else float("inf")
+        """1/2 |W (y - x)|^2; infinite if the trajectory is not feasible."""
+        return float(np.square(self.errors).sum() / 2) if self.feasible else float("inf")
 
     @property
     def jacobian(self) -> Float[np.ndarray, "windows unknowns residuals"]:
@@ -91,9 +91,9 @@ class Evaluation(NamedTuple):
 
     @property
     def covariance(self) -> Spread:
-        """The Cramer-Rao bound of the parameters; infinite if the trajectory is not sound."""
+        """The Cramer-Rao bound of the parameters; infinite if the trajectory is not feasible."""
         count = self.parameters.size
-        return inverse(self.fisher_information) if self.sound else np.full((count, count), np.inf)
+        return inverse(self.fisher_information) if self.feasible else np.full((count, count), np.inf)
 
 
 def evaluate(
@@ -176,7 +176,7 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """
     count, measured = evaluation.parameters.size, ~np.isnan(evaluation.measured)
-    if not (evaluation.sound and measured.any()):
+    if not (evaluation.feasible and measured.any()):
         return np.full((count, count), np.inf)
     jacobian, information, shared = evaluation.jacobian, evaluation.information, evaluation.covariance
     cross, own = information[:, count:, :count], information[:, count:, count:]

@@ -86,8 +86,8 @@ def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability
         raise ValueError(f"`bracket` must hold {evaluation.nominal.size} parameters, got {bracket.lower.shape[0]}.")
     nominal, half_width = evaluation.nominal, np.asarray(bracket.half_width)
     valid = bool(((half_width > 0) & np.isfinite(half_width)).all())
-    sound = valid and evaluation.sound
-    if not evaluation.sound:
+    feasible = valid and evaluation.feasible
+    if not evaluation.feasible:
         evaluation = evaluate(evaluation.problem, as_float(nominal))
     half_width = half_width if valid else np.ones_like(nominal)
     information = evaluation.fisher_information
@@ -97,6 +97,6 @@ def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability
     with np.errstate(divide="ignore"):
         alone = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 0.0)), np.inf)
     std = np.sqrt(np.diagonal(inverse(information)))
-    if not sound:
+    if not feasible:
         std = alone = np.full_like(std, np.inf)
     return Identifiability(nominal, half_width, std, alone, np.maximum(eigenvalues, 0.0), directions)

@@ -89,8 +89,8 @@ class AntColony(AbstractEstimator):
         @jax.vmap
         def shoot(point: Float[Array, " unknowns"]) -> Scalar:
             """The cost of a point; infinite if its trajectory fails."""
-            cost, sound = problem.shots(*split(point))
-            return jnp.where(sound & jnp.isfinite(cost), cost, jnp.inf)
+            cost, feasible = problem.shots(*split(point))
+            return jnp.where(feasible & jnp.isfinite(cost), cost, jnp.inf)
 
         def sweep(colony: _Colony) -> _Colony:
             new = self._sample(colony.points, jax.random.fold_in(key, colony.sweeps))

@@ -28,7 +28,7 @@ from ..linalg import gram, invert
 from ..models.state import Rates
 from ..shooting import ShootingProblem
 
-Rows = Float[Array, "samples 3 columns"]
+RegressionRows = Float[Array, "samples 3 columns"]
 Matrix = Float[Array, "parameters parameters"]
 
 # Standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It matters only
@@ -68,7 +68,7 @@ class Regression(NamedTuple):
         """The noise of the rates [rad/s]."""
         return self.problem.sigma[RATES]
 
-    def rows(self) -> tuple[Rows, Callable[[Rows], Float[Array, "samples 3"]]]:
+    def rows(self) -> tuple[RegressionRows, Callable[[RegressionRows], Float[Array, "samples 3"]]]:
         """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
 
         Missing samples get rows of zeros. The function turns the slope of a number in the rows into its slope in the
@@ -77,7 +77,7 @@ class Regression(NamedTuple):
         rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
         return rows, lambda slope: back(slope)[0]
 
-    def _rows(self, rates: Float[Array, "samples 3"]) -> Rows:
+    def _rows(self, rates: Float[Array, "samples 3"]) -> RegressionRows:
         """The rows with other values of the measured rates; the same samples are missing."""
         measured, (filled, known) = ~jnp.isnan(self.rates), self._fill(rates)
         increments = self._increments(filled)
@@ -145,7 +145,11 @@ class Regression(NamedTuple):
         return jnp.concatenate([increments, jnp.zeros_like(increments[:1])])
 
     def covariance(
-        self, rows: Rows, back: Callable[[Rows], Float[Array, "samples 3"]], steps: Parameters, inverse: Matrix
+        self,
+        rows: RegressionRows,
+        back: Callable[[RegressionRows], Float[Array, "samples 3"]],
+        steps: Parameters,
+        inverse: Matrix,
     ) -> Matrix:
         """The covariance of the solution `steps` from white noise in the measured rates, to first order.
 
@@ -190,7 +194,7 @@ class Regression(NamedTuple):
         choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
         # One after the other, so that the simulation is compiled once.
         shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
-        flies = shots.sound[0] & jnp.isfinite(shots.cost[0])
+        flies = shots.feasible[0] & jnp.isfinite(shots.cost[0])
         (parameters, initial_state), shot = jax.tree.map(
             lambda both: jnp.where(identifiable | flies, *both), (choices, shots)
         )
@@ -202,7 +206,7 @@ class Regression(NamedTuple):
             cost=shot.cost,
             rollouts=rollouts + 1,
             sweeps=1,
-            sound=shot.sound,
+            feasible=shot.feasible,
             done=jnp.ones((), dtype=bool),
             history=history,
         )

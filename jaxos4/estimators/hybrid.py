@@ -122,8 +122,8 @@ def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
     # A loop over the two searches, so that the search is compiled once. A batch of hits skips the second.
     hit, both = jax.lax.scan(search, jnp.zeros((), dtype=bool), jnp.asarray([True, False]))
     near, wide = (jax.tree.map(lambda leaf, place=place: leaf[place], both) for place in (0, 1))
-    sound = answered & (near.result == RESULTS.successful)
-    better = ~hit & (~sound | ((wide.result == RESULTS.successful) & (wide.cost < near.cost)))
+    near_is_right = answered & (near.result == RESULTS.successful)
+    better = ~hit & (~near_is_right | ((wide.result == RESULTS.successful) & (wide.cost < near.cost)))
     best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
     return dataclasses.replace(
         best,

@@ -251,7 +251,7 @@ class IBSS(AbstractEstimator):
             unknowns = jnp.clip(state.unknowns + step, *stage.limits)
             curvature = stage.evaluate(unknowns)
             slope = self._slopes(stage, directions, curvature)
-            close = curvature.shot.sound.all() & self._is_near(stage, curvature, slope)
+            close = curvature.shot.feasible.all() & self._is_near(stage, curvature, slope)
             # A broken slope counts as that of a minimum at step 0: with unit information the slope is then the step.
             brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
             return brackets, unknowns, curvature, taken + 1, close
@@ -269,8 +269,8 @@ class IBSS(AbstractEstimator):
         stalled = swept & (gain <= _GAIN) & _may_stall(stage, state, found)
         finite = jnp.isfinite(unknowns).all() & jnp.isfinite(shot.cost).all()
         # The cost of an unsound trajectory means nothing.
-        not_worse = shot.sound.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
-        rejected = ~first & ~(finite & (~before.sound.all() | not_worse)) | (stalled & (gain < 0))
+        not_worse = shot.feasible.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
+        rejected = ~first & ~(finite & (~before.feasible.all() | not_worse)) | (stalled & (gain < 0))
         new, old = (unknowns, curvature), (state.unknowns, state.curvature)
         unknowns, curvature = jax.tree.map(lambda new, old: jnp.where(rejected, old, new), new, old)
         covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(directions.basis)
@@ -307,8 +307,8 @@ class IBSS(AbstractEstimator):
 def _may_stall(stage: Stage, state: State, found: Bisected) -> Flag:
     """Whether a sweep is short, on a cost whose slopes may be large at the minimum: those along strides are inexact."""
     (brackets, _, curvature, _), unknowns = found, stage.problem.unknowns
-    sound = curvature.shot.sound.all() & state.curvature.shot.sound.all()
-    return jnp.isfinite(unknowns.stride).any() & sound & (jnp.abs(brackets.predicted).max() <= _SHORT)
+    feasible = curvature.shot.feasible.all() & state.curvature.shot.feasible.all()
+    return jnp.isfinite(unknowns.stride).any() & feasible & (jnp.abs(brackets.predicted).max() <= _SHORT)
 
 
 def _next_widths(stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:

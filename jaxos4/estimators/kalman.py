@@ -78,7 +78,7 @@ class JointEKF(AbstractRecursion):
         found = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < self.passes), again, none)
         (joint, root, history), passes, done = found
         parameters, initial_state = split(joint)
-        cost, sound = problem.shots(parameters, initial_state)
+        cost, feasible = problem.shots(parameters, initial_state)
         return as_estimate(
             problem,
             parameters=parameters,
@@ -87,7 +87,7 @@ class JointEKF(AbstractRecursion):
             cost=cost,
             rollouts=passes * (unknowns + 1) + 1,
             sweeps=passes,
-            sound=sound,
+            feasible=feasible,
             prior=self.prior,
             done=done,
             history=history,

@@ -142,8 +142,8 @@ class Newton(NamedTuple):
 
 def _cost(curvature: Curvature) -> Scalar:
     """The cost of all windows; infinite for a trajectory that fails."""
-    cost, sound = curvature.shot
-    return jnp.where(sound.all() & jnp.isfinite(cost).all(), cost.sum(), jnp.inf)
+    cost, feasible = curvature.shot
+    return jnp.where(feasible.all() & jnp.isfinite(cost).all(), cost.sum(), jnp.inf)
 
 
 class OutputError(AbstractEstimator):
@@ -233,7 +233,7 @@ class FilterError(AbstractEstimator):
             return self._search(problem)
         found, count = self._search(InnovationsProblem(problem)), problem.unknowns.count
         parameters = found.parameters[:count]
-        first, cost, sound, rollouts = fit_start(problem, parameters)
+        first, cost, feasible, rollouts = fit_start(problem, parameters)
         return as_estimate(
             problem,
             parameters=parameters,
@@ -242,7 +242,7 @@ class FilterError(AbstractEstimator):
             cost=cost,
             rollouts=rollouts + found.rollouts,
             sweeps=found.sweeps,
-            sound=sound & jnp.isfinite(found.cost),
+            feasible=feasible & jnp.isfinite(found.cost),
             done=found.result != RESULTS.max_sweeps,
             prior=self.prior,
         )

@@ -111,7 +111,7 @@ class SVSF(AbstractRecursion):
         none = jnp.zeros((samples, count), dtype=float)
         (last, history), _ = jax.lax.scan(fly, (at_center, none), length=self.passes)
         parameters = box.center + box.width * (shares[:, None] * history).sum(axis=0)
-        initial_state, cost, sound, rollouts = fit_start(problem, parameters)
+        initial_state, cost, feasible, rollouts = fit_start(problem, parameters)
         return as_estimate(
             problem,
             parameters=parameters,
@@ -120,7 +120,7 @@ class SVSF(AbstractRecursion):
             cost=cost,
             rollouts=self.passes * (1 + 3 + count) + rollouts,
             sweeps=self.passes,
-            sound=sound,
+            feasible=feasible,
             prior=self.prior,
             done=jnp.ones((), dtype=bool),
             history=box.center + box.width * history,

@@ -161,16 +161,16 @@ def _fly(
     begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
 
     def step(carry: tuple[Motion, Array, Array], row) -> tuple[tuple[Motion, Array, Array], Array]:
-        (motion, disturbance, sound), (forcing, gust) = carry, row
+        (motion, disturbance, feasible), (forcing, gust) = carry, row
         pushed = reach * disturbance + gust[:, 0]
         turning = offset[:3] + pushed[:3] / dt
         pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(pushed[3:])
         moved = rk4_step(_Free(model, tuple(turning), tuple(pushing)), motion, forcing, scalars, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
         values = jnp.stack(jax.tree.leaves(moved))
-        sound = sound & jnp.isfinite(values).all() & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
-        motion = jax.tree.map(lambda new, old: jnp.where(sound, new, old), moved, motion)
-        return (motion, kept * disturbance + gust[:, 1], sound), jnp.stack(jax.tree.leaves(motion))
+        feasible = feasible & jnp.isfinite(values).all() & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
+        motion = jax.tree.map(lambda new, old: jnp.where(feasible, new, old), moved, motion)
+        return (motion, kept * disturbance + gust[:, 1], feasible), jnp.stack(jax.tree.leaves(motion))
 
     pushed = jnp.where(lane.filtered, start.disturbance, 0.0) + lane.pushed
     pushed = pushed.at[:3].add(absorbed[:3])

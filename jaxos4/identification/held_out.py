@@ -95,8 +95,8 @@ def _regression(problem: ShootingProblem, values: Array, held: Numeric) -> Array
 def validate_on(fit: Fit, other: ShootingProblem, name: str) -> Validation:
     """How well the parameters explain another flight; only its initial state is fitted."""
     other, parameters = eqx.tree_at(lambda p: p.sigma, other, fit.problem.sigma), fit.estimate.parameters
-    start, cost, sound, _ = quick_jit(fit_start)(padded(other), parameters)
-    if not bool(sound):
+    start, cost, feasible, _ = quick_jit(fit_start)(padded(other), parameters)
+    if not bool(feasible):
         return Validation(name, None, None)
     diagnostics = residual_diagnostics(evaluate(other, parameters, start), fitted=False)
     return Validation(name, finite_or_none(cost), channel_fits(other, diagnostics))

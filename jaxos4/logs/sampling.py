@@ -22,8 +22,8 @@ _FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up
 Times = Float[np.ndarray, " samples"]
 Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]
-Rows = Float[np.ndarray, " rows"]
-Resampled = tuple[Rows, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
+RowPositions = Float[np.ndarray, " rows"]
+Resampled = tuple[RowPositions, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
 
 
 class Series(NamedTuple):
@@ -56,7 +56,7 @@ def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Colum
     return until
 
 
-def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[Rows], Columns]:
+def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[RowPositions], Columns]:
     """Root mean square of each rotor's speed or command from each row to the next, so that its impulse is conserved.
 
     Thrust and torque are proportional to the square. Speeds are held until the next sample; if `linear`, their squares
@@ -65,7 +65,7 @@ def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[Rows]
     squares = Series(series.t, np.square(series.values))
     impulse = integral(squares, linear=linear)
 
-    def at(rows: Rows) -> Columns:
+    def at(rows: RowPositions) -> Columns:
         last = np.searchsorted(series.t, rows[-1], side="right") - 1
         out = np.empty((rows.size, squares.values.shape[1]))
         out[:-1] = np.diff(impulse(rows), axis=0) / np.diff(rows)[:, None]
@@ -104,7 +104,7 @@ def averages(t: Times, omega: Rotors, channels: Columns) -> Callable[[float], Re
     return average
 
 
-def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
+def at_rows(rows: RowPositions, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
     """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
 
     Values are interpolated linearly to the time of the row, but not across a gap: between neighbours more than 1.5
@@ -146,7 +146,7 @@ def _averaged(series: Series, step: float = _FASTEST_ROWS) -> Series:
 
 def gyro_rows(
     table: Table, rates: Series, rotors: Series, *, measured: bool, others: Mapping[tuple[str, ...], Series | None]
-) -> tuple[Rows, Table]:
+) -> tuple[RowPositions, Table]:
     """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
 
     Impossible samples are taken out before, so that no row takes a part of them. A gyro that is faster than 1 kHz is

@@ -254,11 +254,11 @@ class TrainedNetwork(AbstractEstimator):
         other |= (inflation > _LARGEST_INFLATION).any() | (scale > self.settings.noise[1] * (1 + _SAME))
         result = RESULTS.where(outside.any(), RESULTS.at_bound, RESULTS.successful)
         result = RESULTS.where(unidentifiable.any(), RESULTS.unidentifiable, result)
-        sound = finite & shot.sound & jnp.isfinite(parameters).all()
-        result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
+        feasible = finite & shot.feasible & jnp.isfinite(parameters).all()
+        result = RESULTS.where(feasible, result, RESULTS.nonfinite_trajectory)
         result = RESULTS.where(other, RESULTS.network_mismatch, result)
         result = RESULTS.where(problem.unknowns.valid, result, RESULTS.bracket_invalid)
-        usable = sound & ~other & problem.unknowns.valid
+        usable = feasible & ~other & problem.unknowns.valid
         estimate = Estimate(
             parameters=jnp.where(usable, parameters, self.bracket.center),
             covariance=jnp.where(usable, correlation * deviations[:, None] * deviations[None, :], jnp.inf),

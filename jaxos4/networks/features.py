@@ -137,10 +137,10 @@ class Features(eqx.Module):
     def _deviation(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
         """W (x(u) - x(0)); 0 in samples that are not measured, NaN everywhere if the flight at `u` diverges."""
         trajectory = self._trajectory(u)
-        sound = (jnp.abs(trajectory[:, :3]) < FASTEST).all()
+        feasible = (jnp.abs(trajectory[:, :3]) < FASTEST).all()
         if self.problem.size > 3:
-            sound &= (jnp.abs(trajectory[:, 4]) < jnp.pi / 2).all()
-        return jnp.where(sound, self._weighted(self.problem, trajectory), jnp.nan)
+            feasible &= (jnp.abs(trajectory[:, 4]) < jnp.pi / 2).all()
+        return jnp.where(feasible, self._weighted(self.problem, trajectory), jnp.nan)
 
     def _trajectory(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
         return self.problem.predict(*self.coordinates.split(u, len(self.problem.model.parameter_names)))

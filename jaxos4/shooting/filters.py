@@ -51,13 +51,13 @@ class Innovations(NamedTuple):
 
     The unknowns of a channel are the parameters, and then its own `LogNoise`.
 
-    - `sound`: whether the rates stay below `FASTEST`.
+    - `feasible`: whether the rates stay below `FASTEST`.
     - `information`: the Fisher information.
     - `products`: sums of the products of standardised innovations 0 to `LAGS` samples apart.
     """
 
     cost: Segments
-    sound: Bool[Array, " segments"]
+    feasible: Bool[Array, " segments"]
     gradient: Float[Array, "channels unknowns segments"]
     information: Float[Array, "channels unknowns unknowns segments"]
     products: Float[Array, "channels lags segments"]
@@ -224,7 +224,7 @@ def _filter(
     known = _emptied(_Known(Rates(*start), (zero,) * channels), observed.restart[0])
     nothing = Innovations(
         cost=zero,
-        sound=jnp.ones(segments, dtype=bool),
+        feasible=jnp.ones(segments, dtype=bool),
         gradient=jnp.zeros((channels, unknowns, segments), dtype=float),
         information=jnp.zeros((channels, unknowns, unknowns, segments), dtype=float),
         products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
@@ -271,10 +271,10 @@ def _filter_rows(
         return _Feedback(*map(tuple, (gains.rate, gains.disturbance, step.reach, step.kept)))
 
     def body(carry, rows):
-        (covariance, by_noise), (known, slopes, noise_slopes), sound = carry
+        (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry
         forcing, tangents, row = rows
         for x in known.rates:
-            sound = sound & (jnp.abs(x) < FASTEST)
+            feasible = feasible & (jnp.abs(x) < FASTEST)
         (covariance, gains), push = jax.linearize(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
         )
@@ -297,16 +297,16 @@ def _filter_rows(
         (known, errors), push = jax.linearize(filtered, *at)
         slopes, by_errors = jax.vmap(pushed)(*directions)  # pyright: ignore[reportArgumentType]
         found = tuple(map(jnp.stack, (errors, by_errors, by_noise_errors))), gains.variance, gain_slopes.variance
-        return ((covariance, by_noise), (known, slopes, noise_slopes), sound), found
+        return ((covariance, by_noise), (known, slopes, noise_slopes), feasible), found
 
-    first = carry.covariance, carry.known, carry.sums.sound
-    (covariance, known, sound), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
+    first = carry.covariance, carry.known, carry.sums.feasible
+    (covariance, known, feasible), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
     (errors, *slopes), variance, variance_slopes = found
     counts = row.is_measured & counts[:, None]
     found, last = _likelihood(
-        counts, variance, variance_slopes, carry.last, sound, errors, jnp.concatenate(slopes, axis=2)
+        counts, variance, variance_slopes, carry.last, feasible, errors, jnp.concatenate(slopes, axis=2)
     )
-    sums = jax.tree.map(jnp.add, carry.sums, found)._replace(sound=sound)
+    sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)
 
 
@@ -315,7 +315,7 @@ def _likelihood(
     variance: Series,
     variance_slopes: Float[Array, "time 3 channels segments"],
     last: Float[Array, "lags channels segments"],
-    sound: Bool[Array, " segments"],
+    feasible: Bool[Array, " segments"],
     errors: Series,
     slopes: Float[Array, "time channels unknowns segments"],
 ) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
@@ -333,4 +333,4 @@ def _likelihood(
     standard = jnp.concatenate([last, jnp.sqrt(weight) * errors])
     now = standard[LAGS:]
     products = [(now * standard[LAGS - lag : standard.shape[0] - lag]).sum(axis=0) for lag in range(LAGS + 1)]
-    return Innovations(cost, sound, gradient, information, jnp.stack(products, axis=1)), standard[-LAGS:]
+    return Innovations(cost, feasible, gradient, information, jnp.stack(products, axis=1)), standard[-LAGS:]

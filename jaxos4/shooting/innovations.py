@@ -187,7 +187,7 @@ class InnovationsProblem(AbstractProblem):
             slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
             curvature = jnp.where(both, information.sum(axis=0), 0.0) + jnp.diag(unknowns.precision)
             parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0))
-            return Curvature(Shot(cost[None], found.sound.all()[None]), slope[None], curvature[None], parts)
+            return Curvature(Shot(cost[None], found.feasible.all()[None]), slope[None], curvature[None], parts)
 
         return evaluate
 

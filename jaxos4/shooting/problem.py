@@ -221,8 +221,8 @@ class ShootingProblem(AbstractProblem):
         `initial_state` defaults to `first_state`.
         """
         start = self.first_state()[0] if initial_state is None else initial_state
-        cost, sound = self.shots(parameters, start)
-        return jnp.where(sound, cost, jnp.inf)
+        cost, feasible = self.shots(parameters, start)
+        return jnp.where(feasible, cost, jnp.inf)
 
     @quick_jit
     def residuals(
@@ -247,7 +247,7 @@ class ShootingProblem(AbstractProblem):
         """The cost of all windows together."""
         rows, starts = self.rows(parameters), self.split(initial_state)
         each = each_window(lambda rows, start: self.shot(rows, parameters, start), rows, starts)
-        return Shot(each.cost.sum(), each.sound.all())
+        return Shot(each.cost.sum(), each.feasible.all())
 
     def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
         """`curvatures` for a loop: what does not depend on the unknowns is made once."""

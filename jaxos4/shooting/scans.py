@@ -50,12 +50,12 @@ class Shot(NamedTuple):
     """One simulated window.
 
     - `cost`: of the samples before the trajectory fails.
-    - `sound`: whether no sample fails, by a pitch angle beyond +-90 degrees or a body rate above `FASTEST`. The cost of
-      a failed shot means nothing, but its derivative still points back to valid trajectories.
+    - `feasible`: whether no sample fails, by a pitch angle beyond +-90 degrees or a body rate above `FASTEST`. The cost
+      of a failed shot means nothing, but its derivative still points back to feasible trajectories.
     """
 
     cost: Scalar
-    sound: Bool[Array, ""]
+    feasible: Bool[Array, ""]
 
 
 class Parts(NamedTuple):
@@ -124,9 +124,9 @@ def shoot(
 
     def step(carry: tuple[State, Shot], row: Rows) -> tuple[State, Shot]:
         state, shot = carry
-        sound = shot.sound & _is_sound(state)
+        feasible = shot.feasible & _is_feasible(state)
         following, predicted = advance(state, row.forcing, scalars)
-        return following, Shot(shot.cost + _half_square(_errors(row, predicted, weights, sound)), sound)
+        return following, Shot(shot.cost + _half_square(_errors(row, predicted, weights, feasible)), feasible)
 
     nothing = Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
     return _fold(step, (unstack(initial_state), nothing), rows, length)[1]
@@ -214,16 +214,16 @@ def _linearised_shot(
     parameter_tangents = tuple(np.eye(count, cut, dtype=parameters.dtype))
 
     def step(carry: _Carried, row: Rows) -> _Carried:
-        sound = carry.shot.sound & _is_sound(carry.state)
+        feasible = carry.shot.feasible & _is_feasible(carry.state)
         # At rest after a failure, so that no derivative overflows.
-        state = jax.tree.map(lambda x: jnp.where(sound, x, 0.0), carry.state)
+        state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), carry.state)
         forcing = jax.tree.map(along_lanes, row.forcing)
 
         # The rates alone are cheaper to repeat.
         repeated = not lanes or state.attitude is None
         at, late = (state, forcing, scalars), carry.late
-        shot = functools.partial(_linearised_sample, advance, row, at, weights, sound, late is not None)
-        following, push, push_late, cost, pull, squares = shot() if repeated else computed_once(sound, shot)
+        shot = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
+        following, push, push_late, cost, pull, squares = shot() if repeated else computed_once(feasible, shot)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
             nothing, positions = jnp.zeros((cut, *lanes), parameters.dtype), np.asarray(forcing_parameters)
@@ -242,7 +242,7 @@ def _linearised_shot(
         information = [
             _added(blocks, panel, cut, squares, slopes) for panel, blocks in zip(panels, carry.panels, strict=True)
         ]
-        return _Carried(following, tangent, late, Shot(carry.shot.cost + cost, sound), gradient, information)
+        return _Carried(following, tangent, late, Shot(carry.shot.cost + cost, feasible), gradient, information)
 
     last = _fold(step, _before(initial_state, count, cut, panels), rows, length)
     information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)
@@ -286,7 +286,7 @@ def _linearised_sample(
     row: Rows,
     at: tuple[State, Forcing, tuple[Lanes, ...]],
     weights: tuple[Lanes, ...],
-    sound: Bool[Array, "*lanes"],
+    feasible: Bool[Array, "*lanes"],
     late: bool,
 ) -> tuple[State, Callable, Callable | None, Lanes, list[Lanes], list[Lanes]]:
     """The next state, the derivative of `advance`, the cost, and the weighted errors and squared weights.
@@ -299,8 +299,8 @@ def _linearised_sample(
     else:
         linear = jax.linearize(advance, *at)
     (following, predicted), push = linear
-    errors = _errors(row, predicted, weights, sound)
-    known = [jnp.where(jnp.isnan(y) | ~sound, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
+    errors = _errors(row, predicted, weights, feasible)
+    known = [jnp.where(jnp.isnan(y) | ~feasible, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
     pull = [w * e for w, e in zip(known, errors, strict=True)]
     push_late = None
     if late:
@@ -310,17 +310,17 @@ def _linearised_sample(
     return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 
 
-def _is_sound(state: State) -> Bool[Array, " *lanes"]:
+def _is_feasible(state: State) -> Bool[Array, " *lanes"]:
     p, q, r = state.rates
     slow = (jnp.abs(p) < FASTEST) & (jnp.abs(q) < FASTEST) & (jnp.abs(r) < FASTEST)
     return slow if state.attitude is None else slow & (jnp.abs(state.attitude.theta) < jnp.pi / 2)
 
 
 def _errors(
-    row: Rows, predicted: tuple[Lanes, ...], weights: tuple[Lanes, ...], sound: Bool[Array, "*#lanes"]
+    row: Rows, predicted: tuple[Lanes, ...], weights: tuple[Lanes, ...], feasible: Bool[Array, "*#lanes"]
 ) -> list[Lanes]:
     return [
-        jnp.where(jnp.isnan(y) | ~sound, 0.0, w * (y - x))
+        jnp.where(jnp.isnan(y) | ~feasible, 0.0, w * (y - x))
         for y, w, x in zip(row.measured, weights, predicted, strict=True)
     ]
 
