@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ._custom_types import Count, Numeric, RotorSpeeds, Scalar, States, as_float
+from ._custom_types import Count, RotorSpeeds, Scalar, States, as_float
 from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
@@ -113,13 +113,18 @@ class Flight(eqx.Module):
         return Inputs(self.omega, self.dt, self.body_velocity, stretches, self.voltage)
 
     @property
-    def channels(self) -> Float[Numeric, "samples 15"]:
-        """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured. NumPy, unless the flight is traced."""
-        return with_force(self.states, self.specific_force)
+    def channels(self) -> Float[Array, "samples 15"]:
+        """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
+        return with_force(self.states, self.specific_force, jnp)
+
+    @property
+    def recorded(self) -> Float[np.ndarray, "samples 15"]:
+        """`channels` of a recorded flight as NumPy, without a compiled program."""
+        force = self.specific_force
+        return with_force(np.asarray(self.states), None if force is None else np.asarray(force), np)
 
 
-def with_force(states: Any, force: Any) -> Any:
-    """The channels of a flight as one array; NaN: not measured. What is known needs no compiled program."""
-    numpy = jnp if isinstance(states, Tracer) or isinstance(force, Tracer) else np
+def with_force(states: Any, force: Any, numpy: Any) -> Any:
+    """The channels of a flight as one array of `numpy` or `jax.numpy`; NaN: not measured."""
     nothing = numpy.full((*states.shape[:-1], len(FORCE_NAMES)), numpy.nan, states.dtype)
     return numpy.concatenate([states, nothing if force is None else force], axis=-1)

@@ -76,7 +76,7 @@ def fly_batch(loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt
 
     def one(loop: ClosedLoop, references: References, key: Key) -> Flight:
         flight = fly_closed_loop(loop, references, dt=dt, key=key, substeps=_SUBSTEPS)
-        vertical = jnp.asarray(flight.channels[:, -1])
+        vertical = flight.channels[:, -1]
         nothing = jnp.zeros_like(vertical)
         force = jnp.stack(to_earth(Attitude(*flight.states[:, ANGLES].T), (nothing, nothing, vertical)), axis=1)
         velocity = dt * jnp.cumsum(force.at[:, 2].add(-loop.airframe.gravity), axis=0)

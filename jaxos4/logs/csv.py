@@ -83,9 +83,7 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
     if flight.commanded and airframe is not None and np.isfinite(airframe.max_rotor_speed):
         names, omega = COMMAND_NAMES, omega / np.asarray(airframe.max_rotor_speed)
     needed = {"t": np.asarray(flight.time), **dict(zip(names, omega.T, strict=True))}
-    measured: dict[str, np.ndarray] = dict(
-        zip((*STATE_NAMES, *FORCE_NAMES), np.asarray(flight.channels).T, strict=True)
-    )
+    measured: dict[str, np.ndarray] = dict(zip((*STATE_NAMES, *FORCE_NAMES), flight.recorded.T, strict=True))
     if flight.voltage is not None:
         measured["voltage"] = np.asarray(flight.voltage)
     for name, column in {**needed, **measured}.items():

@@ -242,7 +242,7 @@ class Recording(NamedTuple):
     @property
     def channels(self) -> Float[np.ndarray, "samples 15"]:
         """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
-        return with_force(self.states, self.specific_force)
+        return with_force(self.states, self.specific_force, np)
 
     def rows(self, part: slice) -> "Recording":
         """Some samples of the recording; their time stays as recorded."""

@@ -146,15 +146,14 @@ class ShootingProblem(AbstractProblem):
 
     def measured(self) -> Float[Array, "samples columns"]:
         """The measurements in the order of `columns`. A known first sample is NaN: it is no data."""
-        channels = self.flight.channels if self.model.force_axes else self.flight.states
-        measured = jnp.asarray(channels)[:, self.columns]
+        measured = (self.flight.channels if self.model.force_axes else self.flight.states)[:, self.columns]
         if self.initial_state is None:
             return measured
         return jnp.where((np.arange(measured.shape[0]) > 0)[:, None], measured, jnp.nan)
 
     def recorded(self) -> Float[np.ndarray, "samples columns"]:
         """`measured` as NumPy, without a compiled program."""
-        channels = np.asarray(self.flight.channels)[:, self.columns]
+        channels = self.flight.recorded[:, self.columns]
         if self.initial_state is not None:
             channels[0] = np.nan
         return channels
