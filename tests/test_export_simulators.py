@@ -78,7 +78,7 @@ def mujoco_acceleration(found, states, omega):
 
     model = mujoco_model(found)
     data, accelerations = mujoco.MjData(model), []
-    thrusts = found.vehicle.airframe.thrust_coefficient * omega**2
+    thrusts = found.vehicle.thrust_coefficient * omega**2
     for state, quaternion, thrust in zip(states, quaternions(states), thrusts, strict=True):
         data.qpos[:] = np.append(state[[0, 2, 4]], np.roll(quaternion, 1))
         data.qvel[:] = state[[1, 3, 5, 7, 9, 11]]
@@ -141,7 +141,7 @@ def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
     found = read(tmp_path, vehicle_result(values))
     states, _ = random_states(0, 1)
     states[:, [7, 9, 11]] = 0.0
-    hover = np.full((STATES, 4), found.vehicle.airframe.hover_speed)
+    hover = np.full((STATES, 4), found.vehicle.hover_speed)
     simulated = rotorpy_acceleration(found, states, hover, "Multirotor")[:, :3]
     assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
 

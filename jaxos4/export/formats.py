@@ -122,14 +122,14 @@ def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
         """The inertia of a unit mass at a place about the origin [m^2]."""
         return place @ place * np.eye(3) - np.outer(place, place)
 
-    share = _ROTOR_MASS * vehicle.airframe.mass
+    share = _ROTOR_MASS * vehicle.mass
     # The link of a rotor is a thin disc.
-    about_axis = vehicle.airframe.rotor_inertia or share * (_ROTOR * vehicle.arm) ** 2 / 2
+    about_axis = vehicle.rotor_inertia or share * (_ROTOR * vehicle.arm) ** 2 / 2
     rotor = np.diag([about_axis / 2, about_axis / 2, about_axis])
-    places = np.column_stack([vehicle.airframe.rotor_positions, np.zeros(4)])
-    mass = vehicle.airframe.mass - 4 * share
+    places = np.column_stack([vehicle.rotor_positions, np.zeros(4)])
+    mass = vehicle.mass - 4 * share
     center = -share * places.sum(axis=0) / mass
-    rest = np.diag(vehicle.airframe.inertia) - 4 * rotor - mass * steiner(center)
+    rest = np.diag(vehicle.inertia) - 4 * rotor - mass * steiner(center)
     body = mass, center, rest - share * sum(steiner(place) for place in places)
     return {"body": body, "rotor": (share, np.zeros(3), rotor), "slowdown": _SLOWDOWN}
 
@@ -145,7 +145,7 @@ def _templates() -> jinja2.Environment:
     return made
 
 
-def _numbers(*values: Any) -> str:
+def _numbers(*values: float) -> str:
     """Numbers with all their digits; 0 has no sign."""
     return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
 

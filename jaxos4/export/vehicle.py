@@ -1,6 +1,5 @@
 """The vehicle that simulators get: a rigid body with four rotors and the identified parameters."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -22,9 +21,15 @@ _FULL_SCALE = 2.0
 
 
 class RigidVehicle(NamedTuple):
-    """A rigid body with four rotors, and what acts on it. A rotor speed is the speed that makes the thrust b omega^2.
+    """A rigid body with four rotors, in a frame with x forward, y left, z up and the centre of mass at its origin.
 
-    - `airframe`: with the identified constants. The origin of `rotor_positions` is the centre of mass.
+    A rotor speed is the speed that makes the thrust b omega^2: see `thrust_curve`.
+
+    - `mass` [kg], `gravity` [m/s^2], `inertia`: Ix, Iy, Iz [kg m^2].
+    - `rotor_positions`: x and y of each rotor [m]. `rotor_spins`: 1 is counter-clockwise seen from above.
+    - `thrust_coefficient`: b [N s^2/rad^2]. `drag_coefficient`: d, yaw torque = -spin d omega^2 [N m s^2/rad^2].
+    - `rotor_inertia`: J_R [kg m^2].
+    - `max_rotor_speed`: full scale [rad/s].
     - `lag`, `delay`: lag and delay of the rotors behind their commands [s].
     - `torque`: constant, about each axis [N m].
     - `damping`: torque against the body rate about each axis [N m s].
@@ -33,7 +38,15 @@ class RigidVehicle(NamedTuple):
     - `thrust_curve`: c. A command u of full scale makes the speed w `max_rotor_speed` with c w + (1 - c) w^2 = u.
     """
 
-    airframe: Airframe
+    mass: float
+    gravity: float
+    inertia: Float[np.ndarray, "3"]
+    rotor_positions: Float[np.ndarray, "4 2"]
+    rotor_spins: Float[np.ndarray, "4"]
+    thrust_coefficient: float
+    drag_coefficient: float
+    rotor_inertia: float
+    max_rotor_speed: float
     lag: float
     delay: float
     torque: Float[np.ndarray, "3"]
@@ -45,23 +58,29 @@ class RigidVehicle(NamedTuple):
     @property
     def arm(self) -> float:
         """The root mean square of the distances from the centre of mass to the rotors [m]."""
-        return float(np.sqrt(np.square(self.airframe.rotor_positions).sum(axis=1).mean()))
+        return float(np.sqrt(np.square(self.rotor_positions).sum(axis=1).mean()))
+
+    @property
+    def hover_speed(self) -> float:
+        """The rotor speed [rad/s] at which four equal rotors carry the weight."""
+        return float(np.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient)))
 
     @property
     def torque_ratio(self) -> float:
         """The yaw torque of a rotor over its thrust [m]."""
-        return float(self.airframe.drag_coefficient / self.airframe.thrust_coefficient)
+        return self.drag_coefficient / self.thrust_coefficient
 
     @property
     def hover_thrust(self) -> Float[np.ndarray, "4"]:
         """The thrust of each rotor [N] that carries the weight and balances the constant torque."""
-        mixer, weight = np.asarray(self.airframe.mixer), self.airframe.mass * self.airframe.gravity
-        return np.linalg.solve(mixer / self.airframe.thrust_coefficient, np.append(-self.torque, weight))
+        x, y = self.rotor_positions.T
+        yaw = -self.rotor_spins * self.drag_coefficient / self.thrust_coefficient
+        return np.linalg.solve(np.stack([y, -x, yaw, np.ones(4)]), np.append(-self.torque, self.mass * self.gravity))
 
     @property
     def full_thrust(self) -> float:
         """The thrust of one rotor at full scale [N]."""
-        return float(self.airframe.thrust_coefficient * self.airframe.max_rotor_speed**2)
+        return self.thrust_coefficient * self.max_rotor_speed**2
 
     @property
     def thrust_share(self) -> str:
@@ -75,20 +94,19 @@ class RigidVehicle(NamedTuple):
 
         It makes the mean of `drag` along x and y, and that along z, when the rotors turn at the hover speed.
         """
-        return np.array([self.drag[:2].mean(), self.drag[2]]) / (4 * np.asarray(self.airframe.hover_speed))
+        return np.array([self.drag[:2].mean(), self.drag[2]]) / (4 * self.hover_speed)
 
     @property
     def impossible(self) -> str:
         """The reason why no vehicle can be like this. Empty if there is none."""
-        inertia = np.asarray(self.airframe.inertia)
-        for name, moment in zip(INERTIAS, inertia, strict=True):
+        for name, moment in zip(INERTIAS, self.inertia, strict=True):
             if not moment > 0:
                 return f"{name} = {moment:.3g} kg m^2 is not positive"
-            if 2 * moment > inertia.sum():
+            if 2 * moment > self.inertia.sum():
                 return f"{name} = {moment:.3g} kg m^2 exceeds the sum of the other two moments of inertia"
-        if not self.airframe.thrust_coefficient > 0:
+        if not self.thrust_coefficient > 0:
             return "the thrust is not positive"
-        if not 0 <= 4 * self.airframe.rotor_inertia < inertia[2]:
+        if not 0 <= 4 * self.rotor_inertia < self.inertia[2]:
             return "the rotors have no inertia that a part of the vehicle can have"
         if not 0 < self.thrust_curve < 2:
             return f"thrust_curve = {self.thrust_curve:.3g} is no motor's; it must be between 0 and 2"
@@ -104,7 +122,7 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     **Arguments:** `values`: the parameters of a `FlightModel`, by name. The airframe gives the constants that are
     missing. Offsets of several recordings are averaged.
     """
-    gain, curve = values.get("thrust_gain", 1.0), values.get("thrust_curve", 1.0)
+    mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)
     for axis, inverse in enumerate(INERTIAS.values()):
         if inverse in values:
@@ -117,28 +135,32 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     # The centre of mass, x and y, in the frame of the airframe's rotor positions [m].
     named = slopes | {"alpha3": gain / inertia[0], "alpha6": gain / inertia[1]}
     found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)
+    center = np.array([coordinate.value for coordinate in found])
     reaction = values.get("rotor_reaction")
-    body = dataclasses.replace(
-        airframe,
+    rotor_inertia = float(airframe.rotor_inertia) if reaction is None else reaction * inertia[2]
+    speed = float(airframe.max_rotor_speed)
+    drag = np.array([values.get(f"{axis}_drag", 0.0) for axis in "xyz"])
+    moment = [values.get(f"{axis}_velocity", 0.0) for axis in AXES[:2]]
+    vehicle = RigidVehicle(
+        mass=mass,
+        gravity=float(airframe.gravity),
         inertia=inertia,
-        rotor_positions=np.asarray(airframe.rotor_positions) - [coordinate.value for coordinate in found],
-        thrust_coefficient=gain * airframe.thrust_coefficient,
-        drag_coefficient=gain * airframe.drag_coefficient,
-        rotor_inertia=airframe.rotor_inertia if reaction is None else reaction * inertia[2],
-    )
-    lag = values.get("rotor_lag", 0.0)
-    if gain > 0 and not airframe.has_full_scale:
-        body = dataclasses.replace(body, max_rotor_speed=_FULL_SCALE * body.hover_speed)
-    elif gain > 0 and 0 < curve < 2:
-        # The load of the propeller shortens the lag of a motor: that of small changes in hover, `jaxos4.models.rotors`.
-        lag /= float(curve + 2 * (1 - curve) * body.hover_speed / body.max_rotor_speed)
-    return RigidVehicle(
-        airframe=body,
-        lag=lag,
+        rotor_positions=np.asarray(airframe.rotor_positions, dtype=float) - center,
+        rotor_spins=np.asarray(airframe.rotor_spins, dtype=float),
+        thrust_coefficient=gain * float(airframe.thrust_coefficient),
+        drag_coefficient=gain * float(airframe.drag_coefficient),
+        rotor_inertia=rotor_inertia,
+        max_rotor_speed=speed,
+        lag=values.get("rotor_lag", 0.0),
         delay=values.get("rotor_delay", 0.0),
         torque=inertia * offset,
         damping=inertia * np.array([values.get(f"{axis}_damping", 0.0) for axis in AXES]),
-        drag=float(airframe.mass) * np.array([values.get(f"{axis}_drag", 0.0) for axis in "xyz"]),
-        flapping=inertia[:2] * [values.get(f"{axis}_velocity", 0.0) for axis in AXES[:2]],
-        thrust_curve=curve,
+        drag=mass * drag,
+        flapping=inertia[:2] * moment,
+        thrust_curve=values.get("thrust_curve", 1.0),
     )
+    if not np.isfinite(speed) and gain > 0:
+        return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed)
+    # The load of the propeller shortens the lag of a motor: that of small changes in hover (`jaxos4.models.rotors`).
+    curve, share = vehicle.thrust_curve, vehicle.hover_speed / speed if gain > 0 else 0.0
+    return vehicle._replace(lag=vehicle.lag / (curve + 2 * (1 - curve) * share)) if 0 < curve < 2 else vehicle
