@@ -3,9 +3,9 @@
 JAX keeps compiled programs, and finds one by its traced program. To trace takes longer than to read what is compiled.
 So the traced program is exported to the same folder. The name of its file is a digest of the function, the shapes and
 static values of its arguments, the sources of `jaxos4`, the installed packages and JAX's settings. This is enough for a
-command, which runs no other code. A program of the user may add a term to a table, or switch a setting in a part of the
-program: so only the command line keeps programs. To read a file runs its code: none is read from or written to a folder
-or a file that another user owns, or can write to.
+command, which runs no other code. It is not enough for a program of the user, who may add a term to a table, or switch
+a setting in a part of the program: so only the command line keeps programs, see `keep_programs`. To read a file runs
+its code: none is read from or written to a folder or a file that another user owns, or can write to.
 """
 
 import contextlib
@@ -13,11 +13,15 @@ import hashlib
 import io
 import os
 import pickle  # noqa: TID251 - nobody else can write what it reads
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from ._files import write_atomically
+
+# Packages whose code the digest knows. A program that depends on a class or function of another package is not kept.
+_KNOWN = {"jaxos4", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "optax", "numpy", "builtins"}
 
 _programs: dict[str, Callable[..., Any] | None] = {}
 _surroundings: list[bytes] = []  # what every program of this process depends on; empty: nothing is kept
@@ -49,12 +53,12 @@ def kept_program(
     import jax
 
     folder = jax.config.values["jax_compilation_cache_dir"]
-    if not folder or not _is_private(folder) or jax.device_count() > 1 or "<" in function.__qualname__:
+    if not folder or not _is_private(folder) or jax.device_count() > 1 or not _is_known(function):
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
     shapes = [(x.shape, str(x.dtype), getattr(x, "weak_type", False)) if eqx.is_array(x) else x for x in leaves]
     described = io.BytesIO()
-    pickler = pickle.Pickler(described)
+    pickler = _Pickler(described)
     pickler.fast = True  # equal values have equal bytes, whether or not their parts are one object
     try:
         pickler.dump((function.__module__, function.__qualname__, options, shapes, tree))
@@ -81,6 +85,20 @@ def _compiled(traced: Any, results: Any, options: dict[str, Any], arrays: list[A
         return jax.block_until_ready(jax.tree.unflatten(tree, of_arrays(*leaves)))
 
     return call
+
+
+def _is_known(code: Any) -> bool:
+    """Whether a class or function has a name in a package that the digest knows."""
+    return "<" not in code.__qualname__ and code.__module__.partition(".")[0] in _KNOWN
+
+
+class _Pickler(pickle.Pickler):
+    """Writes classes and functions by name, and refuses those whose code is not known."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type | types.FunctionType) and not _is_known(obj):
+            raise pickle.PicklingError(f"the code of {obj} is not known")
+        return NotImplemented
 
 
 def _is_private(place: str | Path | int) -> bool:

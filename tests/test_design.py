@@ -13,7 +13,7 @@ from jaxos4 import design
 from jaxos4.design import Envelope
 from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
 from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
-from jaxos4.design.task import criterion_of
+from jaxos4.design.task import CRITERIA, criterion_of
 from jaxos4.study import load_study
 from jaxos4.study.cell import fleet_of
 
@@ -26,8 +26,8 @@ LOOP_DT, LOOP_SECONDS = 0.004, 4.0
 CLOSED = ("--closed-loop", "--airframe", "mine.toml")
 
 
-OPEN_SETTINGS = {"duration": SECONDS, "dt": 0.01, "channels": "all", "start_is_known": True}
-LOOP_SETTINGS = {"duration": LOOP_SECONDS, "dt": LOOP_DT}
+OPEN_SETTINGS = {"duration": SECONDS, "dt": 0.01, "channels": "all", "criterion": "D", "start_is_known": True}
+LOOP_SETTINGS = {"duration": LOOP_SECONDS, "dt": LOOP_DT, "criterion": "D"}
 
 
 @pytest.fixture(scope="module")
@@ -217,15 +217,19 @@ def test_a_file_is_refused_in_one_line(tmp_path, read, text, said):
         design.read_input(path, 0.02) if read == "input" else design.read_references(path)
 
 
-# The criterion and envelopes.
+# Criteria and envelopes.
 
 
-def test_the_criterion_is_the_volume_of_the_relative_bounds_without_the_nuisances():
+def test_criteria_are_means_of_the_relative_bounds_without_the_nuisances():
     factor, half_width = np.random.default_rng(0).normal(size=(7, 7)), np.array([1.0, 2.0, 0.5])
     information = factor @ factor.T
     relative = np.linalg.inv(information)[:3, :3] / np.outer(half_width, half_width)
-    found = jax.jit(criterion_of)(information, half_width)
-    np.testing.assert_allclose(found, np.log(np.linalg.det(relative)) / 6, rtol=1e-9)
+    criterion = jax.jit(criterion_of, static_argnums=2)
+    value = {name: float(criterion(information, half_width, name)) for name in CRITERIA}
+    np.testing.assert_allclose(value["D"], np.log(np.linalg.det(relative)) / 6, rtol=1e-9)
+    np.testing.assert_allclose(value["A"], np.log(np.trace(relative) / 3) / 2, rtol=1e-9)
+    worst = np.log(np.diagonal(relative).max()) / 2
+    assert worst <= value["worst"] <= worst + np.log(3) / 16
 
 
 def test_an_envelope_is_just_kept_by_its_flight_and_a_limit_must_be_a_positive_number():

@@ -21,6 +21,7 @@ from jaxos4._xla import LOOP_FLAGS, NO_OPTIONS, make_loops_fast, quick_jit
 from jaxos4.bracket import _default
 from jaxos4.cli import _jax, _options, estimate
 from jaxos4.closed_loop import LOGGED
+from jaxos4.design.task import CRITERIA
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.export import TARGETS
@@ -151,7 +152,7 @@ import diffrax
 
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_command_keeps_settings(run):
     tables = {"Estimator": ESTIMATORS, "Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
-    tables |= {"Channels": CHANNELS, "Features": FEATURES, "Simulator": TARGETS}
+    tables |= {"Channels": CHANNELS, "Features": FEATURES, "Simulator": TARGETS, "Criterion": CRITERIA}
     for name, table in tables.items():
         kind = getattr(_options, name)
         assert list(map(str, get_args(kind) or kind)) == list(table)

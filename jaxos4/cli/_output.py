@@ -24,7 +24,7 @@ _PHRASES = {
     "`end`": "--to",
 }
 _OPTIONS = (
-    "angle|bandwidth|bracket|channels|distance|dt|duration|estimator|fastest|gust|holdout|horizon|initial_state|"
+    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|gust|holdout|horizon|initial_state|"
     "network|rate|sample_time|samples|seed|slew|slowest|spacing|terms|validate|velocity|window"
 )
 

@@ -152,6 +152,10 @@ def design(
     initial_state: Annotated[
         options.InitialState | None, Option(help="free: estimated too; known: as the first sample. Default: free.")
     ] = None,
+    criterion: Annotated[
+        options.Criterion,
+        Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound."),
+    ] = "D",
     accuracy: Annotated[
         float | None,
         Option(
@@ -198,7 +202,7 @@ def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "Design":
     settings = options.given(
         duration=asked["duration"], dt=asked["dt"], bandwidth=asked["bandwidth"], key=asked["seed"]
     )
-    settings |= {"compare": True, "progress": progress}
+    settings |= {"criterion": asked["criterion"], "compare": True, "progress": progress}
     intervals = options.read_bracket(asked["bracket"])
     if asked["closed_loop"]:
         loop = make_loop(asked)

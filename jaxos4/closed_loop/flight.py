@@ -40,6 +40,8 @@ def random_references(
     - `amplitude`: levels are uniform between -amplitude and amplitude: roll, pitch, yaw [rad], acceleration [m/s^2].
 
     **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
+
+    **Raises:** `ValueError` that names the argument.
     """
     setting("duration", positive=True)(duration)
     setting("dt", positive=True)(dt)
@@ -74,6 +76,8 @@ def fly_closed_loop(
     **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands at
     sample k, or the mean speed of each rotor until sample k + 1. Its `result` is that of `simulate`. After a failure
     the measurements are NaN and the rotor speeds are 0.
+
+    **Raises:** `ValueError` that names the argument.
     """
     shape = jnp.shape(references)
     if len(shape) != 2 or shape[0] < 2 or shape[1] != 4:

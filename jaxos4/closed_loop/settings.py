@@ -1,4 +1,4 @@
-"""The settings of a flight in closed loop: vehicle, air, controller and sensors. One out of range is a `ValueError`.
+"""The settings of a flight in closed loop: vehicle, air, controller and sensors.
 
 Flights share one program if they have the same `log_every` and `logged`, and all or none of them have `air` and
 `sensors`: all other settings are data.
@@ -34,6 +34,8 @@ class Air(eqx.Module):
     - `drag`: of the rotors along x and y [1/s].
     - `inflow`: the thrust that rotors lose as they climb through the air [1/s].
     - `flapping`: moment over inertia and airspeed, in roll and pitch [1/(m s)], of either sign.
+
+    **Raises:** `ValueError` that names the setting.
     """
 
     wind: PerAxis = eqx.field(converter=setting("wind", _XYZ), default=0.0)
@@ -56,8 +58,10 @@ class Sensors(eqx.Module):
     - `bad_samples`: the number of impossible values, 1e6, at random places of gyro and accelerometer.
     - `velocity_noise`: standard deviation of the measured velocity [m/s]. `None`: not measured. Needs `ClosedLoop.air`.
     - `controller_gyro_noise`: `None`: the controller answers the body rates of the log. A number: it answers the true
-      rates with white noise of this standard deviation [rad/s], behind a filter of time constant
+      rates with white noise of its own with this standard deviation [rad/s], behind a filter with the time constant
       `controller_gyro_filter` [s].
+
+    **Raises:** `ValueError` that names the setting.
     """
 
     gyro_vibration: Scalar = eqx.field(converter=setting("gyro_vibration"), default=0.0)

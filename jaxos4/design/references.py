@@ -124,6 +124,7 @@ class References(task.AbstractTask):
     size: int = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
+    criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_references)
 
@@ -131,7 +132,7 @@ class References(task.AbstractTask):
         """See `AbstractTask`."""
         cosines, sines = jnp.moveaxis(coefficients.reshape(4, 2, -1), 1, 0)
         added = jnp.einsum("rk,rkuv->uv", jnp.square(cosines) + jnp.square(sines), self.added)
-        return task.criterion_of(jnp.asarray(self.base) + added, jnp.ones(len(INERTIAS), dtype=float))
+        return task.criterion_of(jnp.asarray(self.base) + added, jnp.ones(len(INERTIAS), dtype=float), self.criterion)
 
     def uses(self, coefficients: Coefficients) -> Uses:
         """See `AbstractTask`."""
@@ -181,6 +182,7 @@ def design_references(
     bracket: Bracket | None = None,
     duration: float = 20.0,
     dt: float = 0.004,
+    criterion: str = "D",
     bandwidth: float = 6.0,
     compare: bool = False,
     key: Key | int,
@@ -195,7 +197,7 @@ def design_references(
     **Arguments:**
 
     - `loop`: the vehicle, its controller, its gusts and its sensors.
-    - `angle`, `acceleration`: the largest reference of roll, pitch and yaw [rad], and of the vertical acceleration.
+    - `angle`: the largest reference of roll, pitch and yaw [rad]. `acceleration`: the largest vertical one [m/s^2].
     - `limits`: some limits of an `Envelope`, by name, but not `slew`. The others are those that 3-2-1-1 references with
       the same largest values need; those of rotor speeds are the airframe's.
     - `bracket`: of a `FlightModel`; by default the model's.
@@ -206,7 +208,7 @@ def design_references(
     for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
         if not 0 < value <= most:
             raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
-    task.check_ranges(duration, dt, bandwidth, samples=(250, 20_000), cycles=2, fastest=0.1)
+    task.check_settings(duration, dt, bandwidth, criterion, samples=(250, 20_000), cycles=2, fastest=0.1)
     progress("limits")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model_of(loop)) if bracket is None else bracket
@@ -227,6 +229,7 @@ def design_references(
         size=8 * tones.number,
         names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
         units=fleet.inertias_first(("kg m^2",) * 3, fleet.model.parameter_units),
+        criterion=criterion,
         **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )
     return task.solve(references, (8, 0.85, 80), compare=compare, key=key, progress=progress)

@@ -82,6 +82,7 @@ class RotorSpeeds(task.AbstractTask):
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     start_is_known: bool = eqx.field(static=True)
+    criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_input)
 
@@ -97,7 +98,7 @@ class RotorSpeeds(task.AbstractTask):
         def one(parameters: Parameters) -> Scalar:
             slopes = self._sense(omega, parameters)
             information = jnp.einsum("tsu,tsv->uv", slopes, slopes)
-            return task.criterion_of(information, jnp.asarray(self.scale))
+            return task.criterion_of(information, jnp.asarray(self.scale), self.criterion)
 
         return jax.vmap(one)(self.draws).mean()
 
@@ -249,6 +250,7 @@ def design_input(
     dt: float = 0.01,
     channels: str = "all",
     start_is_known: bool = False,
+    criterion: str = "D",
     bandwidth: float = 4.0,
     compare: bool = False,
     key: Key | int,
@@ -257,8 +259,8 @@ def design_input(
     """Design the rotor speeds that identify a vehicle's parameters most accurately within an envelope.
 
     The input is a multisine. Its amplitudes are searched from random starts, by the gradient of the simulator. The
-    criterion is the volume of the confidence ellipsoid, as a mean over vehicles from the bracket. At the end 200
-    vehicles fly the input with a tenth of the step, and its amplitude is reduced until all stay within the envelope.
+    criterion is the mean over vehicles from the bracket. At the end 200 vehicles fly the input with a tenth of the
+    step, and its amplitude is reduced until all of them stay within the envelope.
 
     **Arguments:**
 
@@ -268,13 +270,15 @@ def design_input(
     - `duration`, `dt`: length and sample time [s].
     - `channels`: what will be measured, with the noise of the standard sensors: `"rates"`, `"attitude"` or `"all"`.
     - `start_is_known`: whether the flight starts exactly at rest. If not, the initial state will be estimated too.
+    - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
+      bound. Bounds are shares of the bracket's half-widths.
     - `bandwidth`: the highest frequency [Hz]. `compare`: whether to judge the standard inputs in the envelope too.
     - `key`: for the draws and the starts, or a seed. `progress`: called with the name of each stage.
 
     **Raises:** `InputError` if an argument is out of range, the vehicle cannot hover within the envelope, or no input
     within it excites a parameter.
     """
-    task.check_ranges(duration, dt, bandwidth, samples=(50, 2500), cycles=1, fastest=0.25)
+    task.check_settings(duration, dt, bandwidth, criterion, samples=(50, 2500), cycles=1, fastest=0.25)
     if channels not in CHANNELS:
         raise InputError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
     if model.forcing_parameters or model.force_axes:
@@ -299,6 +303,7 @@ def design_input(
         names=model.parameter_names,
         units=model.parameter_units,
         start_is_known=start_is_known,
+        criterion=criterion,
         **tones,
     )
     found = task.solve(rotor_speeds, _PLAN, compare=compare, key=key, progress=progress)

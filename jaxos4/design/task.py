@@ -1,8 +1,7 @@
 """A design: the search for the most informative inputs within an envelope, a comparison with standard inputs, files.
 
-The criterion is D-optimality: the volume of the confidence ellipsoid. The search minimises criterion + penalty by BFGS.
-The penalty grows from stage to stage, so that the limits hold better and better. They hold exactly only after the task
-has flown the inputs and has reduced their amplitude.
+The search minimises criterion + penalty by BFGS. The penalty grows from stage to stage, so that the limits hold better
+and better. They hold exactly only after the task has flown the inputs and has reduced their amplitude.
 
 Reference: Nocedal and Wright, Numerical Optimization, ch. 6 (BFGS) and 17 (penalty).
 """
@@ -24,7 +23,7 @@ from .._files import write_atomically
 from .._xla import quick_jit
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
-from ..linalg import joint_factor
+from ..linalg import gram, joint_factor
 from ..logs import write_flight
 from ..logs.assemble import SPEED_NAMES
 from ..logs.csv import read_table
@@ -37,6 +36,9 @@ Inputs = Float[np.ndarray, "samples 4"]
 Flown = tuple[Inputs, dict[str, float]]
 Progress = Callable[[str], None]
 
+CRITERIA = ("D", "A", "worst")
+# In the criterion `worst`, the largest bound is replaced by this norm of the bounds, which has derivatives.
+_NORM = 16
 # The penalty of each stage.
 _PENALTIES = (10.0, 50.0, 250.0, 1250.0, 6000.0)
 # BFGS starts with a unit matrix as second derivative, so its unknowns are coefficients over their usual size.
@@ -187,18 +189,28 @@ def _minimise(
     return jax.vmap(one)(starts)
 
 
-def criterion_of(information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"]) -> Scalar:
-    """The logarithm of the geometric mean of the first unknowns' bounds, as shares of `half_width`. Smaller is better.
+def criterion_of(
+    information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str
+) -> Scalar:
+    """The logarithm of a mean bound of the first unknowns, see `design_input`. Smaller is better.
 
-    It is the edge of a cube with the volume of their confidence ellipsoid.
+    A bound is a standard deviation as a share of the `half_width` of its parameter's bracket. The volume of `"D"` is
+    given as the edge of a cube.
     """
     count = half_width.shape[0]
-    volume = -jnp.log(jnp.diagonal(joint_factor(information[None], count).factor[0, :count, -count:])).sum()
-    return (volume - jnp.log(half_width).sum()) / count
+    factor, basis = joint_factor(information[None], count)
+    if criterion == "D":
+        volume = -jnp.log(jnp.diagonal(factor[0, :count, -count:])).sum()
+        return (volume - jnp.log(half_width).sum()) / count
+    squares = jnp.diagonal(gram(basis[0, :count, -count:])) / jnp.square(half_width)
+    if criterion == "A":
+        return jnp.log(squares.mean()) / 2
+    largest = squares.max()
+    return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (_NORM / 2)).sum()) / _NORM
 
 
-def check_ranges(
-    duration: float, dt: float, bandwidth: float, *, samples: tuple[int, int], cycles: int, fastest: float
+def check_settings(
+    duration: float, dt: float, bandwidth: float, criterion: str, samples: tuple[int, int], cycles: int, fastest: float
 ) -> None:
     """Raise `InputError` for settings that cannot be designed for.
 
@@ -207,6 +219,8 @@ def check_ranges(
     if not (dt > 0 and samples[0] <= duration / dt <= samples[1]):
         allowed = f"{samples[0]} to {samples[1]} samples of a positive `dt`"
         raise InputError(f"`duration` must be {allowed}, got {duration:g} s and {dt:g} s.")
+    if criterion not in CRITERIA:
+        raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
     low, high = cycles / duration, fastest / dt
     if not low <= bandwidth <= high:
         limits = f"{cycles} / `duration` and {fastest:g} / `dt`, {low:.3g} to {high:.3g} Hz"
