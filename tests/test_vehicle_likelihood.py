@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
+from jaxos4.identification import sample_time
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.fit import fit_case
 from jaxos4.identification.results import Constant, HeldParameter, SampleTime
@@ -152,6 +153,17 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
     unclear = fit._replace(held=dict.fromkeys(fit.problem.unknowns.names, held["thrust_gain"]))
     assert not answer_of(case, unclear, case.shooting.flight).constants
+
+
+def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeypatch):
+    cases = [case_of(flown(), DT * length) for length in (2, 4)]
+
+    def nowhere(case, found):
+        return case._replace(problem=case.problem.starting_from(jnp.full_like(found.parameters, 1e9)))
+
+    monkeypatch.setattr(sample_time, "_starting_from", nowhere)
+    _, _, answers = fit_at_sample_times(cases, progress=lambda stage: None)
+    assert [set(answer.constants) for answer in answers] == [{"Ix", "Iy", "Iz"}] * 2
 
 
 # The likelihood.

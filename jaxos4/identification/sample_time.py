@@ -18,6 +18,7 @@ import numpy as np
 from ..airframe import Airframe
 from ..estimate import REACH, Estimate
 from ..flight import Flight
+from ..results import result_names
 from ..shooting import InnovationsProblem, for_threads
 from .answers import AXES, NOISY, overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
@@ -46,10 +47,12 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     try:
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            case = case if found is None else _starting_from(case, found)
             if not fits:
                 beside.submit(for_threads(compile_ahead), case)  # what fails here fails again when it is needed
-            found = jax.block_until_ready(case.estimator(case.problem))
+            begin = case if found is None else _starting_from(case, found)
+            found = jax.block_until_ready(begin.estimator(begin.problem))
+            if begin is not case and not has_answer(found):  # the answer for longer samples was no start
+                found = jax.block_until_ready(case.estimator(case.problem))
             fits.append(beside.submit(for_threads(fit_case), case, first=found))
         fits = [fit.result() for fit in fits][::-1]
     finally:  # after an error, what has not begun is not computed
@@ -61,14 +64,13 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
 
 
 def _starting_from(case: Case, found: Estimate) -> Case:
-    """The case, whose search starts at the estimate of all parameters for another sample time, if there is one."""
-    if not has_answer(found) or not isinstance(case.problem, InnovationsProblem):
+    """The case, whose search starts at the estimate of all parameters for longer samples, if that is a minimum."""
+    if str(result_names(found.result)) != "successful" or not isinstance(case.problem, InnovationsProblem):
         return case
     own, start = case.problem.problem.unknowns, np.asarray(found.parameters)
     off = np.abs(start[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
-    if not (off < _NEAR * REACH).all():
-        # The answer may be another minimum. Only the noise starts at that of the last answer.
-        start = np.where(np.arange(start.size) >= own.count, start, np.nan)
+    if not (off < _NEAR * REACH).all():  # the answer may be another minimum
+        return case
     return case._replace(problem=case.problem.starting_from(start))
 
 
