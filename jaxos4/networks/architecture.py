@@ -1,5 +1,6 @@
 """From features to unknowns: a linear map, a learnt correction, the learnt size of the error, calibrated intervals."""
 
+import functools
 import math
 import statistics
 from typing import Any, NamedTuple
@@ -57,9 +58,10 @@ class GatedPerceptron(eqx.Module):
     last: eqx.nn.Linear
 
     def __init__(self, in_size: int, out_size: int, width: int, depth: int, *, key: Key):
-        self.hidden = eqx.nn.MLP(in_size, width, width, depth - 1, _SILU, _SILU, dtype=float, key=key)
-        self.gate = eqx.nn.Linear(in_size, width, dtype=float, key=key)
-        self.last = eqx.nn.Linear(width, out_size, dtype=float, key=key)
+        first, second, third = jax.random.split(key, 3)
+        self.hidden = eqx.nn.MLP(in_size, width, width, depth - 1, _SILU, _SILU, dtype=float, key=first)
+        self.gate = eqx.nn.Linear(in_size, width, dtype=float, key=second)
+        self.last = eqx.nn.Linear(width, out_size, dtype=float, key=third)
 
     def __call__(self, x: Float[Array, " in"]) -> Float[Array, " out"]:
         """The output for inputs `x`."""
@@ -67,19 +69,17 @@ class GatedPerceptron(eqx.Module):
 
 
 class Regressor(eqx.Module):
-    """The trained part of a network: a linear map `skip`, a perceptron that corrects it, and the error's spread.
-
-    `first_regressor` draws the weights that training begins with.
-    """
+    """The trained part of a network: a linear map `skip`, a perceptron that corrects it, and the error's spread."""
 
     skip: Float[Array, "unknowns features"]
     perceptron: GatedPerceptron
     spread: eqx.nn.MLP
 
-    def __init__(self, skip: Float[Array, "unknowns features"], *, width: int, depth: int):
-        self.skip, sizes, key = skip, (skip.shape[1] + 1, skip.shape[0]), jax.random.key(0)
-        self.perceptron = GatedPerceptron(*sizes, width, depth, key=key)
-        self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=key)
+    def __init__(self, skip: Float[Array, "unknowns features"], *, width: int, depth: int, key: Key):
+        self.skip, sizes = skip, (skip.shape[1] + 1, skip.shape[0])
+        first, second = jax.random.split(key)
+        self.perceptron = GatedPerceptron(*sizes, width, depth, key=first)
+        self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=second)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> tuple[Array, Array]:
         """Unknowns of one flight in bracket coordinates, from its features and its noise scale.
@@ -103,7 +103,7 @@ def first_regressor(linear_map: Float[Array, "unknowns features"], key: Key, sha
         nodes = jax.tree.leaves(regressor, is_leaf=lambda x: isinstance(x, eqx.nn.Linear))
         return [x for node in nodes if isinstance(node, eqx.nn.Linear) for x in (node.weight, node.bias)]
 
-    abstract = eqx.filter_eval_shape(Regressor, linear_map, **shape)
+    abstract = eqx.filter_eval_shape(functools.partial(Regressor, linear_map, **shape), key=key)
     blank = jax.tree.map(lambda x: jnp.zeros_like(x) if isinstance(x, jax.ShapeDtypeStruct) else x, abstract)
     shapes = [array.shape for array in arrays(blank)]
     limits = np.repeat([1 / math.sqrt(weight[1]) for weight in shapes[::2]], 2).tolist()
@@ -152,12 +152,15 @@ class ErrorTable(NamedTuple):
     factors: Float[Array, "scales levels parameters"]
     simultaneous: Float[Array, "scales levels"]
 
-    def at(self, scale: Scalar) -> tuple[Array, ...]:
+    def at(self, scale: Scalar) -> tuple[Array, Array, Array, Array]:
         """`rms`, `correlation`, `factors` and `simultaneous`, interpolated in the logarithm of the noise scale."""
         rows = np.arange(self.scales.shape[0])
         place = jnp.interp(jnp.log(scale), jnp.log(self.scales), as_float(rows))
         weights = jnp.maximum(1 - jnp.abs(place - rows), 0.0)  # of all rows: linear between the two nearest
-        return tuple((weights.reshape(-1, *[1] * (table.ndim - 1)) * table).sum(axis=0) for table in self[1:])
+        rms, correlation, factors, simultaneous = (
+            (weights.reshape(-1, *[1] * (table.ndim - 1)) * table).sum(axis=0) for table in self[1:]
+        )
+        return rms, correlation, factors, simultaneous
 
 
 def calibrated_scales(noise: tuple[float, float]) -> Float[Array, " scales"]:

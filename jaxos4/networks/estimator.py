@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Parameters, Scalar, as_float, integer, setting
 from .._xla import quick_jit
@@ -107,7 +107,7 @@ class NetworkEstimator(eqx.Module):
         scaling, regressor = untrained(features, self, key)
         regressor, history = train(regressor, scaling, features, self, key)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
-        return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history))
+        return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
     def _check(self, problem: ShootingProblem, bracket: Bracket) -> None:
         if CHANNELS[self.channels] > problem.size:
@@ -146,6 +146,7 @@ class TrainedNetwork(AbstractEstimator):
     regressor: Regressor
     errors: ErrorTable
     history: Float[Array, "checks 2"]
+    key: UInt32[Array, "..."]
 
     @property
     def channels(self) -> str:

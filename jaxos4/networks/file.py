@@ -103,7 +103,7 @@ def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
         value = arrays[_name(place)]
         if value.shape != leaf.shape:
             raise ValueError(f"{_name(place)} has shape {value.shape}, expected {leaf.shape}")
-        return as_float(value)
+        return as_float(value) if jnp.issubdtype(leaf.dtype, jnp.floating) else jnp.asarray(value, leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(fill, blank)
 
@@ -113,12 +113,14 @@ def _blank(settings: NetworkEstimator, problem: ShootingProblem, checks: int) ->
     parameters, scales = len(problem.model.parameter_names), calibrated_scales(settings.noise)
     coordinates = Coordinates.of(problem, Bracket.default(problem.model), as_float(1.0))
     features = Features.blank(settings.features, problem, coordinates)
-    unknowns, linear_map = coordinates.center, jnp.zeros((coordinates.center.size, features.size))
-    regressor = Regressor(linear_map, width=settings.width, depth=settings.depth)
+    key, unknowns = jax.random.key(0), coordinates.center
+    linear_map = jnp.zeros((unknowns.size, features.size))
+    regressor = Regressor(linear_map, width=settings.width, depth=settings.depth, key=key)
     shapes = ((parameters,), (parameters, parameters), (len(LEVELS), parameters), (len(LEVELS),))
     errors = ErrorTable(scales, *(jnp.zeros((scales.size, *shape)) for shape in shapes))
     scaling = Scaling(linear_map[0], unknowns, unknowns, scales[0])
-    return TrainedNetwork(settings, features, scaling, regressor, errors, jnp.zeros((checks, 2)))
+    history = jnp.zeros((checks, 2))
+    return TrainedNetwork(settings, features, scaling, regressor, errors, history, jax.random.key_data(key))
 
 
 def _name(path: tuple) -> str:
