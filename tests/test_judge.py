@@ -165,6 +165,8 @@ def test_a_disturbance_larger_than_the_control_is_named():
     assert list(weak) == ["pitch"]
     assert "about pitch, the disturbance" in weak["pitch"]
     assert not overwhelmed(fit._replace(held={"alpha6": HeldParameter(0.0, "1", "")}))
+    # Vehicles hardly yaw: if nothing is known of it, the other axes do not need it.
+    assert list(overwhelmed(fit._replace(held={"alpha8": HeldParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.

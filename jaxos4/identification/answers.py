@@ -82,14 +82,19 @@ def _note(fit: Fit, i: int, half_width: float) -> str:
 
 
 def overwhelmed(fit: Fit) -> dict[str, str]:
-    """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words."""
+    """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
+
+    Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then doubted for that reason.
+    """
     omega, mixer = np.asarray(fit.problem.flight.omega, dtype=float), np.asarray(fit.problem.model.airframe.mixer)
     torques, names = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0), fit.problem.model.parameter_names
     alpha, weak = np.abs(np.asarray(fit.estimate.parameters)), {}
     strengths = {rate: row.strength for rate, row in fit.disturbances.items()}
     for (rate, axis), place, torque in zip(AXES.items(), INVERSE.values(), torques, strict=True):
-        control = alpha[place] * torque if names[place] not in fit.held else np.inf
-        if strengths.get(rate, 0.0) > control:
+        control = alpha[place] * torque
+        if names[place] in fit.held:
+            weak |= {axis: "the flights say less about alpha8 than its bracket"} if axis == "yaw" else {}
+        elif strengths.get(rate, 0.0) > control:
             weak[axis] = (
                 f"about {axis}, the disturbance ({strengths[rate]:.2g} rad/s^2) is larger than what the rotors do "
                 f"({control:.2g} rad/s^2)"
