@@ -46,6 +46,12 @@ def test_hover_and_derivatives():
     slope = jax.jit(jax.grad(lambda mass: eqx.tree_at(lambda a: a.mass, OS4, mass).hover_speed))(jnp.asarray(0.65))
     np.testing.assert_allclose(slope, OS4.hover_speed / (2 * 0.65), rtol=1e-12)
 
+    def roll_authority(positions):
+        return eqx.tree_at(lambda a: a.rotor_positions, OS4, positions).mixer[0, 3]
+
+    slope = jax.grad(roll_authority)(jnp.asarray(OS4.rotor_positions))
+    np.testing.assert_allclose(slope, np.array([[0, 0], [0, 0], [0, 0], [0, OS4.thrust_coefficient]]))
+
 
 def test_toml_with_an_arm_and_with_positions(tmp_path):
     path = tmp_path / "quad.toml"
@@ -91,21 +97,27 @@ def _replaced(key, line):
 BAD = {
     "neither file nor preset": ("os4-simulator, voos, crazyflie", None),
     "missing": ("mass", _replaced("mass", "")),
+    "no layout": ("rotor_positions", _replaced("arm", "")),
     "two layouts": ("arm", GOOD + "rotor_positions = [[1, 0], [0, -1], [-1, 0], [0, 1]]"),
     "unknown": ("colour", GOOD + "colour = 1"),
     "text": ("mass", _replaced("mass", 'mass = "heavy"')),
+    "boolean": ("mass", _replaced("mass", "mass = true")),
     "not a number": ("mass", _replaced("mass", "mass = nan")),
     "zero": ("thrust_coefficient", _replaced("thrust_coefficient", "thrust_coefficient = 0")),
     "negative": ("drag_coefficient", _replaced("drag_coefficient", "drag_coefficient = -1e-7")),
+    "negative arm": ("arm", _replaced("arm", "arm = -0.23")),
+    "list for an arm": ("arm", _replaced("arm", "arm = [0.2, 0.2]")),
     "two inertias": ("inertia", _replaced("inertia", "inertia = [1e-3, 1e-3]")),
     "no rigid body": ("inertia", _replaced("inertia", "inertia = [1e-3, 1e-3, 1e-2]")),
     "ragged": ("rotor_positions", _replaced("arm", "rotor_positions = [[1, 0], [0], [-1, 0], [0, 1]]")),
     "one line": ("rotor_positions", _replaced("arm", "rotor_positions = [[1, 0], [2, 0], [-1, 0], [-2, 0]]")),
     "spins of 2": ("rotor_spins", GOOD + "rotor_spins = [2, -2, 2, -2]"),
     "no yaw": ("rotor_spins", GOOD + "rotor_spins = [1, 1, 1, 1]"),
+    "negative speed": ("max_rotor_speed", GOOD + "max_rotor_speed = -1"),
     "no TOML": ("TOML", "mass: 0.65"),
     "two thrusts": ("hover_speed", GOOD + "hover_speed = 200"),
     "hovers at rest": ("hover_speed", _replaced("thrust_coefficient", "hover_speed = 0")),
+    "hovers without mass": ("mass", _replaced("mass", "").replace("thrust_coefficient = 3.13e-5", "hover_speed = 200")),
     "guessed mass": ("mass", _replaced("mass", 'mass = "guess"')),
     "guessed without arms": ("rotor_positions", _replaced("arm", "rotor_positions = [[0, 0], [0, 0], [0, 0], [0, 0]]")),
 }

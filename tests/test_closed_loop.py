@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.closed_loop import fly_standard
+from jaxos4.noise import coloured
 
 DT, SAMPLES = 0.004, 4001
 RATES, ANGLES, VELOCITY = [7, 9, 11], [6, 8, 10], [1, 3, 5]
@@ -181,6 +182,9 @@ def test_commands_can_act_at_once():
     np.testing.assert_allclose(np.asarray(flight.specific_force)[1:, 2], thrust[:-1], rtol=1e-12)
 
 
+# Gusts.
+
+
 def test_gusts_have_their_strength_and_their_correlation_time_and_follow_from_the_key():
     """A controller without gains answers nothing: the body rates are the integral of the gusts."""
     strength, duration = np.array([1e-3, 2e-3, 3e-3]), 0.05
@@ -197,7 +201,24 @@ def test_gusts_have_their_strength_and_their_correlation_time_and_follow_from_th
     assert not np.array_equal(other.specific_force, flight.specific_force)
 
 
-# Batches, failures, and the command line.
+def test_the_process_is_exact():
+    step, count = 0.02, 200_000
+    noise = np.asarray(coloured(jax.random.normal(jax.random.key(0), (count, 4)), jnp.asarray(step)))
+    error = np.sqrt(2 / (count * step))  # of a variance
+    np.testing.assert_allclose(noise.var(axis=0), 1, atol=4 * error)
+    assert np.abs(np.corrcoef(noise.T) - np.eye(4)).max() < 4 * error
+    for shift in (1, 50, 100):
+        found = (noise[shift:] * noise[:-shift]).mean(axis=0)
+        np.testing.assert_allclose(found, np.exp(-shift * step), atol=4 * error)
+    # Innovations are white and have the right size.
+    fresh = noise[1:] - np.exp(-step) * noise[:-1]
+    np.testing.assert_allclose(fresh.var(axis=0), -np.expm1(-2 * step), rtol=4 * np.sqrt(2 / count))
+
+
+# Batches and failures.
+
+
+# The command line.
 
 
 EVERY_EFFECT = jaxos4.ClosedLoop(

@@ -1,4 +1,4 @@
-"""Exported vehicles in MuJoCo and RotorPy: they accelerate as the model does."""
+"""Exported vehicles in MuJoCo and RotorPy: they accelerate as the model does, and fly what it predicts."""
 
 import importlib
 import json
@@ -10,17 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_results import AIRFRAME, VALUES, vehicle_result
+from synthetic_results import AIRFRAME, VALUES, provenance, vehicle_result
 
 import jaxos4
-from jaxos4.airframe import airframe_from_table, alpha_from_inertia
+from jaxos4.airframe import airframe_from_table, airframe_table, alpha_from_inertia
 from jaxos4.export import export_vehicle, read_result
+from jaxos4.forecast.motion import departures
 
 PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "into_your_simulator.md"
 # The simulators of the programs of the page, in their order.
 PROGRAMS = ("mujoco", "mujoco", "mujoco", "rotorpy")
 STATES = 1000
-TERMS = ("motor", "offset", "center_of_mass", "damping", "velocity", "accelerometer", "inflow", "drag")
+# Terms that make a torque or a force.
+TERMS = ("offset", "center_of_mass", "damping", "velocity", "accelerometer", "inflow", "drag")
+SAMPLE, SECONDS = 0.004, 2.0
 
 
 @pytest.fixture
@@ -63,14 +66,25 @@ def quaternions(states):
     return Rotation.from_euler("ZYX", states[:, [10, 8, 6]]).as_quat()
 
 
-def vehicle_acceleration(values, states, omega, rotor_inertia=0.0):
+def modelled(model, parameters, states, omega):
     """Linear acceleration along the earth's axes and angular acceleration along the body's, by the model."""
-    model = jaxos4.FlightModel(airframe_from_table(AIRFRAME | {"rotor_inertia": rotor_inertia}), terms=TERMS)
-    inertia = np.array([values["thrust_gain"] / values[name] for name in ("alpha3", "alpha6", "alpha8")])
-    given = dict(zip([f"alpha{i}" for i in range(1, 9)], alpha_from_inertia(inertia, rotor_inertia), strict=True))
-    parameters = jnp.array([float((given | values).get(name, 0.0)) for name in model.parameter_names])
     derivative = eqx.filter_jit(eqx.filter_vmap(model.derivative, in_axes=(0, 0, None)))
     return np.asarray(derivative(jnp.asarray(states), jnp.asarray(omega), parameters))[:, [1, 3, 5, 7, 9, 11]]
+
+
+def rigid_model(values, terms=TERMS, rotor_inertia=0.0):
+    """The vehicle model, and its parameters by name; its alphas are those of a rigid body."""
+    model = jaxos4.FlightModel(airframe_from_table(AIRFRAME | {"rotor_inertia": rotor_inertia}), terms=terms)
+    inertia = np.array([values["thrust_gain"] / values[name] for name in ("alpha3", "alpha6", "alpha8")])
+    given = dict(zip([f"alpha{i}" for i in range(1, 9)], alpha_from_inertia(inertia, rotor_inertia), strict=True))
+    given |= values
+    return model, {name: float(given.get(name, 0.0)) for name in model.parameter_names}
+
+
+def vehicle_acceleration(values, states, omega, **options):
+    """Of the vehicle model with all terms."""
+    model, given = rigid_model(values, ("motor", *TERMS), **options)
+    return modelled(model, jnp.array(list(given.values())), states, omega)
 
 
 def mujoco_acceleration(found, states, omega):
@@ -144,6 +158,64 @@ def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
     hover = np.full((STATES, 4), found.vehicle.hover_speed)
     simulated = rotorpy_acceleration(found, states, hover, "Multirotor")[:, :3]
     assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
+
+
+@pytest.fixture(scope="module")
+def predicted_flight(tmp_path_factory):
+    """The exported vehicle, its rotor speeds, and the flight from the first sample as `jaxos4.predict` predicts it."""
+    tmp_path = tmp_path_factory.mktemp("flight")
+    model, values = rigid_model({name: VALUES[name] for name in VALUES if not name.startswith(("rotor", "thrust_cu"))})
+    level = {"strength": 0.0, "unit": "", "time_constant": 0.25, "sensor": 0.01, "correlation": 0.0}
+    about = provenance(terms=list(TERMS), sample_time=SAMPLE)
+    known = {"disturbances": dict.fromkeys(("p", "q", "r", "ax", "ay", "az"), level), "provenance": about, "held": {}}
+    result = vehicle_result(values, airframe=airframe_table(model.airframe), **known)
+    found = read(tmp_path, result)
+    time = SAMPLE * np.arange(round(SECONDS / SAMPLE) + 250)
+    steer = np.sin(2 * np.pi * time[:, None] * [1.1, 1.7, 2.3, 0.9] + [0, 1, 2, 3])
+    hover = np.sqrt(found.vehicle.hover_thrust / float(model.airframe.thrust_coefficient) / VALUES["thrust_gain"])
+    omega = hover * (1 + 0.02 * steer)
+    states = np.zeros((time.size, 12))
+    states[:, [6, 8, 10]], states[:, 1:6:2] = [0.5, 0.3, -2.0], [1.0, -2.0, 0.5]
+    states[1:, 1:6:2] = np.nan  # no changes that the model would have to learn
+    flight = jaxos4.Flight(time=time, omega=omega, states=states, specific_force=np.full((time.size, 3), 9.81))
+    prediction = jaxos4.predict(tmp_path / "found.json", flight, horizon=SECONDS, spacing=1.0)
+    assert prediction.time[0] == 0
+    return found, omega, np.vstack([prediction.begin[0], prediction.unaware[0]])
+
+
+def flown_by_mujoco(found, omega, begin):
+    import mujoco
+
+    model = mujoco_model(found)
+    model.opt.timestep, model.opt.integrator = SAMPLE / 20, mujoco.mjtIntegrator.mjINT_RK4
+    data, states = mujoco.MjData(model), []
+    data.qpos[:], data.qvel[:] = begin[[0, 1, 2, 6, 7, 8, 9]], begin[[3, 4, 5, 10, 11, 12]]
+    for speeds in omega:
+        data.ctrl[:4] = found.vehicle.thrust_coefficient * speeds**2
+        mujoco.mj_step(model, data, 20)
+        states.append(np.concatenate([data.qpos[:3], data.qvel[:3], data.qpos[3:], data.qvel[3:]]))
+    return np.array(states)
+
+
+def flown_by_rotorpy(found, omega, begin):
+    vehicle = rotorpy_vehicle(found, integrator_kwargs={"method": "DOP853", "rtol": 1e-10, "atol": 1e-12})
+    state = {"x": begin[:3], "v": begin[3:6], "q": np.roll(begin[6:10], -1), "w": begin[10:], "wind": np.zeros(3)}
+    states = []
+    for speeds in omega:
+        state = vehicle.step(state | {"rotor_speeds": speeds}, {"cmd_motor_speeds": speeds}, SAMPLE)
+        states.append(np.concatenate([state["x"], state["v"], np.roll(state["q"], 1), state["w"]]))
+    return np.array(states)
+
+
+@pytest.mark.parametrize("fly", [flown_by_mujoco, flown_by_rotorpy])
+def test_a_vehicle_flies_the_predicted_flight(mujoco, predicted_flight, fly):
+    """For 2 s, from the same start, with the same rotor speeds."""
+    found, omega, predicted = predicted_flight
+    flown = fly(found, omega[: len(predicted) - 1], predicted[0])
+    assert np.abs(departures(predicted[1:], flown)).max() < 1e-6
+    assert np.abs(departures(predicted[:1], flown))[-1].min() > 0.05  # it flies somewhere
+    heavier = found._replace(airframe=eqx.tree_at(lambda a: a.mass, found.airframe, 1.001 * found.airframe.mass))
+    assert np.abs(departures(predicted[1:], fly(heavier, omega[: len(predicted) - 1], predicted[0]))).max() > 1e-3
 
 
 @pytest.mark.parametrize(

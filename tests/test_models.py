@@ -174,6 +174,16 @@ def test_models_are_abstract_or_final():
 
 
 @every_model
+def test_the_table_of_parameters_is_complete(model):
+    size = len(model.parameters)
+    assert len(set(model.parameter_names)) == len(model.parameter_units) == size
+    for values in (model.alpha, model.half_width):
+        assert (values.shape, values.dtype) == ((size,), jnp.float64)
+        assert np.isfinite(values).all()
+    assert (np.asarray(model.half_width) > 0).all()
+
+
+@every_model
 def test_the_table_says_what_the_parameters_do(model):
     """The forcing depends on the parameters that say so, and the rates linearly on all others that say so."""
     inputs = Inputs(standard_flight().omega[:20], jnp.asarray(0.01), velocity=jnp.ones((20, 3)))

@@ -172,7 +172,7 @@ def _drive(omega: RotorSpeeds, values: Values, part: Part, airframe: Airframe) -
     return driven(omega, motor, part)
 
 
-def _velocity(forcing: Forcing) -> Vector:
+def _velocity(forcing: Forcing):
     return _known(forcing.velocity, VELOCITY, "body_velocity")
 
 
