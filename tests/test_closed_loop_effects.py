@@ -46,6 +46,16 @@ def test_still_air_and_perfect_sensors_change_nothing():
 # The air.
 
 
+def test_a_climb_ends_at_the_speed_at_which_inflow_takes_the_thrust():
+    """Commands that accelerate by 2 m/s^2 in still air: v = 2 / k_z (1 - exp(-k_z t)), and the force falls to g."""
+    inflow = 0.8
+    _, states, force = fly(LEVEL + [0, 0, 0, 2.0], air={"inflow": inflow})
+    late = TIME > 1
+    expected = 2 / inflow * (1 - np.exp(-inflow * (TIME - 0.06)))  # the rotors follow after lag and delay
+    np.testing.assert_allclose(states[late, 5], expected[late], rtol=5e-3)
+    np.testing.assert_allclose(force[late, 2], GRAVITY + 2 - inflow * states[late, 5], rtol=1e-9)
+
+
 def test_wind_has_its_strength_and_its_correlation_time():
     """Drag shows the airspeed, and the log shows the velocity: the difference is the wind."""
     drag, inflow, wind, duration = (0.5, 0.3), 0.6, np.array([1.0, 0.5, 0.8]), 0.1
