@@ -204,7 +204,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
         array = np.asarray(None)
     shape, (least, most) = _SHAPES.get(name, ()), _SIZES.get(name, (1e-15, 1e6))
     if array.dtype.kind not in "iuf" or array.shape != shape:
-        wanted = f"numbers of shape {list(shape)}" if shape else "one number"
+        wanted = f"finite numbers of shape {list(shape)}" if shape else "one finite number"
     elif not ((array >= least) & (array <= most)).all():
         sign = "" if least < 0 else "not negative and " if least == 0 else "positive and "
         wanted = f"{sign}of a quadrotor's size in SI units"
