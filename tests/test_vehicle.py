@@ -213,7 +213,10 @@ def test_at_the_upper_end_of_a_wide_interval_the_least_cost_is_higher_by_two(mon
     assert rise(value + 1.96 * before) < 1.75
     # The cost falls, so the estimate was no minimum: the interval grows until the inertia is not identifiable.
     raised = eqx.tree_at(lambda e: e.cost, fit.searched[1], fit.searched[1].cost + 100)
-    assert "alpha8" in profile.with_profile(fit._replace(searched=(problem, raised)), progress=stages.append).held
+    no_minimum = fit._replace(searched=(problem, raised), widened={"alpha3": 1.5, "alpha8": 1.5})
+    lost = profile.with_profile(no_minimum, progress=stages.append)
+    assert "alpha8" in lost.held
+    assert lost.widened == {"alpha3": 1.5}
     # A fit that did not converge tells nothing.
     failed = eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.max_sweeps)
     monkeypatch.setattr(profile, "_SEARCH", lambda problem: failed)

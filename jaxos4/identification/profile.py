@@ -46,15 +46,16 @@ def with_profile(fit: Fit, *, progress: Progress) -> Fit:
             factor[place], rollouts = max(reach / NINETY_FIVE, 1.0), rollouts + more
     covariance, own = np.asarray(fit.estimate.covariance) * np.outer(factor, factor), problem.problem.unknowns
     lost = not_identifiable(problem, np.sqrt(np.diagonal(covariance))[: own.count])
-    held = {
+    held = fit.held | {
         name: HeldParameter(float(values[i]), own.units[i], PRIOR_NOTE)
         for i, name in enumerate(own.names)
-        if name in lost
+        if name in lost and name not in fit.held
     }
     return fit._replace(
         estimate=eqx.tree_at(lambda e: e.covariance, fit.estimate, as_float(covariance)),
         rollouts=rollouts,
-        held=held | fit.held,
+        held=held,
+        widened={name: x for name, x in fit.widened.items() if name not in held},
     )
 
 
