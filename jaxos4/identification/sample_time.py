@@ -38,8 +38,8 @@ _NEAR = 0.95
 def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[int, Fit, tuple[SampleTime, ...]]:
     """The place of the case that the rule chooses, its fit, and the answers of all.
 
-    The search for all parameters starts at that of the sample time before. What the flights do not show is held beside
-    it, in another thread.
+    The search for all parameters starts at the answer of the sample time before, if that is a minimum. What the flights
+    do not show is held beside it, in another thread.
 
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
