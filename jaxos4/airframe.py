@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Numeric, Scalar, as_constant
 from ._files import read_toml
-from .errors import InputError, named
+from .errors import InputError, named, shortened
 
 GRAVITY, STANDARD_GRAVITY = 9.81, 9.80665
 """The gravity of an airframe that gives none, and the unit g [m/s^2]."""
@@ -203,7 +203,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     except (ValueError, OverflowError):  # rows of several lengths, or an integer of more than 64 bits
         array = np.asarray(None)
     shape, (least, most) = _SHAPES.get(name, ()), _SIZES.get(name, (1e-15, 1e6))
-    if array.dtype.kind not in "iuf" or array.shape != shape:
+    if array.dtype.kind not in "iuf" or array.shape != shape or not np.isfinite(array).all():
         wanted = f"finite numbers of shape {list(shape)}" if shape else "one finite number"
     elif not ((array >= least) & (array <= most)).all():
         sign = "" if least < 0 else "not negative and " if least == 0 else "positive and "
@@ -212,4 +212,4 @@ def _numbers(name: str, value: Any) -> np.ndarray:
         wanted = "1 (counter-clockwise) or -1"
     else:
         return array.astype(float)
-    raise InputError(f"`{name}` must be {wanted}, got {repr(value)[:80]}.")
+    raise InputError(f"`{name}` must be {wanted}, got {shortened(repr(value), 80)}.")

@@ -12,6 +12,11 @@ class TrainingError(RuntimeError):
     """A network could not be trained."""
 
 
+def shortened(text: str, most: int) -> str:
+    """`text` with at most this many characters; "..." at its end if it is longer."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 @contextlib.contextmanager
 def named(place: object) -> Iterator[None]:
     """Raises a `ValueError` of the block again, as an `InputError` that begins with its place."""

@@ -12,8 +12,10 @@ from lanes import names
 
 import jaxos4
 from jaxos4.identification import problem as problems, profile
-from jaxos4.identification.fit import fit_innovations
+from jaxos4.identification.fit import fit_case, fit_innovations
+from jaxos4.identification.prepare import Case
 from jaxos4.identification.problem import liveliest
+from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
 
 FLIGHTS, PERIOD, SECONDS = 8, 0.004, 10.0
@@ -189,38 +191,113 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
     assert set(fit.disturbances) == {"p", "q", "r"}
 
 
-@pytest.mark.usefixtures("optimised")
-def test_at_the_upper_end_of_a_wide_interval_the_least_cost_is_higher_by_two(monkeypatch):
-    """By 1.96^2 / 2. It is higher by 1.7 where 1.96 standard deviations of the covariance end."""
+@functools.cache
+def poorly_known():
+    """The problem of a flight that says little about alpha8, as a case, and its fit."""
     flight, airframe = (lane(part, 0) for part in flown(1.0, 1.0))
     problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
-    fit = fit_innovations(jaxos4.FilterError(), problem, np.zeros(flight.time.shape[0], int))
-    place, own, stages = problem.problem.unknowns.names.index("alpha8"), problem.problem.unknowns, []
-    wider = profile.with_profile(fit, progress=stages.append)
+    recording = np.zeros(flight.time.shape[0], int)
+    nothing = dict.fromkeys(("model", "held_out", "provenance"))
+    case = Case(problem, problem.problem, jaxos4.FilterError(), "filter-error", recording=recording, **nothing)
+    return case, fit_case(case)
+
+
+@pytest.mark.usefixtures("optimised")
+def test_at_the_upper_end_of_a_wide_interval_the_least_cost_is_higher_by_two():
+    """By 1.96^2 / 2. It is higher by 1.7 where 1.96 standard deviations of the covariance end."""
+    case, fit = poorly_known()
+    own, stages = case.problem.problem.unknowns, []
+    place = own.names.index("alpha8")
+    wider = profile.with_profile(fit, case, progress=stages.append)
     assert stages == ["computing intervals"]  # the other inertias are known well
     assert wider.rollouts > fit.rollouts
     assert wider.held == fit.held
     value, before, after = float(fit.estimate.parameters[place]), fit.bound[place], float(wider.estimate.std[place])
+    assert wider.profiled == {"alpha8": pytest.approx(after / before)}
     others = np.arange(fit.estimate.std.size) != place
     np.testing.assert_array_equal(wider.estimate.std[others], fit.estimate.std[others])
 
     def rise(end):
-        other = jaxos4.FilterError(tolerance=1e-6)(problem.hold({"alpha8": np.asarray(end)}))
+        other = jaxos4.FilterError(tolerance=1e-6)(case.problem.hold({"alpha8": np.asarray(end)}))
         prior = ((end - float(own.center[place])) / float(own.half_width[place])) ** 2 / 2
         return float(other.cost) + prior - float(fit.estimate.cost)
 
     assert rise(value + 1.96 * after) == pytest.approx(1.92, rel=0.02)
     assert rise(value + 1.96 * before) < 1.75
-    # The cost falls, so the estimate was no minimum: the interval grows until the inertia is not identifiable.
-    raised = eqx.tree_at(lambda e: e.cost, fit.searched[1], fit.searched[1].cost + 100)
-    no_minimum = fit._replace(searched=(problem, raised), widened={"alpha3": 1.5, "alpha8": 1.5})
-    lost = profile.with_profile(no_minimum, progress=stages.append)
+    # The factor of the jackknife multiplies that of the profile.
+    twice = eqx.tree_at(lambda e: e.covariance, fit.estimate, 4 * fit.estimate.covariance)
+    both = profile.with_profile(fit._replace(estimate=twice), case, progress=stages.append)
+    np.testing.assert_allclose(both.estimate.std, 2 * wider.estimate.std)
+
+
+# How much higher the cost is at each end, in shares of 1.96^2 / 2; None: the fit did not converge. Then the
+# end, in shares of that of the covariance.
+ENDS = {
+    "no fit": ([None], 1.0),
+    "at once": ([1.0], 1.0),
+    "the second fails": ([4 / 9, None], 1.5),
+    "the second hits": ([4 / 9, 1.0], 1.5),
+    "flat": ([1 / 4, 1 / 4, 1 / 4], 8.0),
+    "steep": ([9.0, 9.0, 9.0], 1 / 8),
+}
+
+
+def fits_at_ends(monkeypatch, found, unknowns, shares):
+    """Replaces the fits of the profile. Returns what is left of the shares."""
+    shares, place = iter(shares), unknowns.names.index("alpha8")
+
+    def fit_at(problem):
+        share = next(shares)
+        prior = ((problem.start[place] - unknowns.center[place]) / unknowns.half_width[place]) ** 2 / 2
+        cost = found.cost - prior + NINETY_FIVE**2 / 2 * (0.0 if share is None else share)
+        result = jaxos4.RESULTS.max_sweeps if share is None else jaxos4.RESULTS.successful
+        return eqx.tree_at(lambda e: (e.parameters, e.cost, e.result), found, (problem.start, cost, result))
+
+    monkeypatch.setattr(profile, "FilterError", lambda tolerance: fit_at)
+    return shares
+
+
+@pytest.mark.usefixtures("optimised")
+@pytest.mark.parametrize(("shares", "end"), ENDS.values(), ids=ENDS)
+def test_an_interval_ends_where_the_fits_that_succeeded_say(monkeypatch, shares, end):
+    _, fit = poorly_known()
+    problem, found = fit.searched
+    unknowns = problem.problem.unknowns
+    left = fits_at_ends(monkeypatch, found, unknowns, shares)
+    reach, lower, _ = profile.upper_end(problem, found, unknowns.names.index("alpha8"))
+    assert reach == pytest.approx(end * NINETY_FIVE)
+    assert lower is None
+    assert not list(left)
+
+
+@pytest.mark.usefixtures("optimised")
+def test_an_inertia_whose_interval_has_no_end_is_not_identifiable(monkeypatch):
+    case, fit = poorly_known()
+    fits_at_ends(monkeypatch, fit.searched[1], case.problem.problem.unknowns, [1 / 4] * 3)
+    widened = fit._replace(widened={"alpha3": 1.5, "alpha8": 1.5})
+    lost = profile.with_profile(widened, case, progress=lambda stage: None)
     assert "alpha8" in lost.held
-    assert lost.widened == {"alpha3": 1.5}
-    # A fit that did not converge tells nothing.
-    failed = eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.max_sweeps)
-    monkeypatch.setattr(profile, "_SEARCH", lambda problem: failed)
-    np.testing.assert_array_equal(profile.with_profile(fit, progress=stages.append).estimate.std, fit.estimate.std)
+    assert (lost.widened, lost.profiled) == ({"alpha3": 1.5}, {})
+
+
+@pytest.mark.usefixtures("optimised")
+def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch):
+    case, fit = poorly_known()
+    # A search that ended beside the minimum.
+    problem, found = fit.searched
+    aside = eqx.tree_at(lambda e: e.cost, found, found.cost + 3.0)
+    stages = []
+    better = profile.with_profile(fit._replace(searched=(problem, aside)), case, progress=stages.append)
+    assert stages.count("fitting again where the cost is lower") == 1
+    assert better.rollouts > fit.rollouts
+    assert abs(float(better.estimate.cost - found.cost)) < 2 * jaxos4.FilterError().tolerance
+    assert "alpha8" in better.profiled
+    # Each end is lower than the estimate before it: no minimum is found.
+    fits_at_ends(monkeypatch, found, case.problem.problem.unknowns, [-1.0] * 3)
+    assert names(profile.with_profile(fit, case, progress=stages.append).estimate) == "max_sweeps"
+    # A search that did not converge has no profile.
+    failed = fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.at_bound))
+    assert profile.with_profile(failed, case, progress=stages.append) is failed
 
 
 @pytest.mark.usefixtures("optimised")

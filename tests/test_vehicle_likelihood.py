@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import sample_time
+from jaxos4.identification import profile, sample_time
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.fit import fit_case
 from jaxos4.identification.results import Constant, HeldParameter, SampleTime
@@ -118,13 +118,19 @@ def test_noise_of_measured_speeds_is_its_share_of_their_changes(noise):
     assert noise_of_speeds(dataclasses.replace(flight, commanded=True), finest, CRAZYFLIE) == 0
 
 
-def test_four_sample_times_need_one_program():
-    """The length of a flight is data."""
+def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
+    """The length of a flight is data. The table of sample times shows the intervals of the answer."""
+    monkeypatch.setattr(profile, "_WELL_KNOWN", 0.0)
     with compiled_programs() as programs:
         found = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))
     np.testing.assert_allclose([each.sample_time for each in found.sample_times], [0.004, 0.008, 0.016, 0.032])
     searches = [name for name in programs if name is not None and "call" in name.lower()]
     assert len(searches) == 1, programs
+    (chosen,) = [each for each in found.sample_times if each.sample_time == found.provenance.sample_time]
+    assert chosen.constants == found.rigid_body.constants
+    longer = {name for name, row in found.parameters.items() if row.std is not None and row.std > row.bound}
+    assert longer == {name for name, row in found.parameters.items() if "profile" in row.note} | set(found.widened)
+    assert not longer.isdisjoint({"alpha3", "alpha6", "alpha8"} - set(found.widened))
 
 
 def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
@@ -162,8 +168,10 @@ def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeyp
         return case._replace(problem=case.problem.starting_from(jnp.full_like(found.parameters, 1e9)))
 
     monkeypatch.setattr(sample_time, "_starting_from", nowhere)
-    _, _, answers = fit_at_sample_times(cases, progress=lambda stage: None)
+    place, fit, answers = fit_at_sample_times(cases, progress=lambda stage: None)
     assert [set(answer.constants) for answer in answers] == [{"Ix", "Iy", "Iz"}] * 2
+    assert place == 0
+    assert fit.rollouts > fit_case(cases[0]).rollouts  # both searches count
 
 
 # The likelihood.

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from .._custom_types import Parameters
 from .._xla import quick_jit
 from ..airframe import airframe_from_table
-from ..errors import InputError, named
+from ..errors import InputError, named, shortened
 from ..flight import FORCE_NAMES
 from ..identification.results import Identification, ResultFile
 from ..linalg import covariance_root
@@ -63,7 +63,9 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     with named("" if given else found):
         used, airframe = file.provenance, airframe_from_table(file.airframe or {})
         if strangers := [term for term in used.terms or () if term not in TERMS]:
-            raise InputError(f"the term {strangers[0][:40]} is not of this version; run `jaxos4 estimate` again.")
+            raise InputError(
+                f"the term {shortened(strangers[0], 40)} is not of this version; run `jaxos4 estimate` again."
+            )
         model = FlightModel(airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
         known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
         known |= {row: each.value for row, each in file.held.items()}

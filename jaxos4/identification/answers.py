@@ -78,6 +78,8 @@ def _note(fit: Fit, i: int, half_width: float) -> str:
         notes.append("outside its bracket")
     if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
         notes.append("outside the network's interval")
+    if factor := fit.profiled.get(fit.problem.unknowns.names[i]):
+        notes.append(f"interval {factor:.1f} times longer by the likelihood's profile")
     return "; ".join(notes)
 
 

@@ -23,7 +23,7 @@ from .prepare import Case, FlightSettings, VehicleSettings, own_settings, prepar
 from .problem import Intervals
 from .profile import with_profile
 from .results import Identification, SampleTime, finite_or_none
-from .sample_time import fit_at_sample_times
+from .sample_time import answer_of, fit_at_sample_times
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
 
 Flights = Flight | Recording | Sequence[Flight | Recording]
@@ -78,7 +78,6 @@ def identify(
     if isinstance(subject, Airframe):
         cases = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **common)
         case, fit, sample_times = _fit_vehicle(cases, estimator or DEFAULT, seed=seed, progress=progress)
-        fit = with_profile(fit, progress=progress)
     else:
         own = own_settings(FlightSettings, settings)
         case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
@@ -91,13 +90,18 @@ def _fit_vehicle(
     cases: Sequence[Case], estimator: str | AbstractEstimator, *, seed: int, progress: Callable[[str], None]
 ) -> tuple[Case, Fit, tuple[SampleTime, ...]]:
     """The case at the chosen sample time and its fit. Newton's method compares several sample times."""
-    place, sample_times, is_default = 0, (), isinstance(estimator, str) and estimator == DEFAULT
+    place, fit, sample_times = 0, None, ()
+    is_default = isinstance(estimator, str) and estimator == DEFAULT
     if is_default or len(cases) > 1:
         place, fit, sample_times = fit_at_sample_times(cases, progress=progress)
-        if is_default:
-            return cases[place], fit, sample_times
-    case = with_estimator(cases[place], estimator, seed=seed, progress=progress)
-    return case, fit_case(case, progress=progress), sample_times
+    case = cases[place]
+    if fit is None or not is_default:
+        case = with_estimator(case, estimator, seed=seed, progress=progress)
+        fit = fit_case(case, progress=progress)
+    fit = with_profile(fit, case, progress=progress)
+    # The table shows the final answer at the chosen sample time.
+    answer = answer_of(case, fit, cases[0].shooting.flight)
+    return case, fit, (*sample_times[:place], answer, *sample_times[place + 1 :])
 
 
 def describe(

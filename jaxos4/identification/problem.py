@@ -12,7 +12,7 @@ import numpy as np
 
 from .._custom_types import as_float
 from ..bracket import Bracket
-from ..errors import InputError, named
+from ..errors import InputError, named, shortened
 from ..flight import STATE_NAMES
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
@@ -56,7 +56,9 @@ def _interval(name: str, value: Any) -> list[float]:
     pair = value if isinstance(value, list | tuple) else []
     numbers = [float(x) for x in pair if isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < 1e12]
     if len(pair) != 2 or len(numbers) != 2 or not numbers[0] < numbers[1]:
-        raise InputError(f"`bracket`: `{name}` must be [lower, upper] with lower below upper, got {repr(value)[:80]}.")
+        raise InputError(
+            f"`bracket`: `{name}` must be [lower, upper] with lower below upper, got {shortened(repr(value), 80)}."
+        )
     return numbers
 
 

@@ -3,20 +3,24 @@
 Under a controller, an alpha can be exchanged for strength and time constant of the disturbance. So the cost is not
 quadratic: it is flat above an alpha that came out too small, and its covariance is too small. The profile needs no
 covariance: a 95 % interval ends where the least cost is higher by 1.96^2/2, with all other unknowns fitted again.
+
+A likelihood can have several maxima. If the cost is lower at an end than at the estimate, the search starts there
+again.
 """
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from .._custom_types import as_float
 from ..estimate import Estimate
 from ..estimators import FilterError
-from ..results import NINETY_FIVE, result_names
+from ..results import NINETY_FIVE, RESULTS, result_names
 from ..shooting import InnovationsProblem
 from .answers import INVERSE
-from .fit import PRIOR_NOTE, Fit, bracket_cost, not_identifiable
-from .prepare import Progress
+from .fit import PRIOR_NOTE, Fit, bracket_cost, fit_case, not_identifiable
+from .prepare import Case, Progress
 from .results import HeldParameter
 
 # If the standard deviation of such an alpha is at most this share of it, the cost is nearly quadratic in its interval.
@@ -26,25 +30,51 @@ _WELL_KNOWN = 0.1
 _FITS, _CLOSE, _LEAST_SLOPE = 3, 0.1, 0.1
 # Newton's method needs one or two steps from the start that it is given. A cost that is too large by as much as its
 # tolerance moves the end of an interval by 1 %.
-_SEARCH = FilterError(tolerance=0.04)
+_TOLERANCE = 0.04
+# If the cost falls by more than this, the estimate is not at the minimum. The most minima that are tried.
+_LOWER, _MINIMA = 0.1, 3
 
 
-def with_profile(fit: Fit, *, progress: Progress) -> Fit:
+def with_profile(fit: Fit, case: Case, *, progress: Progress) -> Fit:
     """The fit of a vehicle, in which standard deviations of poorly known inertias are at least those by the profile.
 
-    Only the upper end is looked for, because the upper side is longer.
+    Only the upper end is looked for, because the upper side is longer. The jackknife multiplies a standard deviation
+    too: it allows for a wrong model, and the profile for a cost that is not quadratic.
+
+    **Returns:** the fit at a lower minimum if an end shows one; with the result `max_sweeps` if the last one that was
+    tried is no minimum either.
     """
-    if fit.searched is None or str(result_names(fit.estimate.result)) != "successful":
+    whole = case.problem
+    if not isinstance(whole, InnovationsProblem):
         return fit
-    problem, found = fit.searched
-    values, free, rollouts = np.asarray(found.parameters), fit.free, fit.rollouts
-    factor = np.ones(values.size)
-    for place in INVERSE.values():
-        if place in free and fit.bound[place] > _WELL_KNOWN * abs(values[place]):
+    for _ in range(_MINIMA):
+        if fit.searched is None or str(result_names(fit.estimate.result)) != "successful":
+            return fit
+        (problem, found), factors, lower = fit.searched, {}, None
+        poor = np.flatnonzero(fit.bound > _WELL_KNOWN * np.abs(np.asarray(fit.estimate.parameters)[: fit.bound.size]))
+        for place in sorted({*INVERSE.values()} & {*fit.free} & {*poor.tolist()}):
             progress("computing intervals")
-            reach, more = upper_end(problem, found, place)
-            factor[place], rollouts = max(reach / NINETY_FIVE, 1.0), rollouts + more
-    covariance, own = np.asarray(fit.estimate.covariance) * np.outer(factor, factor), problem.problem.unknowns
+            reach, lower, rollouts = upper_end(problem, found, place)
+            fit = fit._replace(rollouts=fit.rollouts + rollouts)
+            if lower is not None:
+                break
+            factors[place] = max(reach / NINETY_FIVE, 1.0)
+        if lower is None:
+            return _widened(fit, problem, factors)
+        progress("fitting again where the cost is lower")
+        first = jax.block_until_ready(case.estimator(whole.starting_from(lower)))
+        other = fit_case(case, first=first, progress=progress)
+        fit = other._replace(rollouts=fit.rollouts + other.rollouts)
+    return fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, RESULTS.max_sweeps))
+
+
+def _widened(fit: Fit, problem: InnovationsProblem, factors: dict[int, float]) -> Fit:
+    """The fit with larger standard deviations. `factors`: by the place of the parameter."""
+    own, values = problem.problem.unknowns, np.asarray(fit.estimate.parameters)
+    factor = np.ones(values.size)
+    for place, each in factors.items():
+        factor[place] = each
+    covariance = np.asarray(fit.estimate.covariance) * np.outer(factor, factor)
     lost = not_identifiable(problem, np.sqrt(np.diagonal(covariance))[: own.count])
     held = fit.held | {
         name: HeldParameter(float(values[i]), own.units[i], PRIOR_NOTE)
@@ -53,29 +83,38 @@ def with_profile(fit: Fit, *, progress: Progress) -> Fit:
     }
     return fit._replace(
         estimate=eqx.tree_at(lambda e: e.covariance, fit.estimate, as_float(covariance)),
-        rollouts=rollouts,
         held=held,
         widened={name: x for name, x in fit.widened.items() if name not in held},
+        profiled={own.names[i]: x for i, x in factors.items() if x > 1 and own.names[i] not in held},
     )
 
 
-def upper_end(problem: InnovationsProblem, found: Estimate, place: int) -> tuple[float, int]:
-    """Where the interval of one parameter ends by the profile, in standard deviations, and the rollouts."""
-    own, covariance = problem.problem.unknowns, np.asarray(found.covariance)
+def upper_end(
+    problem: InnovationsProblem, found: Estimate, place: int
+) -> tuple[float, Float[np.ndarray, " unknowns"] | None, int]:
+    """Where the interval of one parameter ends by the profile.
+
+    **Returns:** the end in standard deviations above the estimate; unknowns at which the cost is lower than at the
+    estimate, or `None`; the rollouts. If no fit at an end succeeds, the end is that of the covariance. If a later fit
+    fails, the end follows from the fits before.
+    """
+    search, own, covariance = FilterError(tolerance=_TOLERANCE), problem.problem.unknowns, np.asarray(found.covariance)
     # How the minimum moves with this parameter, in steps of its standard deviation.
     along = covariance[:, place] / np.sqrt(covariance[place, place])
     unknowns, at, root, reach, rollouts = np.asarray(found.parameters), 0.0, 0.0, NINETY_FIVE, 0
     for _ in range(_FITS):
         unknowns, before, at = unknowns + (reach - at) * along, at, reach
         held = {own.names[place]: float(unknowns[place])}
-        other = jax.block_until_ready(_SEARCH(problem.hold(held).starting_from(unknowns)))
+        other = jax.block_until_ready(search(problem.hold(held).starting_from(unknowns)))
         rollouts += int(other.rollouts)
         if str(result_names(other.result)) != "successful":
             break
         rise = float(other.cost) + bracket_cost(own, held) - float(found.cost)
         unknowns, last, root = np.asarray(other.parameters), root, np.sqrt(max(2 * rise, 0.0))
+        if rise < -_LOWER:
+            return NINETY_FIVE, unknowns, rollouts
         reach = at + (NINETY_FIVE - root) / max((root - last) / (at - before), _LEAST_SLOPE)
         reach = float(np.clip(reach, at / 2, 2 * at))
         if abs(root - NINETY_FIVE) < _CLOSE:
             break
-    return reach, rollouts
+    return reach, None, rollouts

@@ -10,7 +10,7 @@ import msgspec
 from ..airframe import airframe_table
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
-from ..errors import InputError, named
+from ..errors import InputError, named, shortened
 from ..estimate import Estimate
 from ..results import NAMES, result_names
 from ..shooting import ShootingProblem
@@ -211,7 +211,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
-    - `rollouts`: simulated flights of all searches together.
+    - `rollouts`: simulated flights of all searches together; of a vehicle, of those at the chosen sample time.
     - `cost`: 1/2 |W (y - x)|^2 at the estimate; of a vehicle the negative log-likelihood. `None` without one.
     - `seconds`: computing time [s].
     - `parameters`: by name. Without an answer, a vehicle has none.
@@ -339,9 +339,9 @@ class ResultFile(msgspec.Struct, frozen=True, kw_only=True):
                 raise InputError(f"not a result ({what}); {remedy}.") from None
             if own.model != "flight":
                 which = "only a vehicle (--model flight) can be exported or can predict"
-                raise InputError(f"`model` {own.model[:40]}: {which}.")
+                raise InputError(f"`model` {shortened(own.model, 40)}: {which}.")
             if own.result not in NAMES:
-                raise InputError(f"`result` {own.result[:40]}: is not a result code; {again}")
+                raise InputError(f"`result` {shortened(own.result, 40)}: is not a result code; {again}")
             if not own.covariance or own.airframe is None:
                 raise InputError(f"{own.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
             rows, count = own.covariance, len(own.parameters)

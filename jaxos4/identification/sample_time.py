@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -52,7 +53,8 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
             begin = case if found is None else _starting_from(case, found)
             found = jax.block_until_ready(begin.estimator(begin.problem))
             if begin is not case and not has_answer(found):  # the answer for longer samples was no start
-                found = jax.block_until_ready(case.estimator(case.problem))
+                other = jax.block_until_ready(case.estimator(case.problem))
+                found = eqx.tree_at(lambda e: e.rollouts, other, found.rollouts + other.rollouts)
             fits.append(beside.submit(for_threads(fit_case), case, first=found))
         fits = [fit.result() for fit in fits][::-1]
     finally:  # after an error, what has not begun is not computed

@@ -11,7 +11,7 @@ import numpy as np
 from ..airframe import Airframe
 from ..analysis.prediction import HORIZONS, starts
 from ..bracket import Bracket
-from ..errors import InputError, TrainingError
+from ..errors import InputError, TrainingError, shortened
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
@@ -31,8 +31,9 @@ _FIRST_SIGMA = 0.5
 _SEGMENTS = 16
 _FEW_RECORDINGS = 4  # from twice this number of recordings on, there are more segments
 _SHORTEST_SEGMENT = 1.25  # no segment is shorter than this [s]
-# The estimator of a vehicle, which flies in closed loop. It stops within 0.05 standard deviations of the minimum.
-DEFAULT, _NEWTON = "filter-error", FilterError(tolerance=1e-3)
+# The estimator of a vehicle, which flies in closed loop. With this tolerance it stops within 0.05 standard deviations
+# of the minimum.
+DEFAULT, _TOLERANCE = "filter-error", 1e-3
 
 
 def prepare_vehicle(
@@ -109,7 +110,7 @@ def _case(
     recording = np.asarray(prepared.recordings)[number]
     problem = _innovations(shooting, prepared, room)
     return Case(
-        problem, shooting, _NEWTON, name, "flight", held_out, recording, provenance,
+        problem, shooting, FilterError(tolerance=_TOLERANCE), name, "flight", held_out, recording, provenance,
         validate.name if validate else "", prepared.doubts, prepared.log_step,
     )  # fmt: skip
 
@@ -199,7 +200,7 @@ def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tu
         return default_terms(available)
     for term in terms:
         if term not in TERMS:
-            raise InputError(f"`terms`: knows no `{term[:40]}`; the terms are {', '.join(TERMS)}.")
+            raise InputError(f"`terms`: knows no `{shortened(term, 40)}`; the terms are {', '.join(TERMS)}.")
         missing = TERMS[term].needs - available
         if FULL_SCALE in missing:
             raise InputError(f"`terms`: {term} needs `max_rotor_speed` in the airframe; set it or leave it out.")

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..errors import InputError
+from ..errors import InputError, shortened
 from ..flight import FORCE_NAMES, Flight, with_force
 
 Path = str | os.PathLike[str]
@@ -318,7 +318,7 @@ def printable(text: str) -> str:
 
 def quoted(text: str) -> str:
     """`text` in quotes, on one line, with at most 40 characters."""
-    return repr(text if len(text) <= 40 else text[:37] + "...")
+    return repr(shortened(text, 40))
 
 
 def counted(number: int, noun: str) -> str:

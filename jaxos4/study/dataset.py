@@ -22,7 +22,7 @@ import xarray as xr
 
 from .._files import BROKEN, write_file
 from .._version import __version__
-from ..errors import InputError
+from ..errors import InputError, shortened
 from ..models import MODELS
 from ..networks import TrainedNetwork, load_network
 from .cell import LEVELS, OUTCOMES, fleet_of, fly
@@ -167,8 +167,7 @@ def check_store(directory: Path, study: Study, device: str = "") -> Store:
 
 
 def _short(value: Any) -> str:
-    text = msgspec.json.encode(value).decode()
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return shortened(msgspec.json.encode(value).decode(), 60)
 
 
 def assemble(store: Store) -> xr.Dataset:
