@@ -30,8 +30,9 @@ modules = [path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("*.py") if
 jaxtyping.install_import_hook([".".join(module.with_suffix("").parts) for module in modules], "typechecker.check")
 
 from jaxos4 import _xla  # noqa: E402
+from jaxos4.cli._jax import collect_rarely  # noqa: E402
 
-gc.set_threshold(100_000, 20, 100)  # as the command line does
+collect_rarely()
 # Before JAX starts to compute: all programs compile as the program of one flight does, because tests compile for longer
 # than they compute. The other cores have workers: a program compiled in parts takes a tenth more time of all cores.
 OURS = " ".join(

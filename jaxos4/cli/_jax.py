@@ -16,7 +16,7 @@ _MOST_BYTES = 1 << 30
 
 def prepare() -> None:
     """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off."""
-    gc.set_threshold(100_000, 20, 100)  # tracing makes millions of small objects that stay
+    collect_rarely()
 
     import jax
 
@@ -34,6 +34,11 @@ def prepare() -> None:
     # Another process may be writing the same program, or remove it: it is then compiled again.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     keep_programs()
+
+
+def collect_rarely() -> None:
+    """Makes garbage collection rare: tracing makes millions of small objects that stay."""
+    gc.set_threshold(100_000, 20, 100)
 
 
 def _usable_folder() -> Path | None:

@@ -91,14 +91,13 @@ class AbstractTask(eqx.Module):
     """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
-    - `write`: writes the inputs as CSV. `size`: the number of coefficients.
+    - `size`: the number of coefficients.
     - `names`, `units`: those of the parameters, the targets first. `scale`: for each target, a size of which accuracies
       are shares. `unexcited`: a parameter whose bound is not below this counts as not excited.
     """
 
     kind: ClassVar[str]
     vehicles: ClassVar[int]
-    write: ClassVar[Callable[[Designed, Path], None]]
     size: eqx.AbstractVar[int]
     envelope: eqx.AbstractVar[Envelope]
     names: eqx.AbstractVar[tuple[str, ...]]
@@ -121,6 +120,11 @@ class AbstractTask(eqx.Module):
     @abc.abstractmethod
     def standard(self) -> dict[str, Flown]:
         """The standard inputs that fit into the time, by name."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def write(designed: Designed, path: Path) -> None:
+        """Write the inputs as CSV."""
 
     @abc.abstractmethod
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
