@@ -268,7 +268,7 @@ class IBSS(AbstractEstimator):
         gain = before.cost.sum() - shot.cost.sum()
         stalled = swept & (gain <= _GAIN) & _may_stall(stage, state, found)
         finite = jnp.isfinite(unknowns).all() & jnp.isfinite(shot.cost).all()
-        # The cost of an unsound trajectory means nothing.
+        # The cost of a trajectory that is not feasible means nothing.
         not_worse = shot.feasible.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
         rejected = ~first & ~(finite & (~before.feasible.all() | not_worse)) | (stalled & (gain < 0))
         new, old = (unknowns, curvature), (state.unknowns, state.curvature)

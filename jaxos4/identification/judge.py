@@ -217,15 +217,18 @@ def _skill(skill: PredictionSkill | None, still: Sequence[str]) -> Iterator[Doub
             "choose another part with `begin` and `end`, or another flight with `validate`",
         )
         return
-    place = int(np.argmin(np.abs(np.array(skill.horizons) - _HORIZON)))
-    values = {rate: getattr(skill, rate).skill[place] for rate in AXES}
-    poor = [rate for rate, value in values.items() if value is not None and value <= 0 and AXES[rate] not in still]
+    table = np.array([getattr(skill, rate).skill for rate in AXES], dtype=float)
+    # The held-out parts may be too short for the usual horizon.
+    known = np.isfinite(table).any(axis=0)
+    place = int(np.argmin(np.where(known, np.abs(np.array(skill.horizons) - _HORIZON), np.inf)))
+    values = dict(zip(AXES, table[:, place].tolist(), strict=True))
+    poor = [rate for rate, value in values.items() if value <= 0 and AXES[rate] not in still]
     if poor:
         named = ", ".join(f"{rate} {values[rate]:.2g}" for rate in poor)
-        axes = " and ".join(AXES[rate] for rate in poor)
+        axes, ahead = " and ".join(AXES[rate] for rate in poor), f"{skill.horizons[place]:.2g} s ahead"
         yield Doubt(
             "no_skill",
-            f"the fit predicts {axes} {_HORIZON:g} s ahead no better than constant rates (skill {named})",
+            f"the fit predicts {axes} {ahead} no better than constant rates (skill {named})",
             f"fly more {axes}, or check the airframe and the time stamps",
         )
 
