@@ -79,6 +79,10 @@ def test_the_rates_are_the_predictions_with_a_band_of_95_percent():
     predicted = synthetic_predictions()
     drawn = json.loads(predicted_rates(predicted, 0.004, styles(["ibss"])["ibss"]))
     assert drawn["horizons"][drawn["shown"]] == "0.248"
+    # Nothing was measured so far ahead.
+    measured = np.where(np.arange(3)[:, None] > 0, np.nan, predicted.measured)
+    short = json.loads(predicted_rates(predicted._replace(measured=measured), 0.004, styles(["ibss"])["ibss"]))
+    assert short["horizons"][short["shown"]] == "0.1"
     # A break between the stretches, and each prediction at the time that it is of.
     assert drawn["measured"][1][1][80] is drawn["predicted"][1][1][80] is None
     assert drawn["start"] == sorted(drawn["start"])

@@ -1,12 +1,13 @@
 """Predictions of the body rates some tenths of a second ahead, with the disturbance at their start, and their skill."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import Numeric, Parameters, Scalar, as_float
 from .._xla import quick_jit
@@ -17,6 +18,8 @@ from ..shooting.gains import LogNoise, Observed, gains_of, is_rate, transition
 from .frequency_response import modelled_acceleration
 
 HORIZONS = (0.1, 0.25, 0.5)
+# The horizon that decides whether a model predicts [s].
+_DECISIVE = 0.25
 # Time between starts, and time around a start over which the measured rates are averaged [s].
 _EVERY, _AROUND = 0.05, 0.02
 # Number of parts of the flight for the jackknife, which omits one part at a time.
@@ -154,6 +157,13 @@ def skill(predicted: Predictions) -> Skill:
         spread = np.sqrt((len(parts) - 1) * np.var(without, axis=0)) if len(parts) > 1 else np.full(count.shape, np.nan)
         rmse, persistence = np.sqrt(total / count)
         return Skill(rmse, persistence, 1 - total[0] / total[1], spread, errors.shape[0])
+
+
+def decisive_horizon(
+    horizons: Sequence[float] | Float[np.ndarray, " horizons"], known: Bool[ArrayLike, " horizons"]
+) -> int:
+    """The place of the horizon nearest to 0.25 s, of those at which anything was measured."""
+    return int(np.argmin(np.where(known, np.abs(np.asarray(horizons) - _DECISIVE), np.inf)))
 
 
 def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Float[np.ndarray, "samples 3"]:

@@ -10,7 +10,7 @@ from .._custom_types import as_float
 from ..airframe import Airframe
 from ..analysis.frequency_response import frequency_response
 from ..analysis.inertia import fit_inertia
-from ..analysis.prediction import Predictions
+from ..analysis.prediction import Predictions, decisive_horizon
 from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
@@ -32,7 +32,6 @@ _CONSISTENT = 1e-3
 # Innovations that correlate more than this bias filter error more than its intervals say. Longer samples [s] than the
 # second figure would hide the motion with the vibration.
 _VIBRATION, _LONGEST_SAMPLE = 0.4, 0.008
-_HORIZON = 0.25  # [s]
 # Value and standard deviation of each parameter that has an estimate.
 Found = dict[str, tuple[float, float]]
 _OF_YAW = ("alpha7", "alpha8")
@@ -218,9 +217,7 @@ def _skill(skill: PredictionSkill | None, still: Sequence[str]) -> Iterator[Doub
         )
         return
     table = np.array([getattr(skill, rate).skill for rate in AXES], dtype=float)
-    # The held-out parts may be too short for the usual horizon.
-    known = np.isfinite(table).any(axis=0)
-    place = int(np.argmin(np.where(known, np.abs(np.array(skill.horizons) - _HORIZON), np.inf)))
+    place = decisive_horizon(skill.horizons, np.isfinite(table).any(axis=0))
     values = dict(zip(AXES, table[:, place].tolist(), strict=True))
     poor = [rate for rate, value in values.items() if value <= 0 and AXES[rate] not in still]
     if poor:

@@ -16,15 +16,15 @@ from .._files import check_writable, write_file
 from ..airframe import Airframe
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.inertia import CenterOfMass, center_of_mass
-from ..analysis.prediction import Predictions
+from ..analysis.prediction import Predictions, decisive_horizon
 from ..identification.results import Constant, Identification, SampleTime
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
 
-# The horizon that the page shows first [s], and the share of the errors that the band of the predictions holds.
-_SHOWN, _BAND = 0.25, 0.95
+# The share of the errors that the band of the predictions holds.
+_BAND = 0.95
 _INERTIAS = ("Ix", "Iy", "Iz")
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
@@ -155,7 +155,7 @@ def predicted_rates(predicted: Predictions, sample_time: float, look: Style) -> 
     return json.dumps(
         {name: np.where(np.isfinite(array), array.round(4), np.nan).tolist() for name, array in arrays.items()}
         | {"horizons": [f"{x:.3g}" for x in predicted.horizons], "color": look.color, "band": f"{100 * _BAND:g} %"}
-        | {"shown": int(np.argmin(np.abs(predicted.horizons - _SHOWN)))}
+        | {"shown": decisive_horizon(predicted.horizons, np.isfinite(predicted.measured).any(axis=(0, 2)))}
     ).replace("NaN", "null")
 
 
