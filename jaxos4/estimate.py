@@ -43,7 +43,8 @@ class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
     - `parameters`: all unknowns that the problem's windows share; a held one has its value, and a variance of 0. If
-      `result` says that there is no estimate: the bracket's center, or 0 if the bracket is invalid.
+      `result` says that there is no estimate: the bracket's center, or 0 if the bracket is invalid. The bracket of a
+      network is its own.
     - `covariance`: of `parameters`; infinite without an estimate. It follows from the Fisher information at the
       estimate and the problem's `sigma`; that of a network from its errors on simulated flights.
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
@@ -181,12 +182,12 @@ def from_starts(
 ) -> Estimate:
     """The best answer of searches from each of the problem's starts, one after the other; equal starts count once.
 
-    `start`: where to start instead, unless it is NaN.
+    `start`: where to start instead, unless it is NaN, or the unknown is held.
     """
     starts, own, count = problem.starts, len(problem.model.parameter_names), problem.unknowns.count
     if start is not None and jnp.shape(start) != (count,):
         raise ValueError(f"`start` must hold {count} unknowns, got shape {jnp.shape(start)}.")
-    firsts = starts if start is None else jnp.where(jnp.isnan(start), starts, start)
+    firsts = starts if start is None else jnp.where(jnp.isnan(start) | ~problem.unknowns.free, starts, start)
     if starts.shape[0] == 1:
         return search(firsts[0])
     search = jax.jit(search)  # traced once, although it is called twice

@@ -59,6 +59,46 @@ def test_both_kinds_of_directions_reach_the_maximum_of_the_likelihood(directions
         assert np.abs((estimates.parameters - best) / bound()).max() < most
 
 
+@pytest.mark.usefixtures("optimised")
+def test_coordinates_search_innovations_too_and_say_that_they_need_more_sweeps():
+    """A level of the noise at its limit is slow."""
+    problem = jaxos4.InnovationsProblem(standard_problem(channels="rates", states=noisy_states(1)[0], free=True))
+    best, found = jaxos4.FilterError()(problem), jaxos4.IBSS(directions="coordinate")(problem)
+    assert names(found) == "max_sweeps"
+    assert 0 < float(found.cost - best.cost) < 2
+    assert (np.abs(found.parameters - best.parameters)[:8] <= 0.5 * best.std[:8]).all()
+
+
+def broken(problem, lowest, highest, factor):
+    """The slope of alpha3 is multiplied by `factor` between two values."""
+
+    class Broken(jaxos4.ShootingProblem):
+        def stages(self, *, cascade):
+            stages = super().stages(cascade=cascade)
+
+            def evaluate(number, unknowns):
+                curvature, alpha = stages.evaluate(number, unknowns), unknowns[0, 2]
+                change = jnp.where((alpha > lowest) & (alpha < highest), factor, 1.0)
+                return curvature._replace(gradient=curvature.gradient.at[:, 2].multiply(change))
+
+            return stages._replace(evaluate=evaluate)
+
+    return Broken(problem.model, problem.flight, sigma=problem.sigma, channels="rates", unknowns=problem.unknowns)
+
+
+def test_slopes_that_are_wrong_end_no_search_as_a_success():
+    """Beside the minimum, the search goes round what is not a number. Where every slope is wrong, it says so."""
+    problem = standard_problem(channels="rates", states=noisy_states(1)[0], free=True)
+    problem = problem.within(jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF))
+    best = jaxos4.IBSS()(problem)
+    value, std = float(best.parameters[2]), float(best.std[2])
+    found = jaxos4.IBSS()(broken(problem, value + 2 * std, value + 6 * std, np.nan))
+    assert names(found) == "successful"
+    assert (np.abs(found.parameters - best.parameters) <= 0.05 * best.std).all()
+    strides = eqx.tree_at(lambda p: p.unknowns.stride, problem, problem.unknowns.stride.at[0].set(1.0))
+    assert names(jaxos4.IBSS()(broken(strides, -np.inf, np.inf, -1.0))) != "successful"
+
+
 def test_recorded_brackets_close_in_on_the_estimate():
     """They are recorded as each sweep opened them. That of a held parameter has no width."""
     problem = standard_problem(states=noisy_states(1)[0], channels="rates")

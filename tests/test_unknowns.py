@@ -48,6 +48,26 @@ def test_the_others_are_estimated_without_error_if_the_held_values_are_true(name
     assert (np.abs(found.parameters - model.alpha) <= tolerance).all()
 
 
+def test_a_held_parameter_needs_neither_a_start_nor_a_bracket():
+    """A start elsewhere does not move it, and its bracket may be empty."""
+    problem = noisy_problem().hold(HELD)
+    found, start = jaxos4.IBSS()(problem), problem.unknowns.center + 0.9 * problem.unknowns.half_width
+    half_width = problem.unknowns.half_width.at[np.array(PLACES)].set(0.0)
+    empty = jaxos4.IBSS()(problem, jaxos4.Bracket.around(problem.unknowns.center, half_width))
+    for other in (jaxos4.IBSS()(problem, start=start), empty):
+        assert other.result == jaxos4.RESULTS.successful
+        np.testing.assert_array_equal(other.parameters[np.array(PLACES)], list(HELD.values()))
+        assert (np.abs(other.parameters - found.parameters) <= 0.01 * found.std).all()
+
+
+def test_held_parameters_are_no_degrees_of_freedom():
+    problem = noisy_problem()
+    residuals = problem.residuals(problem.model.alpha)
+    free, held = (np.asarray(each.reweighted(residuals).sigma)[9] for each in (problem, problem.hold(HELD)))
+    count = residuals.size - 3  # the first sample is known
+    assert held / free == pytest.approx(np.sqrt((1 - 8 / count) / (1 - 6 / count)), rel=1e-9)
+
+
 @pytest.mark.parametrize("kind", ["shooting", "innovations"])
 def test_information_about_held_unknowns_is_left_out(kind):
     """Gradient and information of the others do not change."""

@@ -84,7 +84,7 @@ class AntColony(AbstractEstimator):
         def split(point: Float[Array, " unknowns"]) -> tuple[Array, Array]:
             """The shared unknowns and the initial state of a point."""
             start = first + off * point[count:] if problem.free_size else first
-            return usable.center + usable.width * point[:count], start
+            return jnp.clip(usable.center + usable.width * point[:count], *usable.limits(REACH)), start
 
         @jax.vmap
         def shoot(point: Float[Array, " unknowns"]) -> Scalar:

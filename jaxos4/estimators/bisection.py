@@ -1,7 +1,8 @@
 """The parts of IBSS: a stage, the directions of a sweep, and the brackets along them.
 
 All steps are in standard deviations. The unknowns of a window are the shared ones, then its own initial state.
-Its directions are those of the initial state, then the shared ones, which carry the initial state to where it fits.
+The directions of its initial state come first. Along each shared direction, the initial states move too, to where they
+fit best.
 """
 
 import functools
@@ -19,14 +20,16 @@ from ..shooting.abstract import WindowUnknowns
 Flag = Bool[Array, ""]
 PerDirection = Float[Array, "windows n"]
 
-_STRIDE_INFORMATION = 0.1  # in units of 1/stride^2: along a stride the information misjudges the curvature
+# Added information, in units of 1/stride^2: that of unknowns with a stride misjudges the curvature.
+_STRIDE_INFORMATION = 0.1
 
 
 class Stage(NamedTuple):
     """A stage of a problem, see `Stages`.
 
     - `evaluate`, `misfit`, `searched`, `smallest_step`: those of `Stages` for this stage. `limits`: of all unknowns.
-    - `added_information`: of directions, not of the cost: for unknowns without a prior, and to keep strides short.
+    - `added_information`: added before directions are chosen; the cost does not contain it. For an unknown without a
+      prior it is that of the bracket; for any other it keeps steps within the stride.
     """
 
     problem: AbstractProblem
@@ -60,7 +63,7 @@ class Directions(NamedTuple):
     """The directions of a sweep, and the room along them from where it begins.
 
     - `factor`, `basis`: see `JointFactor`. A direction is a column of `basis`.
-    - `moves`: the unknowns that move: not those at a limit, beyond which the cost falls.
+    - `moves`: the unknowns that may move: all but those at a limit beyond which the cost falls.
     - `below`, `above`: the way to the limits, against and along each direction.
     """
 
@@ -76,8 +79,9 @@ class Brackets(NamedTuple):
 
     - `predicted`: the predicted step to the minimum.
     - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: those of the part that no slope
-      has excluded; both at one opened end if the minimum lies beyond it.
-    - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope there, and its change.
+      has excluded. If the minimum lies beyond an opened end, both are at that end.
+    - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope at `last`, and how fast it
+      changes.
     """
 
     predicted: PerDirection
@@ -92,7 +96,7 @@ class Brackets(NamedTuple):
 
     @classmethod
     def around(cls, predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection):
-        """Brackets around predicted steps. The first trials are their middles, the rates those of unit information."""
+        """Brackets around predicted steps. The first trials are their middles; the rates are 1, as the information."""
         predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
         lowest, highest = jnp.maximum(predicted - half_width, -below), jnp.minimum(predicted + half_width, above)
         middle, zero = (lowest + highest) / 2, jnp.zeros_like(lowest)
@@ -106,6 +110,7 @@ class Brackets(NamedTuple):
         """
         lower = jnp.where(slope <= 0, self.trial, self.lower)
         upper = jnp.where(slope >= 0, self.trial, self.upper)
+        # After the first shot this is not finite, so the rate stays 1.
         secant = (slope - self.slope) / (self.trial - self.last)
         rate = jnp.where((secant > 0) & jnp.isfinite(secant), secant, self.rate)
         zero = self.trial - slope / rate
@@ -115,5 +120,5 @@ class Brackets(NamedTuple):
 
 
 def prior_std(problem: AbstractProblem) -> WindowUnknowns:
-    """Standard deviation of each unknown without the flight: half of how far off the unknown may be."""
+    """Standard deviation of each unknown before the flight is seen: half of how far off it may be."""
     return problem.join(problem.unknowns.usable.half_width, problem.first_state()[1]) / 2

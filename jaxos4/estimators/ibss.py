@@ -1,4 +1,4 @@
-"""Iterative Bi-Section Shooting (IBSS): halve brackets on the slope of the trajectory mismatch.
+"""Iterative Bi-Section Shooting (IBSS): narrow brackets by the sign of the slope of the cost.
 
 The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md). They are
 the five calls in `IBSS.sweep`.
@@ -23,17 +23,18 @@ from .bisection import Brackets, Directions, Flag, PerDirection, Stage, prior_st
 
 KINDS_OF_DIRECTIONS = {"whitened": joint_factor, "coordinate": coordinate_directions}
 
-_COARSE = 0.5  # a stage that is not the last ends once no direction has more than this many standard deviations to go
-# The first sweep of a stage goes so many standard deviations of its start at most; brackets reach this share of them.
+_COARSE = 0.5  # every stage but the last ends when the minimum is at most this many standard deviations away
+# The first sweep of a stage: its longest step in standard deviations of the stage's start, and the half-width of its
+# brackets as a share of that.
 _OPENING, _FIRST = 4.0, 0.05
-# Later half-widths are this many times the last error of the predictions. Both are shares of the longest step; that of
-# the half-width is at least the second number, and at most 1.
+# Later: half-width / longest step = _SAFETY times the relative error of the last predictions, from _NARROWEST to 1.
 _SAFETY, _NARROWEST = 2.0, 0.01
-_GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose last shot was at one of its ends, and of all together
-_CHANCE = 1.0  # a sweep that raises the cost by no more may have done so by chance
-# A sweep of at most so many standard deviations that lowers the cost by no more than the second number has stalled.
+# If the last shot was at an end of its bracket, its growth is multiplied by _GROWTH, up to _WIDEST.
+_GROWTH, _WIDEST = 4.0, 256.0
+_CHANCE = 1.0  # a sweep may raise the cost by this much and is still kept
+# A sweep has stalled if its predicted steps are at most _SHORT, and it lowers the cost by no more than _GAIN.
 _SHORT, _GAIN = 0.3, 1e-4
-# After a rejected sweep, the next may go this share as far, and after any other this many times as far.
+# The trust is multiplied by _RETREAT after a rejected sweep, and by _ADVANCE after any other.
 _RETREAT, _ADVANCE = 0.25, 1.4
 
 
@@ -45,8 +46,8 @@ class State(NamedTuple):
     - `relative_width`: the half-width of the next brackets, as a share of the longest step. `growth`: how many times as
       wide each direction's bracket is.
     - `trust`: the share of the longest predicted step that a sweep may go; 1: no limit.
-    - `number_in_stage`: of the next sweep; -1 for the first shot, which is at the start.
-    - `sweeps`, `rollouts`: how many sweeps shot, and `Estimate.rollouts`, in all stages so far.
+    - `number_in_stage`: the number of the next sweep in this stage; -1: only a shot at the start.
+    - `sweeps`: the number of sweeps with at least one shot. `rollouts`: see `Estimate.rollouts`. Both count all stages.
     - `done`: whether the stage ended by itself. `record`: see `Estimate.brackets`.
     """
 
@@ -73,17 +74,19 @@ class IBSS(AbstractEstimator):
 
     A *shot* simulates the flight at trial unknowns, and gives the cost with its gradient and information. **The sign of
     the cost's slope along a direction decides** which side of the trial holds the minimum, and so which part of the
-    bracket is dropped. The quadratic model and the secant through the last slopes only **propose**. A *sweep* is one
-    iteration. A *stage* repeats sweeps on some of the data until the minimum is near; the last stage fits all of them.
-    Parameters are bisected on the sum of all windows' slopes, initial states on those of their own window.
+    bracket is dropped. The quadratic model and the secant through the last slopes **propose** where to shoot. The size
+    of the slopes decides when to stop, and the cost whether a point is kept. A *sweep* is one iteration. A *stage*
+    repeats sweeps on some of the data until the minimum is near; the last stage fits all of them. Parameters are
+    bisected on the sum of all windows' slopes, initial states on those of their own window.
 
     **Arguments:**
 
     - `directions`: `"whitened"`: the columns of L^-T, with L L^T the Fisher information at the current estimate; the
       cost is nearly separable along them, so a sweep bisects all together. The rates are fitted first, then all
-      channels. `"coordinate"`: the unknowns, one in each sweep, on all channels at once: good on the rates only.
+      channels. `"coordinate"`: the unknowns themselves, one in each sweep, on all channels at once: slow on more
+      channels than the rates.
     - `halvings`: the shots of a sweep that narrow the brackets.
-    - `max_sweeps`: the most sweeps of each stage; along coordinates, for each of them.
+    - `max_sweeps`: the most sweeps of a stage; along coordinates, times the number of unknowns that are searched.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
       direction. These are scaled by the `misfit` of the residuals, so noise-free data are fitted to rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
@@ -197,10 +200,10 @@ class IBSS(AbstractEstimator):
         predicted, near = self._predict(stage, state, directions)
         brackets = self._open(stage, state, directions, predicted)
         found = self._bisect(stage, state, directions, near, brackets)
-        return self._judge(stage, state, directions, near, found)
+        return self._judge(stage, state, directions, predicted, near, found)
 
     def terminate(self, stage: Stage, state: State) -> Flag:
-        """Whether the stage has ended. After its last sweep it looks once more whether the minimum is near."""
+        """Whether the stage has ended. One more call after the last sweep does not shoot: is the minimum near?"""
         return state.done | (state.number_in_stage > self._most_sweeps(stage))
 
     def _look_around(self, stage: Stage, state: State) -> Directions:
@@ -213,7 +216,7 @@ class IBSS(AbstractEstimator):
         return Directions(factor, basis, moves, *room_to_limits(unknowns, basis, (lower, upper)))
 
     def _predict(self, stage: Stage, state: State, directions: Directions) -> tuple[PerDirection, Flag]:
-        """2. The step to the quadratic model's minimum (minus the slope: the information is 1). Is it near?"""
+        """2. Predict the step to the quadratic model's minimum: minus the slope. If it is near, the stage ends."""
         steps = jnp.clip(-self._slopes(stage, directions, state.curvature), -directions.below, directions.above)
         return steps, (state.number_in_stage >= 0) & self._is_near(stage, state.curvature, steps)
 
@@ -252,25 +255,35 @@ class IBSS(AbstractEstimator):
             curvature = stage.evaluate(unknowns)
             slope = self._slopes(stage, directions, curvature)
             close = curvature.shot.feasible.all() & self._is_near(stage, curvature, slope)
-            # A broken slope counts as that of a minimum at step 0: with unit information the slope is then the step.
+            # A slope that is not finite becomes the trial: with unit information this puts the minimum at step 0.
             brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
             return brackets, unknowns, curvature, taken + 1, close
 
         first = brackets, state.unknowns, state.curvature, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
         return jax.lax.while_loop(lambda carry: (carry[3] < shots) & ~carry[4], shoot, first)[:4]
 
-    def _judge(self, stage: Stage, state: State, directions: Directions, near: Flag, found: Bisected) -> State:
+    def _judge(
+        self,
+        stage: Stage,
+        state: State,
+        directions: Directions,
+        predicted: PerDirection,
+        near: Flag,
+        found: Bisected,
+    ) -> State:
         """5. Keep the new point, or go back and stay closer if the sweep made things worse."""
         brackets, unknowns, curvature, shots = found
         shot, before = curvature.shot, state.curvature.shot
         first = state.number_in_stage < 0
         swept = ~first & (shots > 0)
         gain = before.cost.sum() - shot.cost.sum()
-        stalled = swept & (gain <= _GAIN) & _may_stall(stage, state, found)
-        finite = jnp.isfinite(unknowns).all() & jnp.isfinite(shot.cost).all()
+        stalled = swept & (gain <= _GAIN) & self._may_stall(stage, state, predicted, curvature)
+        numbers = (unknowns, shot.cost, curvature.gradient, curvature.information)
+        finite = jnp.stack([jnp.isfinite(each).all() for each in numbers]).all()
         # The cost of a trajectory that is not feasible means nothing.
         not_worse = shot.feasible.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
-        rejected = ~first & ~(finite & (~before.feasible.all() | not_worse)) | (stalled & (gain < 0))
+        bad = ~finite | (before.feasible.all() & ~not_worse)
+        rejected = (~first & bad) | (stalled & (gain < 0))
         new, old = (unknowns, curvature), (state.unknowns, state.curvature)
         unknowns, curvature = jax.tree.map(lambda new, old: jnp.where(rejected, old, new), new, old)
         covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(directions.basis)
@@ -295,20 +308,22 @@ class IBSS(AbstractEstimator):
         return slopes_along(directions.basis, gradient, stage.problem.unknowns.count)
 
     def _is_near(self, stage: Stage, curvature: Curvature, steps: PerDirection) -> Flag:
-        """Whether so short steps, or slopes, end a stage: the last stage is searched finely, the others coarsely."""
+        """Whether steps, or slopes, which are as long, are short enough to end the stage: the last one ends finely."""
         misfit = stage.misfit(curvature.shot.cost.sum())
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
         return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
+    def _may_stall(self, stage: Stage, state: State, predicted: PerDirection, curvature: Curvature) -> Flag:
+        """Whether a short sweep may end the stage: only if an unknown has a stride, as its slopes are inexact.
+
+        One coordinate alone does not say how far the others have to go.
+        """
+        feasible = curvature.shot.feasible.all() & state.curvature.shot.feasible.all()
+        short = jnp.isfinite(stage.problem.unknowns.stride).any() & (jnp.abs(predicted).max() <= _SHORT)
+        return feasible & short & (self.directions == "whitened")
+
     def _most_sweeps(self, stage: Stage) -> Count:
         return self.max_sweeps * (1 if self.directions == "whitened" else stage.searched.sum())
-
-
-def _may_stall(stage: Stage, state: State, found: Bisected) -> Flag:
-    """Whether a sweep is short, on a cost whose slopes may be large at the minimum: those along strides are inexact."""
-    (brackets, _, curvature, _), unknowns = found, stage.problem.unknowns
-    feasible = curvature.shot.feasible.all() & state.curvature.shot.feasible.all()
-    return jnp.isfinite(unknowns.stride).any() & feasible & (jnp.abs(brackets.predicted).max() <= _SHORT)
 
 
 def _next_widths(stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:
@@ -322,7 +337,7 @@ def _next_widths(stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar
 
 
 def _recorded(stage: Stage, state: State, directions: Directions, brackets: Brackets, swept: Flag) -> Array:
-    """The record with what one more sweep opened: the values of each parameter between the ends of all brackets."""
+    """The record with one more row: the lowest and the highest value of each parameter in the opened brackets."""
     length, _, count = state.record.shape
     basis = jnp.where(stage.searched[:count, None], directions.basis[0, :count], 0.0)
     spans = basis * jnp.stack([brackets.lowest, brackets.highest])[:, 0, None]

@@ -97,22 +97,27 @@ class Unknowns(eqx.Module):
         strangers = [name for name in values if name not in self.names]
         if strangers:
             raise ValueError(f"`values`: {strangers[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
-        if len(values) == self.count:
-            raise ValueError("`values` holds every unknown; leave at least one free.")
         held = np.isin(self.names, list(values))
+        if held.all() or not (isinstance(self.free, Tracer) or (np.asarray(self.free) & ~held).any()):
+            raise ValueError("`values` holds every unknown that is still free; leave at least one.")
         given = [as_float(values.get(name, 0.0)) for name in self.names]
         center, free = _held(self.center, self.free, held, given)
         return dataclasses.replace(self, center=center, free=free)
 
     @property
     def valid(self) -> Bool[Array, ""]:
-        """Whether every bracket is finite, and its lower end is below its upper end."""
-        return ((self.half_width > 0) & jnp.isfinite(self.half_width) & jnp.isfinite(self.center)).all()
+        """Whether every bracket is finite, and its lower end is below its upper end, unless the unknown is held."""
+        wide = (self.half_width > 0) | ~self.free
+        return (wide & jnp.isfinite(self.half_width) & jnp.isfinite(self.center)).all()
 
     @property
     def usable(self) -> "Unknowns":
-        """The unknowns themselves if they are valid; otherwise 0 +- 1, so that a batch stays finite."""
-        center, half_width = jnp.where(self.valid, self.center, 0.0), jnp.where(self.valid, self.half_width, 1.0)
+        """The unknowns themselves if they are valid; otherwise 0 +- 1, so that a batch stays finite.
+
+        The half-width of a held unknown is 1 if it was 0.
+        """
+        center = jnp.where(self.valid, self.center, 0.0)
+        half_width = jnp.where(self.valid & (self.half_width > 0), self.half_width, 1.0)
         return dataclasses.replace(self, center=center, half_width=half_width)
 
     @property

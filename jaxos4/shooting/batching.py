@@ -140,6 +140,8 @@ def on_all_cores(function: Callable) -> Callable:
     def batch(many: Any, *shared: Any) -> Any:
         leaves, structure = jax.tree.flatten(eqx.filter((many, shared), eqx.is_array))
         lanes = leaves[0].shape[0]
+        if not lanes:
+            raise ValueError("`many` must hold at least one lane.")
         size = min(lanes, _CHUNK) if jax.default_backend() == "cpu" else lanes
 
         @for_threads

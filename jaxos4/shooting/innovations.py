@@ -89,6 +89,8 @@ class InnovationsProblem(AbstractProblem):
         # An array in any case, so that all starts share one program.
         unknowns = problem.unknowns.count + 3 * self.problem.columns.size
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
+        if self.start.shape != (unknowns,):
+            raise ValueError(f"`start` must hold {unknowns} unknowns, got shape {self.start.shape}.")
 
     @property
     def model(self) -> AbstractModel:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -16,7 +16,8 @@ _CAPACITIES = (4096, 16384, 65536)
 def padded(problem: ShootingProblem) -> ShootingProblem:
     """The problem with a padded flight.
 
-    Padding is not simulated: it costs memory and no time. Results change by rounding errors only.
+    Padding is not simulated: it costs memory and no time. Results change by rounding errors only. Derivatives
+    are forward-mode only.
 
     A flight in windows is not padded.
     """

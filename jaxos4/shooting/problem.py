@@ -298,7 +298,7 @@ class ShootingProblem(AbstractProblem):
         columns, before = self.columns, np.asarray(self.sigma)
         measured, squares = self.recorded(), np.square(np.reshape(residuals, (-1, columns.size))).sum(axis=0)
         known = ~np.isnan(measured)
-        count, unknowns = known.sum(axis=0), len(self.model.parameter_names) + self.windows * self.free_size
+        count, unknowns = known.sum(axis=0), int(np.asarray(self.unknowns.free).sum()) + self.windows * self.free_size
         freedom = max(1 - unknowns / max(count.sum(), 1), 1e-3)
         sigma = before[columns] * np.sqrt(squares / np.maximum(count * freedom, 1))
         rounding = ROUNDING * np.finfo(before.dtype).eps * np.where(known, np.abs(measured), 0.0).max(axis=0)

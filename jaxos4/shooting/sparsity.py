@@ -39,7 +39,7 @@ def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results
 def panels_of(
     advance: Callable, at: tuple[Any, Any, tuple], forcing_parameters: tuple[int, ...], *, free: bool
 ) -> tuple[int, list[Panel]]:
-    """The number of unknowns up to the last that acts not on the translation alone, and panels of all rows.
+    """The number of unknowns up to the last one that acts on rates or attitude; and the panels of all rows.
 
     **Arguments:**
 
