@@ -146,7 +146,7 @@ def test_trouble_is_named(report):
         "noise x 0.1, ibss, flight 1: at bound",
         "noise x 0.1, ibss, flight 3: nonfinite trajectory",
         "noise x 10, ibss, flight 2: max sweeps",
-        "3 flights without numbers",
+        "3 flights that did not end successful",
         "† absolute error, in the parameter's unit: the truth is 0",
         "‡ absolute error, in the parameter's unit: below the noise floor",
         "jaxos4 study synthetic.toml --out synthetic",

@@ -45,6 +45,7 @@ WRONG_SPECIFICATIONS = [
     (MINE.replace("mass = 0.6", "mass = -0.6"), "[airframe.mine]: `mass`"),
     (MINE + "max_rotor_speed = inf", "[airframe.mine]: not finite"),
     (AIRFRAME, "[airframe.mine] is not flown"),
+    ('[input]\nmine = "mine.csv"', "`input` mine is not flown; name it in `excitations`"),
     (None, "No such file"),
     (b"\xff\xfe\x00", "not a TOML file"),
     ("flights = ", "not a TOML file"),
@@ -55,6 +56,8 @@ WRONG_SPECIFICATIONS = [
 
 @pytest.mark.parametrize(("text", "words"), WRONG_SPECIFICATIONS)
 def test_a_wrong_specification_is_one_line(run, tmp_path, text, words):
+    rows = "".join(f"{0.01 * k:.2f},200,200,200,200\n" for k in range(600))
+    (tmp_path / "mine.csv").write_text("t,omega1,omega2,omega3,omega4\n" + rows)
     if text is not None:
         (tmp_path / "spec.toml").write_bytes(text if isinstance(text, bytes) else text.encode())
     for option in ((), ("--dry-run",)):

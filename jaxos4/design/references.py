@@ -28,7 +28,7 @@ _TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
 _LITTLE = 0.9
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
 _SMALL = np.array([0.02, 0.02, 0.02, 0.2])
-# The least number of flights of a batch of tones that hover in gusts instead.
+# In a batch of tones, at least this many flights hover in gusts instead.
 _GUSTY = 8
 # Times in periods at which the search looks, about eight for each cycle of the fastest tone.
 _POINTS = np.arange(200) / 200
@@ -208,6 +208,8 @@ def design_references(
     for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
         if not 0 < value <= most:
             raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
+    if "slew" in (limits or {}):
+        raise InputError("`limits`: `slew` is a limit of rotor speeds, and a controller has none; leave it out.")
     task.check_settings(duration, dt, bandwidth, criterion, samples=(250, 20_000), cycles=2, fastest=0.1)
     progress("limits")
     key = jax.random.key(key) if isinstance(key, int) else key

@@ -57,7 +57,7 @@ class Designed(NamedTuple):
     - `bounds`: the smallest standard deviation that each parameter can have after the flight.
     - `uses`: the largest share of each limit that any vehicle of the bracket uses; empty if none was flown.
     - `period`: the time after which the inputs repeat [s]; the whole flight if they do not.
-    - `history`: the bounds after each sample, infinite until a parameter is excited. `None`: the bounds fall with the
+    - `history`: the bounds after each sample, very large until a parameter is excited. `None`: the bounds fall with the
       square root of the duration.
     """
 

@@ -62,7 +62,7 @@ class NetworkEstimator(eqx.Module):
       log-uniformly, and the scale is an input of the network.
     - `width`, `depth`: of the perceptron that corrects a linear map.
     - `steps`, `batch`, `learning_rate`: of the training, by Muon with a cosine schedule; a step uses `batch` flights,
-      and each flight is used four times with new noise.
+      and each flight is used about four times, with new noise.
     - `patience`: training stops early after this many checks, of 250 steps each, without a better validation loss.
     - `held_out`: simulated flights for the calibration of the intervals, each with new noise at nine noise scales.
 

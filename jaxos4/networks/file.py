@@ -69,20 +69,21 @@ def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
     Raises `InputError` if it is no complete network file of this version; `OSError` if it cannot be read.
     """
     content = path if isinstance(path, io.BytesIO) else io.BytesIO(Path(path).read_bytes())
+    place = "the network" if isinstance(path, io.BytesIO) else path
     try:
         with np.load(content, allow_pickle=False) as file:
-            return _restore(path, {name: file[name] for name in file.files})
+            return _restore(place, {name: file[name] for name in file.files})
     except InputError:
         raise
     except (*BROKEN, OSError) as error:
         what = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: not a whole network file ({what}); train it again with `jaxos4 train`.") from None
+        raise InputError(f"{place}: not a whole network file ({what}); train it again with `jaxos4 train`.") from None
 
 
-def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
+def _restore(place: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     header = json.loads(str(arrays["header"]))
     if header["format"] != _FORMAT:
-        raise InputError(f"{path}: trained by another version of jaxos4; train it again with `jaxos4 train`.")
+        raise InputError(f"{place}: trained by another version of jaxos4; train it again with `jaxos4 train`.")
     settings = NetworkEstimator(**header["settings"] | {"noise": tuple(header["settings"]["noise"])})
     airframe = Airframe(**{f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
     problem = ShootingProblem(
@@ -95,7 +96,8 @@ def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
         windows=header["windows"],
     )
     blank = eqx.filter_eval_shape(lambda p: _blank(settings, p, header["checks"]), problem)
-    blank = eqx.tree_at(lambda n: n.features.problem, blank, problem)
+    given = problem, jnp.asarray(arrays["network.key"], dtype=jnp.uint32)  # the size of a key depends on its kind
+    blank = eqx.tree_at(lambda n: (n.features.problem, n.key), blank, given)
 
     def fill(place: tuple, leaf: Any) -> Any:
         if not isinstance(leaf, jax.ShapeDtypeStruct):

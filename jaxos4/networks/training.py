@@ -105,7 +105,10 @@ def train(
         history.append([float(value) for value in losses])
         value, current = history[-1]
         if not np.less(history[-1], _DIVERGED).all():
-            raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
+            loss = next(each for each in (current, value) if not each < _DIVERGED)
+            raise TrainingError(
+                f"training diverged within {first + count} steps (loss {loss:g}): lower `learning_rate`."
+            )
         without_improvement += 1
         if current < lowest - _IMPROVEMENT * abs(current):
             best, lowest, without_improvement = regressor, current, 0
@@ -200,9 +203,11 @@ def calibrate(
         chunks = noisy_chunks(features, flights, np.stack([scale, scale]), key, purpose, 1 + number)
         error = np.concatenate([_standardised(regressor, scaling, chunk, scale) for chunk in chunks])[:, :parameters]
         error = error[np.isfinite(error).all(axis=1)]
-        rank = np.ceil((len(error) + 1) * LEVELS).astype(int) - 1
+        rank = np.ceil(np.round((len(error) + 1) * LEVELS, 9)).astype(int) - 1  # LEVELS have rounding errors
         if rank[-1] >= len(error):
-            raise TrainingError("too few of the held-out flights can be flown to calibrate: narrow the bracket.")
+            raise TrainingError(
+                "too few of the held-out flights can be flown to calibrate: narrow the bracket, or increase `held_out`."
+            )
         moments = error.T @ error / len(error)
         rms = np.sqrt(np.diagonal(moments))
         relative = np.abs(error) / rms

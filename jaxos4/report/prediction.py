@@ -67,7 +67,8 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
         x = np.pad(found.time[shown, None] + found.horizons, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
         measured, predicted = (_angles(states[shown]) for states in (found.measured, found.predicted))
         # The same turn of an angle.
-        predicted[..., 6:9] -= 2 * np.pi * np.nan_to_num(np.round((predicted - measured)[..., 6:9] / (2 * np.pi)))
+        predicted[..., 6:9] = np.unwrap(predicted[..., 6:9], axis=-2)
+        measured[..., 6:9] -= 2 * np.pi * np.nan_to_num(np.round((measured - predicted)[..., 6:9] / (2 * np.pi)))
         handles = []
         for panel, (title, column) in zip(panels, columns, strict=True):
             y, half, seen = (
@@ -97,5 +98,4 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
 
 def _angles(states: np.ndarray) -> np.ndarray:
     """The states with roll, pitch and yaw [rad] in the place of the quaternion."""
-    angles = np.unwrap(euler_angles(states[..., 6:10]), axis=-2)
-    return np.concatenate([states[..., :6], angles, states[..., 10:]], axis=-1)
+    return np.concatenate([states[..., :6], euler_angles(states[..., 6:10]), states[..., 10:]], axis=-1)

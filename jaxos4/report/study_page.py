@@ -57,7 +57,7 @@ def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
         failed=study_tables.failed_cells(dataset),
         missing=missing,
         cells=cells,
-        drawn=sum(map(bool, drawings)),
+        drawn=min(len(drawings), MOST_DRAWN),
         zero_scale=bool((dataset["scale"] == 0).any()),
     )
     files = {folder / f"{each.stem}.svg": each.svg for figures in drawings for each in figures.values()}

@@ -241,7 +241,9 @@ def _results(
     """The arrays of a cell's file. A flight without an estimate has NaN, and a result that says why."""
     seed, hit = found["seed"], np.full(study.batch, -1)
     if seed is not None:
-        hit = ((truth >= seed.lower) & (truth <= seed.upper)).all(axis=-1)
+        # A network without an answer has an infinite interval, which is no hit.
+        given = np.isfinite(seed.lower) & np.isfinite(seed.upper)
+        hit = (given & (truth >= seed.lower) & (truth <= seed.upper)).all(axis=-1)
     finite = np.isfinite(found["std"]).all(axis=-1) & np.isfinite(found["parameters"]).all(axis=-1)
 
     def kept(name: str) -> np.ndarray:

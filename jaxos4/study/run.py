@@ -207,13 +207,16 @@ def carry_out(
     run: Callable[[Store], Iterator[tuple[str, int]]] = run_here,
     progress: Callable[[str, int], None] = lambda label, done: None,
 ) -> xr.Dataset:
-    """Runs the missing cells of a study and writes its Dataset. Raises what `open_store` and `run` raise.
+    """Runs the missing cells of a study and writes its Dataset.
+
+    Raises what `open_store` and `run` raise, and `InputError` if an excitation does not fit into one of the durations.
 
     - `out`: the study's folder; a new one, or one that the same study wrote.
     - `device`: what computes, in words, for the provenance.
     - `run`: `run_here`, or `run_on_cluster` with its client.
     - `progress`: is called after each step, with its label and the number of finished cells.
     """
+    study.check_excitations()
     with open_store(out, study, device) as store:
         for label, done in run(store):
             progress(label, done)

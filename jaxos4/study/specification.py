@@ -139,7 +139,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     raise InputError(f"`{axis}` must be finite numbers, got {value}; correct it.")
                 if value not in choices:
                     raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(choices)}.")
-        for key, text in (("title", self.title), *(("airframe", name) for name in self.airframe)):
+        names = [("airframe", name) for name in self.airframe] + [("input", name) for name in self.input]
+        for key, text in (("title", self.title), *names):
             if not text.isprintable():
                 raise InputError(f"`{key}` has a line break or another control character; remove it.")
         for name, table in self.airframe.items():
@@ -147,6 +148,9 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise InputError(f"[airframe.{name}] is not flown; name it in `airframes`, or remove it.")
             if not all(math.isfinite(value) for value in table.values() if isinstance(value, float)):
                 raise InputError(f"[airframe.{name}]: not finite; leave out `max_rotor_speed` if it is unknown.")
+        for name in self.input:
+            if name not in self.excitations:
+                raise InputError(f"`input` {name} is not flown; name it in `excitations`, or remove it.")
         for name in self.airframes:
             self.vehicle(name)
         for duration in self.durations:
@@ -155,6 +159,12 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise InputError(f"`durations`: {got} is not 2 to {_MOST} samples; change one.")
         if self.count > _MOST:
             raise InputError(f"{self.count} cells, more than {_MOST}; shorten an axis, or increase `batch`.")
+
+    def check_excitations(self) -> None:
+        """Raises `InputError` if an excitation does not fit into one of the durations."""
+        for name, excitation, duration in itertools.product(self.airframes, self.excitations, self.durations):
+            with named(f"`excitations`: {excitation} of {duration:g} s by {name}"):
+                self.omega(excitation, name, duration)
 
     def vehicle(self, name: str) -> Airframe:
         """The airframe of that name. Raises `InputError` if there is none, or if its table is not usable."""
@@ -226,9 +236,7 @@ def load_study(path: Path) -> Study:
     try:
         table = table | _inputs(table, Path(path).parent)
         study = msgspec.convert(table, Study)
-        for name, excitation, duration in itertools.product(study.airframes, study.excitations, study.durations):
-            with named(f"`excitations`: {excitation} of {duration:g} s by {name}"):
-                study.omega(excitation, name, duration)
+        study.check_excitations()
     except (InputError, msgspec.ValidationError, RecursionError) as error:
         in_our_words = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
         what = " ".join(str(error).split())[:300]
