@@ -192,7 +192,7 @@ def standard_references(
     """
     time = dt * np.arange(samples)[:, None]
     sines = [np.sin(2 * math.pi * time * np.asarray(some)).sum(axis=1) for some in (*STANDARD_TONES, _VERTICAL_TONES)]
-    swept, _ = _sweep(samples // 4, samples // 4 * dt, _SWEPT)
+    swept, _ = _sweep(max(samples // 4, 1), samples // 4 * dt, _SWEPT)
     pulses = {name: np.repeat([*heights, 0.0], max(round(_WIDTH / dt), 1)) for name, heights in _REFERENCE_PULSES}
     shapes = {"multisine": np.stack(sines, axis=1)}
     for name, parts in ({name: (once, -once) for name, once in pulses.items()} | {"chirp": (swept,)}).items():

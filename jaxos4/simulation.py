@@ -5,11 +5,9 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector, as_float
+from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector, as_float, setting
 from ._xla import quick_jit
 from .flight import STATE_NAMES, Flight, Inputs
 from .models.abstract import AbstractModel
@@ -98,17 +96,13 @@ def simulate(
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
     start = jnp.zeros(12) if initial_state is None else initial_state
-    for name, value, shape in (
-        ("parameters", parameters, (len(model.parameter_names),)),
-        ("omega", omega, (*jnp.shape(omega)[:1], 4)),
-        ("initial_state", start, (12,)),
-        ("dt", dt, ()),
-    ):
-        if jnp.shape(value) != shape:
-            raise ValueError(f"`{name}` must have shape {shape}, got {jnp.shape(value)}; use `vmap` for a batch.")
-    if not isinstance(dt, Tracer) and not np.asarray(dt) > 0:
-        raise ValueError(f"`dt` must be positive, got {dt}.")
-    return _simulate(model, as_float(parameters), as_float(omega), as_float(dt), as_float(start), method)
+    if jnp.ndim(omega) != 2 or jnp.shape(omega)[1] != 4:
+        raise ValueError(f"`omega` must have shape (samples, 4), got {jnp.shape(omega)}; use `vmap` for a batch.")
+    for name, value, size in (("parameters", parameters, len(model.parameter_names)), ("initial_state", start, 12)):
+        if jnp.shape(value) != (size,):
+            raise ValueError(f"`{name}` must have shape ({size},), got {jnp.shape(value)}; use `vmap` for a batch.")
+    dt = setting("dt", positive=True)(dt)
+    return _simulate(model, as_float(parameters), as_float(omega), dt, as_float(start), method)
 
 
 @quick_jit

@@ -38,6 +38,14 @@ def fly(loop, wanted=LEVEL, *, seed=1):
     return jaxos4.fly_closed_loop(loop, jnp.asarray(wanted), dt=DT, key=jax.random.key(seed))
 
 
+def test_random_references_bring_the_vehicle_back_to_its_height():
+    """A pair of accelerations gains no velocity: it rises in one step of 0.5 s, at 1.5 m/s^2 at most."""
+    wanted = np.asarray(jaxos4.random_references(duration=60.0, dt=0.01, key=jax.random.key(0)))
+    gained = 0.01 * np.cumsum(wanted[:, 3])
+    assert 0.5 < np.abs(gained).max() < 2 * 1.5 * 0.5
+    assert np.abs(np.corrcoef(wanted[100:-100].T) - np.eye(4)).max() < 0.35  # each its own steps
+
+
 # The second implementation.
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .._custom_types import Key, Numeric, Scalar, as_float, setting
+from .._custom_types import Key, Numeric, Scalar, as_float, integer, setting
 from .._xla import quick_jit
 from ..airframe import alpha_scalars
 from ..flight import Flight
@@ -34,6 +34,8 @@ def random_references(
 ) -> References:
     """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
 
+    Accelerations come in pairs of opposite sign. So the vehicle gains little vertical velocity, as in a real flight.
+
     **Arguments:**
 
     - `duration`, `dt`: length and sample time [s].
@@ -55,8 +57,13 @@ def random_references(
 
 @functools.partial(jax.jit, static_argnums=2)
 def _levels(key: Key, steps: Int[Array, "samples 4"], count: int, amplitude: References) -> References:
-    """The level of each reference in each of its steps, of which there are at most `count`."""
+    """The level of each reference in each of its steps, of which there are at most `count`.
+
+    Every second acceleration is the one before it with the opposite sign.
+    """
     levels = jax.random.uniform(key, (count, 4), minval=-1, maxval=1)
+    step = np.arange(count)
+    levels = levels.at[:, 3].set(levels[step - step % 2, 3] * (1 - 2 * (step % 2)))
     return amplitude * jnp.take_along_axis(levels, steps, axis=0)
 
 
@@ -82,7 +89,8 @@ def fly_closed_loop(
     shape = jnp.shape(references)
     if len(shape) != 2 or shape[0] < 2 or shape[1] != 4:
         raise ValueError(f"`references` must have shape (samples, 4), at least two samples, got {shape}.")
-    if substeps < 1 or substeps % loop.log_every:
+    substeps = integer("substeps", 1, static=True)(substeps)
+    if substeps % loop.log_every:
         raise ValueError(f"`substeps` must be a positive multiple of `log_every` = {loop.log_every}, got {substeps}.")
     return _fly(loop, as_float(references), setting("dt", positive=True)(dt), key, substeps)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._custom_types import Scalar, setting
+from .._custom_types import Scalar, integer, setting
 from ..airframe import Airframe
 from ..models.rotors import Motor
 from ..models.terms import STEEPEST
@@ -52,8 +52,8 @@ class Sensors(eqx.Module):
       axis, once for each revolution. The amplitude is proportional to the squared speed. Sampling causes aliasing.
     - `gyro_filter`, `force_filter`: time constants of the first-order low-pass filters before logging [s]. They filter
       the noise too.
-    - `speed_noise`, `speed_step`: standard deviation and step of rounding of what is logged of the rotors [rad/s].
-    - `clock_offset`: the rotors are logged so much later than the gyro, earlier if negative [s].
+    - `speed_noise`, `speed_step`: standard deviation and rounding step of the logged rotor speeds or commands [rad/s].
+    - `clock_offset`: delay of the logged rotors behind the gyro [s]; negative: the rotors are logged earlier.
     - `dropouts`: the shares of samples that gyro and accelerometer lose (NaN), independently.
     - `bad_samples`: the number of impossible values, 1e6, at random places of gyro and accelerometer.
     - `velocity_noise`: standard deviation of the measured velocity [m/s]. `None`: not measured. Needs `ClosedLoop.air`.
@@ -140,14 +140,12 @@ class ClosedLoop(eqx.Module):
     controller_inertia: PerAxis | None = eqx.field(
         converter=lambda x: None if x is None else setting("controller_inertia", _BODY)(x), default=None
     )
-    log_every: int = eqx.field(static=True, default=1)
+    log_every: int = eqx.field(static=True, converter=integer("log_every", 1, static=True), default=1)
     logged: str = eqx.field(static=True, default="commands")
 
     def __check_init__(self):
         if self.logged not in LOGGED:
             raise ValueError(f"`logged` must be one of {', '.join(LOGGED)}, got {self.logged!r}.")
-        if self.log_every < 1:
-            raise ValueError(f"`log_every` must be at least 1, got {self.log_every}.")
         loaded = [x for x in (self.thrust_curve, self.motor_braking) if not isinstance(x, Tracer) and float(x) != 1]
         if loaded and not self.airframe.has_full_scale:
             raise ValueError("`airframe.max_rotor_speed` must be known for `thrust_curve` and `motor_braking`: set it.")

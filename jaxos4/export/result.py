@@ -132,6 +132,7 @@ def _parts(file: ResultFile) -> tuple[dict[str, float], list[str], list[str]]:
             found.pop(name, None)  # the estimate says that this one is not to be trusted
     if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SIGNIFICANT * found["rotor_reaction"][1]:
         del found["rotor_reaction"]
+    if "rotor_reaction" not in found and "rotor_reaction" in (*rows, *file.held):
         notes.append("rotor_reaction: below noise; the inertia of the rotors is the airframe's")
     curve, error = found.get("thrust_curve", (1.0, 0.0))
     if abs(curve - 1) < _SIGNIFICANT * error:

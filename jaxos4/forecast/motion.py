@@ -299,5 +299,5 @@ def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[
     )
     rate, disturbance = 1 - gains.rate[-1], gains.disturbance[-1]
     after = Covariance(p.rate * rate, p.cross * rate, p.disturbance - p.cross * disturbance)
-    absorbed = disturbance * dt / (disturbance * dt + (1 - step.kept) * gains.rate[-1])
+    absorbed = disturbance * dt / (disturbance * step.reach + (1 - step.kept) * gains.rate[-1])
     return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

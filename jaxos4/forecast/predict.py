@@ -26,7 +26,7 @@ from .vehicle import Vehicle, vehicle_of
 
 # Futures of each start for the band, and half the width of a 95 % interval in their standard deviations (Student).
 _DRAWS, _NINETY_FIVE = 64, 1.9977
-# What a log cannot replace by a prediction.
+# Inputs that no prediction can replace.
 _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
 
@@ -49,8 +49,8 @@ def predict(
     battery's voltage if the model needs it, and nothing else that was measured.
 
     The 95 % band holds what will be measured. It comes from 64 futures: parameters drawn from their covariance, errors
-    of the rates at the start, and disturbances drawn as the fit found them. What the sensors contradict each other is
-    added: how far position, velocity and attitude are from dead reckoning with gyro and accelerometer.
+    of the rates at the start, and disturbances drawn as the fit found them. The band also
+    contains the disagreement of the sensors: how far position, velocity and attitude are from dead reckoning.
 
     **Arguments:**
 

@@ -25,7 +25,7 @@ _LEAST = 1e-9  # of a noise level, whose logarithm must be finite
 class Vehicle(NamedTuple):
     """The vehicle that predicts.
 
-    - `name`: of the result's file; `estimator` and model if there is none.
+    - `name`: of the result's file. Without a file: the estimator and the model.
     - `model`: of one recording.
     - `parameters`, `covariance`: of the model. The mean of the recordings, if each had its own value.
     - `offset`: how far an offset of p', q', r' may be from the parameter in another recording, as a standard deviation

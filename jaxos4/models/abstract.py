@@ -27,14 +27,16 @@ Constant = float | Callable[[Airframe], Scalar]
 class Parameter(NamedTuple):
     """One unknown of a model.
 
-    - `half_width`, `center`: of the default bracket, for a term's parameter: a number, or a function of the airframe.
+    - `half_width`, `center`: of the default bracket of a term's parameter. Each is a number, or a function of the
+      airframe.
     - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
-    - `in_forcing`: whether the forcing depends on it, else the rate equations are linear in it. A model fills it in.
+    - `in_forcing`: whether the forcing depends on it. If not, the rate equations are linear in it. The model sets it.
     - `nonnegative`: whether physics forbids a negative value.
     - `scales_torque`: whether torque exceeds that of the airframe by this factor.
     - `plain`: the usual value, at which the parameter is held unless the flights clearly contradict it.
-    - `contradiction`: from a value and its error, why physics or the airframe forbids it, and what to do.
+    - `contradiction`: a function of a value and its error. It returns why physics or the airframe forbids the value,
+      and what to do; `None` if nothing does.
     """
 
     name: str

@@ -133,7 +133,7 @@ class CorrectedOS4(AbstractOS4):
     @property
     def gyroscopic_factor(self) -> Scalar:
         """1: alpha2 = J_R / Ix."""
-        return jnp.asarray(1.0)
+        return as_float(1.0)
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """Euler's equations with the gyroscopic torque -omega x (0, 0, J_R Omega_r)."""

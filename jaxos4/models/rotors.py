@@ -68,7 +68,7 @@ class Part(NamedTuple):
 
 
 class Speeds(NamedTuple):
-    """Rotor speeds over each sample [rad/s]: at its begin, at its end, and their change up to the next sample."""
+    """Rotor speeds [rad/s] at the beginning and at the end of each sample, and their change up to the next sample."""
 
     begin: RotorSpeeds
     end: RotorSpeeds
@@ -85,7 +85,8 @@ def measured_speeds(omega: Commands, part: Part) -> Speeds:
 def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
     """The thrust of each rotor divided by b [rad^2/s^2], of speeds that change linearly over a sample.
 
-    **Returns:** the mean over the sample; and that at its begin, where measurements are: the mean of both sides.
+    **Returns:** the mean over the sample; and the value at its beginning, when sensors measure: the mean of the values
+    just before and just after.
     """
     begin, end, _ = speeds
     before = jnp.concatenate([part.before[None], end[:-1]])
@@ -94,7 +95,7 @@ def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
 
 
 def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
-    """Commands that act `delay` [s] later. A stretch has its first command before that, and its last one after that.
+    """Commands that act `delay` [s] later. Before a stretch its first command acts, and after it its last one.
 
     Cubics interpolate between samples (Catmull and Rom 1974): a delay of whole samples is exact, and the derivative in
     the delay has no jumps at which a search could end.

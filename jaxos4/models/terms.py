@@ -137,7 +137,7 @@ _GROWS = "is negative: no inflow makes thrust grow with the velocity along z"
 _CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, and fly climbs and descents"))
 _SPARSE = "1/s is more than rotors give (1): motors were logged too rarely", "log on board, faster, or rotor speeds"
 _DAMPED = _limits((-_INF, _MOST_DAMPING, *_SPARSE))
-_OFF = f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so that the thrust is not the weight"
+_OFF = f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so the thrust does not match the weight"
 _LEVEL = _limits((-2 * _BIAS, 2 * _BIAS, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
 
 
@@ -319,4 +319,4 @@ def required(value: T | None, message: str) -> T:
 
 def _known(value: T | None, need: str, field: str) -> T:
     names = ", ".join(name for name, term in TERMS.items() if need in term.needs)
-    return required(value, f"`terms`: {names} need `Flight.{field}`, which this flight does not have; leave them out.")
+    return required(value, f"`terms`: {names} need `Flight.{field}`, which is not given; leave them out.")

@@ -48,14 +48,16 @@ class FlightModel(AbstractModel):
     **Arguments:**
 
     - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity`, `inflow` and `drag`
-      need `Flight.body_velocity`. `gyro_bias` and `offset` can be distinguished only if the attitude is compared too.
+      need `Flight.body_velocity`, or states with a velocity. `gyro_bias` and `offset` can be distinguished only if the
+      attitude is compared too.
       Leave out `motor`, `lag` and `delay` if rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
       own offsets and gyro biases. All other parameters are the vehicle's.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
 
-    **Raises:** `ValueError` for a term that does not exist or is given twice, recordings that are not counted from 0,
-    or a term that needs `airframe.max_rotor_speed` or `battery_voltage` if that is not known.
+    **Raises:** `ValueError` for a term that does not exist or is given twice, terms that exclude each other, recordings
+    that are not counted from 0, or a term that needs `airframe.max_rotor_speed` or `battery_voltage` if that is not
+    known.
     """
 
     airframe: Airframe
@@ -229,8 +231,9 @@ class FlightModel(AbstractModel):
 
     def _of_terms(self, constant: Callable[[Parameter], Constant]) -> Parameters:
         """A constant of each row of the table, for this airframe."""
+        # In the order of the table: a set would order the operations of a program by the addresses of its functions.
         constants = [constant(parameter) for *_, parameter in self._table]
-        values = {c: as_float(c(self.airframe) if callable(c) else c) for c in set(constants)}
+        values = {c: as_float(c(self.airframe) if callable(c) else c) for c in dict.fromkeys(constants)}
         return jnp.stack([values[c] for c in constants]) if constants else jnp.zeros(0)
 
     def _contributions(
