@@ -203,7 +203,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     except (ValueError, OverflowError):  # rows of several lengths, or an integer of more than 64 bits
         array = np.asarray(None)
     shape, (least, most) = _SHAPES.get(name, ()), _SIZES.get(name, (1e-15, 1e6))
-    if array.dtype.kind not in "iuf" or array.shape != shape or not np.isfinite(array).all():
+    if array.dtype.kind not in "iuf" or array.shape != shape or np.isnan(array).any():
         wanted = f"finite numbers of shape {list(shape)}" if shape else "one finite number"
     elif not ((array >= least) & (array <= most)).all():
         sign = "" if least < 0 else "not negative and " if least == 0 else "positive and "

@@ -13,7 +13,7 @@ class TrainingError(RuntimeError):
 
 
 def shortened(text: str, most: int) -> str:
-    """`text` with at most this many characters; "..." at its end if it is longer."""
+    """The text, cut to `most` characters with "..." at its end if it is longer."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 

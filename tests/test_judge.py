@@ -143,7 +143,10 @@ def test_a_fit_without_skill_is_not_believed(rates, axes):
     # The held-out parts are too short for 0.25 s.
     short = RateSkill([-0.5, None, None], *[[None] * 3] * 4)
     (doubt,) = doubts(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=short, q=short, r=short))
-    assert "roll and pitch and yaw 0.1 s ahead" in str(doubt)
+    assert "roll and pitch and yaw no better than constant rates (skill p -0.5 at 0.1 s, " in str(doubt)
+    # Each rate has its own horizon.
+    (doubt,) = doubts(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=skill().p, q=short, r=skill().r))
+    assert "predicts pitch no better than constant rates (skill q -0.5 at 0.1 s)" in str(doubt)
     # An axis that the held-out part hardly shows has no skill to lose, and the cause comes before the missing skill.
     poor = skill(p=0.5, q=0.5, r=-2.0)
     assert doubts(skill=poor, still=["yaw"]) == ()
@@ -239,4 +242,5 @@ def test_a_recorded_flight_does_not_end_successful_without_skill_or_against_phys
     # What was held out is too short for predictions of 0.25 s.
     skills = [getattr(found.skill, rate).skill[0] for rate in "pqr"] if found.skill is not None else []
     assert not (found.successful and any(skill is not None and skill <= 0 for skill in skills))
+    assert found.result == "no_skill"
     assert found.successful == (not found.doubts) or found.result in ("at_bound", "max_sweeps")

@@ -13,6 +13,7 @@ from lanes import names
 import jaxos4
 from jaxos4.identification import problem as problems, profile
 from jaxos4.identification.fit import fit_case, fit_innovations
+from jaxos4.identification.judge import judge
 from jaxos4.identification.prepare import Case
 from jaxos4.identification.problem import liveliest
 from jaxos4.results import NINETY_FIVE
@@ -292,9 +293,15 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
     assert better.rollouts > fit.rollouts
     assert abs(float(better.estimate.cost - found.cost)) < 2 * jaxos4.FilterError().tolerance
     assert "alpha8" in better.profiled
-    # Each end is lower than the estimate before it: no minimum is found.
+    assert better.is_lowest
+    # The search ends where it began, although the cost is lower at an end: no minimum is found.
+    stages = []
     fits_at_ends(monkeypatch, found, case.problem.problem.unknowns, [-1.0] * 3)
-    assert names(profile.with_profile(fit, case, progress=stages.append).estimate) == "max_sweeps"
+    lost = profile.with_profile(fit, case, progress=stages.append)
+    assert not lost.is_lowest
+    assert stages.count("fitting again where the cost is lower") <= 2
+    assert lost.searched[1].cost <= found.cost
+    assert judge(case, lost, progress=stages.append)["doubts"][0].result == "max_sweeps"
     # A search that did not converge has no profile.
     failed = fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.at_bound))
     assert profile.with_profile(failed, case, progress=stages.append) is failed

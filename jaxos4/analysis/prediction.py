@@ -162,7 +162,7 @@ def skill(predicted: Predictions) -> Skill:
 def decisive_horizon(
     horizons: Sequence[float] | Float[np.ndarray, " horizons"], known: Bool[ArrayLike, " horizons"]
 ) -> int:
-    """The place of the horizon nearest to 0.25 s, of those at which anything was measured."""
+    """The place of the horizon nearest to 0.25 s among those that are `known`: something was measured there."""
     return int(np.argmin(np.where(known, np.abs(np.asarray(horizons) - _DECISIVE), np.inf)))
 
 

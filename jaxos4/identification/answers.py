@@ -30,6 +30,8 @@ _SCALE = 0.01
 NOISY, _TOO_LARGE = 0.05, 2.5
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
 _UNKNOWN = 1e3
+# A factor of an interval from this one on is noted: it is printed with one decimal.
+_NOTED = 1.05
 # A channel with fewer measurements has no diagnostics.
 _FEWEST_SAMPLES = 2
 
@@ -78,8 +80,9 @@ def _note(fit: Fit, i: int, half_width: float) -> str:
         notes.append("outside its bracket")
     if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
         notes.append("outside the network's interval")
-    if factor := fit.profiled.get(fit.problem.unknowns.names[i]):
-        notes.append(f"interval {factor:.1f} times longer by the likelihood's profile")
+    factor = fit.profiled.get(fit.problem.unknowns.names[i], 1.0)
+    if factor >= _NOTED:
+        notes.append(f"interval {factor:.1f} times as long, by the profile of the likelihood")
     return "; ".join(notes)
 
 

@@ -56,7 +56,8 @@ class Fit(NamedTuple):
     - `held`: parameters of a vehicle that are not estimated. `negative`: value and standard deviation of those that are
       held at 0 because they came out negative.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
-    - `profiled`: by which factor its interval by the profile of the likelihood is longer, by parameter.
+    - `profiled`: by which factor the profile of the likelihood made an interval longer, by parameter.
+    - `is_lowest`: false if the cost is known to be lower elsewhere.
     - `disturbances`: by channel. `noise`: the same as logarithms. Only for innovations.
     - `searched`: the problem of innovations with what is held, and its estimate with the covariance of the search.
     """
@@ -71,6 +72,7 @@ class Fit(NamedTuple):
     negative: dict[str, tuple[float, float]] = {}
     widened: dict[str, float] = {}
     profiled: dict[str, float] = {}
+    is_lowest: bool = True
     disturbances: dict[str, Disturbance] = {}
     noise: LogNoise | None = None
     searched: tuple[InnovationsProblem, Estimate] | None = None

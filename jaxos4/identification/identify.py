@@ -98,9 +98,11 @@ def _fit_vehicle(
     if fit is None or not is_default:
         case = with_estimator(case, estimator, seed=seed, progress=progress)
         fit = fit_case(case, progress=progress)
-    fit = with_profile(fit, case, progress=progress)
-    # The table shows the final answer at the chosen sample time.
+    before, fit = fit, with_profile(fit, case, progress=progress)
+    # The row of the chosen sample time shows the final answer.
     answer = answer_of(case, fit, cases[0].shooting.flight)
+    if fit.searched is not before.searched:  # the other rows have the minimum that was left
+        return case, fit, (answer,)
     return case, fit, (*sample_times[:place], answer, *sample_times[place + 1 :])
 
 

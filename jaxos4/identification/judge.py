@@ -38,6 +38,13 @@ _OF_YAW = ("alpha7", "alpha8")
 _LONGEST_DELAY = 0.04  # [s], of rotors; more is an error of clocks
 
 
+_NOT_LOWEST = Doubt(
+    "max_sweeps",
+    "the likelihood has several maxima, and the search did not find the highest",
+    "fly more roll, pitch and yaw, or choose another part with `begin` and `end`",
+)
+
+
 def doubts_of(
     model: AbstractModel,
     parameters: dict[str, ParameterEstimate],
@@ -196,12 +203,12 @@ def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
 
 
 def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:
-    """The axes about which the held-out part hardly turns."""
+    """The axes about which the held-out part hardly turns, or about which it was not measured."""
     still = []
     for (rate, axis), measured in zip(AXES.items(), np.moveaxis(predicted.measured, 2, 0), strict=True):
         noise = fit.disturbances[rate].sensor if rate in fit.disturbances else 0.0
         seen = measured[np.isfinite(measured)]
-        if seen.size and seen.std() < max(WEAK, OVER_NOISE * noise):
+        if not seen.size or seen.std() < max(WEAK, OVER_NOISE * noise):
             still.append(axis)
     return tuple(still)
 
@@ -216,16 +223,15 @@ def _skill(skill: PredictionSkill | None, still: Sequence[str]) -> Iterator[Doub
             "choose another part with `begin` and `end`, or another flight with `validate`",
         )
         return
-    table = np.array([getattr(skill, rate).skill for rate in AXES], dtype=float)
-    place = decisive_horizon(skill.horizons, np.isfinite(table).any(axis=0))
-    values = dict(zip(AXES, table[:, place].tolist(), strict=True))
-    poor = [rate for rate, value in values.items() if value <= 0 and AXES[rate] not in still]
+    table = {rate: np.array(getattr(skill, rate).skill, dtype=float) for rate in AXES}
+    places = {rate: decisive_horizon(skill.horizons, np.isfinite(row)) for rate, row in table.items()}
+    poor = [rate for rate, row in table.items() if row[places[rate]] <= 0 and AXES[rate] not in still]
     if poor:
-        named = ", ".join(f"{rate} {values[rate]:.2g}" for rate in poor)
-        axes, ahead = " and ".join(AXES[rate] for rate in poor), f"{skill.horizons[place]:.2g} s ahead"
+        named = ", ".join(f"{r} {table[r][places[r]]:.2g} at {skill.horizons[places[r]]:.2g} s" for r in poor)
+        axes = " and ".join(AXES[rate] for rate in poor)
         yield Doubt(
             "no_skill",
-            f"the fit predicts {axes} {ahead} no better than constant rates (skill {named})",
+            f"the fit predicts {axes} no better than constant rates (skill {named})",
             f"fly more {axes}, or check the airframe and the time stamps",
         )
 
@@ -275,6 +281,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     # One that is held at 0 came out negative. What is known of another held one is its bracket.
     held = {name: fit.negative.get(name, (row.value, widths[name])) for name, row in fit.held.items()}
     doubts = (
+        *(() if fit.is_lowest else (_NOT_LOWEST,)),
         *(_implausible(cause, remedy) for cause, remedy in case.doubts),
         *(_implausible(why, f"fly more {axis}, or in calmer air") for axis, why in weak.items()),
         *(doubt for _, doubt in _contradicted(fit.problem.model, held)),

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from .._custom_types import as_float
 from ..estimate import Estimate
 from ..estimators import FilterError
-from ..results import NINETY_FIVE, RESULTS, result_names
+from ..results import NINETY_FIVE, result_names
 from ..shooting import InnovationsProblem
 from .answers import INVERSE
 from .fit import PRIOR_NOTE, Fit, bracket_cost, fit_case, not_identifiable
@@ -31,7 +31,8 @@ _FITS, _CLOSE, _LEAST_SLOPE = 3, 0.1, 0.1
 # Newton's method needs one or two steps from the start that it is given. A cost that is too large by as much as its
 # tolerance moves the end of an interval by 1 %.
 _TOLERANCE = 0.04
-# If the cost falls by more than this, the estimate is not at the minimum. The most minima that are tried.
+# An end whose cost is lower by more than this shows that the estimate is not at the minimum. The most minima whose ends
+# are looked at.
 _LOWER, _MINIMA = 0.1, 3
 
 
@@ -41,13 +42,12 @@ def with_profile(fit: Fit, case: Case, *, progress: Progress) -> Fit:
     Only the upper end is looked for, because the upper side is longer. The jackknife multiplies a standard deviation
     too: it allows for a wrong model, and the profile for a cost that is not quadratic.
 
-    **Returns:** the fit at a lower minimum if an end shows one; with the result `max_sweeps` if the last one that was
-    tried is no minimum either.
+    **Returns:** the fit at the lowest minimum that was found; not `is_lowest` if the cost is lower at one of its ends.
     """
     whole = case.problem
     if not isinstance(whole, InnovationsProblem):
-        return fit
-    for _ in range(_MINIMA):
+        raise ValueError("`case.problem` must be an `InnovationsProblem`.")
+    for left in reversed(range(_MINIMA)):
         if fit.searched is None or str(result_names(fit.estimate.result)) != "successful":
             return fit
         (problem, found), factors, lower = fit.searched, {}, None
@@ -61,11 +61,27 @@ def with_profile(fit: Fit, case: Case, *, progress: Progress) -> Fit:
             factors[place] = max(reach / NINETY_FIVE, 1.0)
         if lower is None:
             return _widened(fit, problem, factors)
+        if not left:
+            break
         progress("fitting again where the cost is lower")
         first = jax.block_until_ready(case.estimator(whole.starting_from(lower)))
         other = fit_case(case, first=first, progress=progress)
-        fit = other._replace(rollouts=fit.rollouts + other.rollouts)
-    return fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, RESULTS.max_sweeps))
+        rollouts = fit.rollouts + other.rollouts
+        if not (other.answered and _cost(other, whole) < _cost(fit, whole)):
+            fit = fit._replace(rollouts=rollouts)
+            break
+        fit = other._replace(rollouts=rollouts)
+    return fit._replace(is_lowest=False)
+
+
+def _cost(fit: Fit, whole: InnovationsProblem) -> float:
+    """The cost, with that of the brackets of held parameters."""
+    if fit.searched is None:
+        raise ValueError("`fit` must be one of innovations.")
+    problem, found = fit.searched
+    own = problem.problem.unknowns
+    held = {own.names[i]: float(own.center[i]) for i in np.flatnonzero(~np.asarray(own.free))}
+    return float(found.cost) + bracket_cost(whole.problem.unknowns, held)
 
 
 def _widened(fit: Fit, problem: InnovationsProblem, factors: dict[int, float]) -> Fit:
@@ -96,7 +112,7 @@ def upper_end(
 
     **Returns:** the end in standard deviations above the estimate; unknowns at which the cost is lower than at the
     estimate, or `None`; the rollouts. If no fit at an end succeeds, the end is that of the covariance. If a later fit
-    fails, the end follows from the fits before.
+    fails, the end is extrapolated from the fits before it.
     """
     search, own, covariance = FilterError(tolerance=_TOLERANCE), problem.problem.unknowns, np.asarray(found.covariance)
     # How the minimum moves with this parameter, in steps of its standard deviation.

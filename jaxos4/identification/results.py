@@ -211,7 +211,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
-    - `rollouts`: simulated flights of all searches together; of a vehicle, of those at the chosen sample time.
+    - `rollouts`: simulated flights of all searches; of a vehicle, of those at the chosen sample time by its estimator.
     - `cost`: 1/2 |W (y - x)|^2 at the estimate; of a vehicle the negative log-likelihood. `None` without one.
     - `seconds`: computing time [s].
     - `parameters`: by name. Without an answer, a vehicle has none.
@@ -233,7 +233,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
     - `disturbances`: the accelerations that the model lacks, by channel.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
-    - `sample_times`: the moments of inertia at each sample time that was tried; empty if only one was.
+    - `sample_times`: the moments of inertia at each sample time that was tried; empty if only one was, or if the search
+      started again: the other sample times then have the minimum that was left.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
     - `predictions`: the predictions themselves; not in `to_dict`.
     - `response`: the frequency response with the fitted data; not in `to_dict`. `None` without an answer.
