@@ -87,11 +87,9 @@ def integer(name: str, least: int, *, static: bool = False) -> Callable[[Any], A
     """
 
     def convert(value: Any) -> Any:
-        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
+        if isinstance(value, jax.Array | np.integer) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
             if isinstance(value, Tracer):
                 return value
-            value = int(value)
-        if isinstance(value, np.integer) and not static:
             value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")

@@ -87,7 +87,9 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
 
     **Raises:** `OSError` that names `path` if its folder does not exist or is not writable, or if `path` is a folder.
     """
-    target = Path(os.path.realpath(path))
+    # The target of a link to a pipe is no path.
+    is_stream = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)
+    target = Path(path) if is_stream else Path(os.path.realpath(path))
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, "is a folder, not a file", os.fspath(path))
     if not target.parent.is_dir():

@@ -133,7 +133,7 @@ def test_identifiability_names_the_parameters_that_are_not_excited(run, tmp_path
     assert [name for name, row in rows.items() if "not identifiable" in row] == ["alpha1", "alpha4", "alpha7"]
     assert (of["alpha1"]["note"], of["alpha3"]["note"]) == ("not identifiable: not excited", "")
     assert of["alpha3"]["bound"] < of["alpha3"]["half_width"]
-    assert of["alpha2"]["note"].startswith("below the noise floor: identifiable below")
+    assert of["alpha2"]["note"].startswith("below the noise floor: can be distinguished from 0 below")
     assert "below the noise" in rows["alpha2"]
 
 

@@ -62,7 +62,7 @@ NOTED = {
     "measured omega1..omega4 are used; command1, command2 are ignored": csv(
         HEADER + ",command1,command2", [row + ",0.5,0.5" for row in ROWS]
     ),
-    "omega2: 2 empty cells hold the value before them, for up to 0.02 s": edited(4, "omega2", "").replace(
+    "omega2: 2 empty cells filled with the value before, for up to 0.02 s": edited(4, "omega2", "").replace(
         "0.03,100,101", "0.03,100,"
     ),
     "unknown columns are ignored: 'P', 'roll', 'mode', 'Omega_1', 'mode', ''": csv(
@@ -236,3 +236,19 @@ def test_a_real_flight_is_read(name, shared_flights):
     np.testing.assert_allclose(impulse, held, rtol=1e-3)
     # thrust over the flight carries the weight, so the units and the rotor columns are what they are taken for
     assert 0.6 < impulse.sum() * CRAZYFLIE.thrust_coefficient / (time[-1] * 0.027 * 9.81) < 1.6
+
+
+def test_an_accelerometer_that_is_off_is_none(tmp_path):
+    rows = [f"{0.01 * k:.2f},100,101,102,103,{0.1 * k:.1f},0,0,9.81" for k in range(200)]
+    (tmp_path / "off.csv").write_text(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows))
+    found = read_recording(tmp_path / "off.csv", None)
+    assert found.specific_force is None
+    assert any("it is off" in note for note in found.notes)
+
+
+def test_an_empty_first_rotor_cell_is_refused_also_beside_an_impossible_one(tmp_path):
+    lines = edited(2, "omega1", "").splitlines()
+    cells = lines[4].split(",")
+    cells[1] = "-5"
+    (tmp_path / "flight.csv").write_text("\n".join([*lines[:4], ",".join(cells), *lines[5:]]) + "\n")
+    assert "omega1: is empty, with no earlier value" in refusal(tmp_path / "flight.csv")

@@ -13,7 +13,7 @@ from hypothesis import example, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from test_flight_csv import csv, read_flight_and_notes
 
-from jaxos4._files import write_atomically
+from jaxos4._files import write_atomically, write_file
 from jaxos4.airframe import OS4
 from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES, Flight
@@ -157,3 +157,11 @@ def test_a_device_is_written_to_and_a_folder_that_is_none_is_named(tmp_path):
         write_flight(flight, tmp_path / "nowhere" / "f.csv")
     with pytest.raises(IsADirectoryError, match="is a folder"):
         write_flight(flight, tmp_path)
+
+
+def test_a_pipe_is_written_in_place():
+    reader, writer = os.pipe()
+    write_file(f"/dev/fd/{writer}", "t,p\n")
+    os.close(writer)
+    with open(reader) as file:
+        assert file.read() == "t,p\n"

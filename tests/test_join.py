@@ -13,7 +13,7 @@ import jaxos4
 from jaxos4.errors import InputError
 from jaxos4.logs.sampling import averages
 from jaxos4.recording import Recording
-from jaxos4.recording.pieces import as_recording, averaged, cut
+from jaxos4.recording.pieces import as_recording, averaged, cut, hold_out
 from jaxos4.recording.usable import Stretch
 
 
@@ -129,3 +129,14 @@ def test_impossible_values_of_a_flight_are_missing():
     assert as_recording(flight).notes == ()
     with pytest.raises(InputError, match=r"flight: field p: at 0 s is 1e\+06 rad/s, beyond 60 rad/s"):
         as_recording(dataclasses.replace(flight, states=flight.states.at[:20, 7].set(1e6)))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.15, 0.25, 0.3, 0.4, 0.45, 0.5])
+def test_the_share_that_is_asked_for_is_held_out(share):
+    """Within one block of 5 s, in 400 s."""
+    samples = 4000
+    recording = Recording(0.1 * np.arange(samples), np.ones((samples, 4)), np.ones((samples, 12)))
+    fitted, held_out = hold_out(recording, 10, share)
+    kept, left_out = (np.isfinite(each.states).all(axis=1) for each in (fitted, held_out))
+    assert (kept ^ left_out).all()
+    assert left_out.mean() == pytest.approx(share, abs=5 / 400)

@@ -157,7 +157,7 @@ REAL = {
     "pyulog_sample_log_small": (
         "this is no quadrotor",
         "is_vtol: this is no quadrotor",
-        "only a quadrotor can be identified",
+        "this is no quadrotor; give the log of a quadrotor",
     ),
     "pyulog_sample_px4_events": ("at 10 Hz (actuator_motors)", "cannot identify a vehicle", "set SDLOG_PROFILE to 147"),
     "pyulog_sample_appended_multiple": ("the vehicle never flew", "on the ground", "give the log of a flight"),

@@ -226,7 +226,7 @@ OTHERS = {
     "frame": ([], {"CA_AIRFRAME": 3}, "parameter CA_AIRFRAME"),
     "rotors": ([], {"CA_ROTOR_COUNT": 6}, "parameter CA_ROTOR_COUNT"),
 }
-REMEDY = ": this is no quadrotor, and only a quadrotor can be identified; give the log of one."
+REMEDY = ": this is no quadrotor; give the log of a quadrotor."
 BAD |= {
     name: (log(combined(grid(0.005)), ROTORS, *topics, **parameters), place + REMEDY)
     for name, (topics, parameters, place) in OTHERS.items()

@@ -50,7 +50,7 @@ class Identifiability(eqx.Module):
         return np.abs(self.nominal) / (NINETY_FIVE * self.std)
 
     def notes(self, names: tuple[str, ...]) -> dict[str, str]:
-        """For each parameter of one flight that is not identifiable or below the noise floor, a note to the user."""
+        """A note for each parameter that is not identifiable or below the noise floor."""
 
         def note(i: int) -> str:
             if not np.isfinite(self.std[i]):
@@ -60,7 +60,8 @@ class Identifiability(eqx.Module):
             if not self.identifiable[i]:
                 return f"not identifiable: only together with {', '.join(names[j] for j in self._partners(i))}"
             if self.noise_limit[i] < 1 and self.nominal[i] != 0:
-                return f"below the noise floor: identifiable below {self.noise_limit[i]:.2g} times this noise"
+                limit = f"{self.noise_limit[i]:.2g} times this noise"
+                return f"below the noise floor: can be distinguished from 0 below {limit}"
             return ""
 
         return {name: text for i, name in enumerate(names) if (text := note(i))}

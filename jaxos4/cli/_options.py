@@ -33,7 +33,9 @@ def check_seed(seed: int) -> int:
 
 FlightFile = Annotated[Path, Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
 ModelOption = Annotated[Model, Option(help="Equations of motion: as published, or corrected.")]
-AirframeOption = Annotated[str, Option(help="os4, os4-simulator, voos, or a TOML file.")]
+AirframeOption = Annotated[
+    str, Option(help="A preset (os4, os4-simulator, voos, crazyflie, x500, ...), or a TOML file.")
+]
 BracketOption = Annotated[Path | None, Option(help="TOML file: alpha1 = [lower, upper], ...")]
 ChannelsOption = Annotated[Channels | None, Option(help="Channels to fit. Default: all that were measured.")]
 InitialStateOption = Annotated[InitialState, Option(help="free: estimated too; known: equal to the first sample.")]

@@ -80,7 +80,7 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
         rate = min(channel.rate for channel in measured.values())
         gap = max(channel.longest_gap for channel in measured.values())
         gaps = f", at most {1e3 * gap:.3g} ms apart" if gap > 1.5 * found.sample_time else ""
-        commands = "rotor1" in names and largest <= 1
+        commands = "rotor1" in names and 0 < largest <= 1
         size = f"up to {largest:.3g} {'of full scale (commands)' if commands else unit}"
         console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
     for note in found.notes:

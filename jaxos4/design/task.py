@@ -25,9 +25,8 @@ from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..linalg import gram, joint_factor
 from ..logs import write_flight
-from ..logs.assemble import SPEED_NAMES
 from ..logs.csv import read_table
-from ..logs.table import Path, refuse
+from ..logs.table import SPEED_NAMES, Path, refuse
 from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]

@@ -6,20 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..airframe import Airframe
-from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
+from ..flight import CHANNEL_NAMES, STATE_NAMES
 from .sampling import UNIFORM, grid_size, held_regularly, logged_rate, resample, unwrap
-from .table import (
-    COMMAND_NAMES as COMMAND_NAMES,
-    LIMITS,
-    MAX_ROWS,
-    PITCH,
-    SPEED_NAMES as SPEED_NAMES,
-    Recording,
-    Sampling,
-    Table,
-    counted,
-    quoted,
-)
+from .table import COMMAND_NAMES, LIMITS, MAX_ROWS, PITCH, SPEED_NAMES, Recording, Sampling, Table, counted, quoted
 
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
 
@@ -42,16 +31,19 @@ def recording_of(
         table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
     # Cells that hold no value were not logged, also those of a rotor.
     motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
-    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
-    facts = table.facts._replace(**{name: getattr(table.facts, name) or found for name, found in rarest.items()})
     dt = _check_time(table)
+    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
+    facts = table.facts._replace(**{name: getattr(table.facts, name) or slowest for name, slowest in rarest.items()})
+    for name in filter(table.holds, motors):
+        if np.isnan(table.columns[name][0]):
+            table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
     table = table.without_impossible(LIMITS | PITCH)
     _check_heading(table)
     if table.impossible:
         found.append(table.impossible_note)
     omega = _rotor_speeds(table, airframe, full_scale, found)
     channels, voltage = _channels(table, found), _voltage(table)
-    with_force = any(map(table.holds, FORCE_NAMES))
+    with_force = np.isfinite(channels[:, len(STATE_NAMES) :]).any()
     commanded = motors is COMMAND_NAMES
     t = table.columns["t"]
     table = table._replace(columns={"t": t})  # frees the memory of a long log
@@ -154,18 +146,17 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
 
 
 def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
-    """The column of a rotor. An empty cell gets the value before it, and so does an impossible one, or after it."""
+    """The column of a rotor. An empty or impossible cell gets the value before it; an impossible first one the next."""
     column, t = table.columns[name], table.columns["t"]
     empty = np.isnan(column)
     if not empty.any():
         return column
     impossible, _ = table.impossible.get(name, (0, ""))
-    if empty[0] and not impossible:
-        table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
     last = np.maximum.accumulate(np.where(empty, np.argmin(empty), np.arange(column.size)))
-    longest, cells = (t - t[last]).max(), np.count_nonzero(empty) - impossible
+    longest, cells = (t - t[last]).max(), int(np.count_nonzero(empty)) - impossible
     if cells:
-        notes.append(f"{name}: {cells} empty cells hold the value before them, for up to {longest:.3g} s")
+        filled = f"{counted(cells, 'empty cell')} filled with the value before, for up to {longest:.3g} s"
+        notes.append(f"{name}: {filled}")
     return column[last]
 
 

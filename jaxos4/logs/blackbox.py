@@ -41,7 +41,7 @@ _KNOWN = (
     _VOLTAGE,
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
-# A session is read with the longest one only if they agree in these settings.
+# Sessions are joined to the longest one if these settings are equal.
 _USED = ("acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
 
 Settings = dict[str, str]
@@ -191,7 +191,7 @@ def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
     except BadHeader as error:
         return None, f"{error}: it is ignored"
     later = in_order(columns["time"])
-    if later is None or later.size < 2:
+    if later is None or np.count_nonzero(later) < 2:
         return None, "holds no frames that can be decoded: it is ignored"
     damage = f"is damaged in {counted(damaged, 'place')}; what follows up to the next complete frame is ignored"
     end = "has no end: it was cut while it was written, or is corrupt"

@@ -12,8 +12,8 @@ import numpy as np
 from .._files import write_atomically
 from ..airframe import Airframe
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
-from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES
-from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, quoted, refuse
+from .assemble import COLUMN_NAMES as COLUMN_NAMES
+from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFormat, Path, Table, counted, opened, quoted, refuse
 
 _LONGEST_LINE = 1 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # float() also reads "nan" and "1_0"
@@ -66,7 +66,8 @@ def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Co
 def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
     """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of states, specific force and voltage.
 
-    Reading the file gives back every bit. If writing fails, an older file at `path` is unchanged.
+    Reading the file gives back every bit of measured speeds and states; angles are unwrapped. If writing fails, an
+    older file at `path` is unchanged.
 
     **Arguments:**
 

@@ -272,7 +272,7 @@ def order_note(first: str) -> str:
 
 
 _UNREADABLE = {
-    FileNotFoundError: "there is no such file; give the path of a log",
+    FileNotFoundError: "there is no such file; give the path of an existing file",
     IsADirectoryError: "is a folder, not a file; give the path of a log",
     PermissionError: "cannot be opened (permission denied); change its permissions or copy it",
 }

@@ -83,9 +83,7 @@ def _check_vehicle(log: Topics) -> None:
     }
     for place, other in others.items():
         if other:
-            refuse(
-                log.path, f"{place}: this is no quadrotor, and only a quadrotor can be identified; give the log of one"
-            )
+            refuse(log.path, f"{place}: this is no quadrotor; give the log of a quadrotor")
 
 
 def _attitude(log: Topics) -> Series | None:

@@ -205,7 +205,7 @@ def _correlations(
         acceleration = np.concatenate([b[late : max(b.shape[0] - early, 0)] for _, b in pairs])
         for i, along in enumerate(acceleration.T):
             measured = np.isfinite(torque).all(axis=1) & np.isfinite(along)
-            if np.count_nonzero(measured) * _STEP < _LEAST_SECONDS:
+            if np.count_nonzero(measured) * step < _LEAST_SECONDS:
                 continue
             x, y = torque[measured] - torque[measured].mean(axis=0), along[measured] - along[measured].mean()
             spreads = x.std(axis=0) * y.std()

@@ -15,6 +15,7 @@ from ..logs.sampling import averages
 _EQUAL_STEPS = 1e-6
 # Length of a block that is held out [s]: each part of a flight then has blocks of both kinds.
 _BLOCK = 5.0
+_ROUNDING = 1e-9  # of sums of shares
 
 
 class Stretch(NamedTuple):
@@ -180,9 +181,10 @@ def hold_out(recording: Recording, length: int, share: float) -> tuple[Recording
     if not share:
         return recording, None
     windows = recording.time.size // length
-    period = round(1 / share)
-    block = max(min(round(_BLOCK / (length * recording.dt)), windows // (2 * period)), 1)
-    held_out = np.repeat((np.arange(windows) // block) % period == period - 1, length)[:, None]
+    block = max(min(round(_BLOCK / (length * recording.dt)), int(windows * share / 2)), 1)
+    number = np.arange(windows) // block
+    held_out = np.floor((number + 1) * share + _ROUNDING) > np.floor(number * share + _ROUNDING)
+    held_out = np.repeat(held_out, length)[:, None]
     if not held_out.any() or held_out.all():
         return recording, None
     force = recording.specific_force

@@ -122,6 +122,9 @@ def prepare(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
     slowest = max(piece.dt for _, piece in parts)
+    if slowest > _NEARLY_EQUAL * WINDOW / _FEWEST_SAMPLES:
+        least = f"log at {_FEWEST_SAMPLES / WINDOW:g} Hz or more"
+        raise InputError(f"{recordings[0].name}: has one sample every {slowest:.4g} s, too few for a vehicle; {least}.")
     if sample_time is not None and slowest > sample_time * _NEARLY_EQUAL:
         if predicted:
             raise InputError(
