@@ -233,8 +233,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
     - `disturbances`: the accelerations that the model lacks, by channel.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
-    - `sample_times`: the moments of inertia at each sample time that was tried; empty if only one was, or if the search
-      started again: the other sample times then have the minimum that was left.
+    - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
     - `predictions`: the predictions themselves; not in `to_dict`.
     - `response`: the frequency response with the fitted data; not in `to_dict`. `None` without an answer.
