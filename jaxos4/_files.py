@@ -44,7 +44,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = check_writable(path)
     if target.exists() and not target.is_file():
         try:
-            yield Path(path)
+            yield target
         except OSError as error:
             raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
@@ -87,9 +87,9 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
 
     **Raises:** `OSError` that names `path` if its folder does not exist or is not writable, or if `path` is a folder.
     """
-    # The target of a link to a pipe is no path.
-    is_stream = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)
-    target = Path(path) if is_stream else Path(os.path.realpath(path))
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        return Path(path)  # a pipe or a device, to which a link may lead that is no path
+    target = Path(os.path.realpath(path))
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, "is a folder, not a file", os.fspath(path))
     if not target.parent.is_dir():

@@ -49,8 +49,8 @@ def predict(
     battery's voltage if the model needs it, and nothing else that was measured.
 
     The 95 % band holds what will be measured. It comes from 64 futures: parameters drawn from their covariance, errors
-    of the rates at the start, and disturbances drawn as the fit found them. The band also
-    contains the disagreement of the sensors: how far position, velocity and attitude are from dead reckoning.
+    of the rates at the start, and disturbances drawn as the fit found them. The band also contains the disagreement of
+    the sensors: how far position, velocity and attitude are from dead reckoning.
 
     **Arguments:**
 

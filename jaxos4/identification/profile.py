@@ -66,11 +66,10 @@ def with_profile(fit: Fit, case: Case, *, progress: Progress) -> Fit:
         progress("fitting again where the cost is lower")
         first = jax.block_until_ready(case.estimator(whole.starting_from(lower)))
         other = fit_case(case, first=first, progress=progress)
-        rollouts = fit.rollouts + other.rollouts
-        if not (other.answered and _cost(other, whole) < _cost(fit, whole)):
-            fit = fit._replace(rollouts=rollouts)
+        is_lower = other.answered and _cost(other, whole) < _cost(fit, whole)
+        fit = (other if is_lower else fit)._replace(rollouts=fit.rollouts + other.rollouts)
+        if not is_lower:
             break
-        fit = other._replace(rollouts=rollouts)
     return fit._replace(is_lowest=False)
 
 

@@ -24,8 +24,8 @@ def velocity_of(recording: Recording) -> tuple[Float[np.ndarray, "samples 3"], U
     """How a vehicle moved through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
-    this sum are forgotten, and so are slow changes of the velocity. Torque and thrust answer a
-    change of velocity faster than this.
+    this sum are forgotten, and so are slow changes of the velocity. Torque and thrust answer a change of
+    velocity faster than this.
 
     **Arguments:** a recording in one piece, without gaps.
 
