@@ -16,6 +16,7 @@ from jaxos4.identification.fit import fit_case, fit_innovations
 from jaxos4.identification.judge import judge
 from jaxos4.identification.prepare import Case
 from jaxos4.identification.problem import liveliest
+from jaxos4.identification.sample_time import answer_of
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
 
@@ -301,7 +302,8 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
     assert not lost.is_lowest
     assert stages.count("fitting again where the cost is lower") <= 2
     assert lost.searched[1].cost <= found.cost
-    assert judge(case, lost, progress=stages.append)["doubts"][0].result == "max_sweeps"
+    answer = answer_of(case, lost, case.shooting.flight)
+    assert judge(case, lost, [answer], progress=stages.append)["doubts"][0].result == "max_sweeps"
     # A search that did not converge has no profile.
     failed = fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.at_bound))
     assert profile.with_profile(failed, case, progress=stages.append) is failed

@@ -20,7 +20,7 @@ from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
 from .results import Constant, Disturbance, Doubt, ParameterEstimate, PredictionSkill, RigidBody, SampleTime
-from .sample_time import moved, noise_of_speeds
+from .sample_time import moved
 
 # Doubts need this many standard deviations.
 _SURE = 3.0
@@ -243,6 +243,8 @@ def _implausible(cause: str, remedy: str) -> Doubt:
 def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, progress: Progress) -> dict[str, Any]:
     """Compare an answer with the airframe, with other sample times, and with measurements that were not fitted.
 
+    `sample_times`: of a vehicle; the one of the fit is among them.
+
     **Returns:** the fields of an `Identification` for the answer, and for what speaks for and against it. `notes`: what
     could not be checked.
     """
@@ -253,8 +255,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         other = None if held_out is None else validate_on(fit, held_out, case.validate)
         return {"parameters": table, "rigid_body": rigid_body(fit), "validation": other}
     step = float(fit.problem.flight.dt)
-    known = [each.speed_noise for each in sample_times if each.sample_time == step]
-    noise = known[0] if known else noise_of_speeds(fit.problem.flight, fit.problem.flight, fit.problem.model.airframe)
+    noise = next(each.speed_noise for each in sample_times if each.sample_time == step)
     body = vehicle_constants(fit, noise)
     predicted = skill = None
     if held_out is not None:
