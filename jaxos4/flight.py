@@ -46,6 +46,7 @@ class Inputs(NamedTuple):
     - `stretches`: `None`: the flight is one stretch.
     - `voltage`: of the battery [V]. `None`: not logged.
     - `length`: the number of samples that count; the others are padding. `None`: all count.
+    - `within`, `averaging_time`: see `Flight`.
     """
 
     omega: RotorSpeeds
@@ -54,13 +55,35 @@ class Inputs(NamedTuple):
     stretches: Stretches | None = None
     voltage: Float[Array, " samples"] | None = None
     length: Count | None = None
+    within: Float[Array, "samples parts 4"] | None = None
+    averaging_time: Scalar | float = 0.0
+
+    @property
+    def divided(self) -> "Inputs":
+        """The inputs in the parts of each sample, as samples of their own."""
+        if self.within is None:
+            raise ValueError("`within` must be known.")
+        (_, parts, _), voltage, stretches = self.within.shape, self.voltage, self.stretches
+        if stretches is not None:
+            first, last = (jnp.repeat(parts * place, parts) for place in stretches[1:])
+            stretches = Stretches(jnp.repeat(stretches.number, parts), first, last + parts - 1)
+        return self._replace(
+            omega=self.within.reshape(-1, 4),
+            dt=self.dt / parts,
+            velocity=None,
+            stretches=stretches,
+            voltage=None if voltage is None else jnp.repeat(voltage, parts),
+            length=None if self.length is None else parts * self.length,
+            within=None,
+        )
 
 
 class Flight(eqx.Module):
     """A recorded or simulated flight on a uniform time grid.
 
     - `time`: sample times [s], uniform.
-    - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing.
+    - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing. Unless
+      they are `held`, measured speeds are those at `time[k]`.
     - `states`: in the order of `STATE_NAMES` (Eq. (14)) and the units of `STATE_UNITS`. NaN: not measured.
     - `specific_force`: what an accelerometer measures along the body's axes [m/s^2]. `None` or NaN: not measured.
     - `result`: how a simulation ended. Rows after a failure are NaN.
@@ -69,6 +92,11 @@ class Flight(eqx.Module):
       (`jaxos4.join`), and their time counts samples. `None`: the flight is one stretch.
     - `commanded`: whether `omega` holds commands, which the rotors follow with a lag, and not measured speeds.
     - `voltage`: of the battery [V], an input of some models; no NaN. `None`: not logged.
+    - `held`: see `omega`.
+    - `within`: the root mean square of each rotor's speed in equal parts of the sample around `time[k]`, from
+      `time[k]` - dt/2 to `time[k]` + dt/2. `None`: not known.
+    - `averaging_time`: how long the measurements of a sample are averaged around `time[k]` [s]; 0: they are those at
+      this instant.
 
     **Raises:** `ValueError` for arrays whose shapes do not agree, or fewer than two samples.
     """
@@ -82,6 +110,9 @@ class Flight(eqx.Module):
     stretch: Int[Array, " samples"] | None = None
     commanded: bool = eqx.field(static=True, default=False)
     voltage: Float[Array, " samples"] | None = eqx.field(converter=_optional_float, default=None)
+    held: bool = eqx.field(static=True, default=True)
+    within: Float[Array, "samples parts 4"] | None = eqx.field(converter=_optional_float, default=None)
+    averaging_time: Scalar = eqx.field(converter=as_float, default=0.0)
 
     def __check_init__(self):
         samples = self.time.shape
@@ -110,7 +141,8 @@ class Flight(eqx.Module):
     def inputs(self) -> Inputs:
         """The inputs of the vehicle."""
         stretches = None if self.stretch is None else Stretches.of(self.stretch)
-        return Inputs(self.omega, self.dt, self.body_velocity, stretches, self.voltage)
+        own = self.omega, self.dt, self.body_velocity, stretches, self.voltage
+        return Inputs(*own, within=self.within, averaging_time=self.averaging_time)
 
     @property
     def channels(self) -> Float[Array, "samples 15"]:

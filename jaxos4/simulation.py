@@ -25,6 +25,12 @@ def euler_step(model: AbstractModel, state: State, forcing: Forcing, parameters,
     return _advance(state, model.cascade(state, forcing, parameters), dt)
 
 
+def midpoint_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
+    """A step by the midpoint rule, of order 2."""
+    middle = _advance(state, model.cascade(state, forcing, parameters), dt / 2)
+    return _advance(state, model.cascade(middle, forcing, parameters), dt)
+
+
 def rk4_step(model: Any, state: S, forcing: Any, parameters: Any, dt: Scalar) -> S:
     """The classical Runge-Kutta step, of order 4. The forcing is constant over the step.
 

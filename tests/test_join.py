@@ -112,7 +112,7 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     rng, t, dt = np.random.default_rng(0), 3.0 + 0.001 * np.arange(83), 0.001 * ratio
     channels = np.cumsum(rng.normal(size=(83, 3)), axis=0)
     channels[rng.uniform(size=channels.shape) < lost] = np.nan
-    grid, _, found = averages(t, rng.uniform(100, 300, (83, 4)), channels)(dt)
+    grid, _, found = averages(t, rng.uniform(100, 300, (83, 4)), channels, held=True)(dt)
     np.testing.assert_allclose(grid, t[0] + dt * np.arange(grid.size), rtol=1e-12)
     assert grid[-1] <= t[-1] + 1e-6 < grid[-1] + dt + 1e-6
     np.testing.assert_allclose(found, averaged_slowly(t, channels, grid, dt), rtol=1e-9, atol=1e-9)

@@ -127,7 +127,7 @@ def dirty(exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def recorded(omega: np.ndarray, seen: np.ndarray) -> jaxos4.Flight:
     """The averaged recording."""
     t = FINE * np.arange(omega.shape[0])
-    grid, speeds, channels = averages(t, omega, seen)(COARSE)
+    grid, speeds, channels = averages(t, omega, seen, held=True)(COARSE)
     states, force = np.full((grid.size, 12), np.nan), np.full((grid.size, 3), np.nan)
     states[:, [7, 9, 11]], force[:, 2] = channels[:, :3], channels[:, 3]
     return jaxos4.Flight(grid, speeds, states, force)

@@ -196,8 +196,7 @@ def filtered(
 ) -> Filtered:
     """The rates and disturbances at each sample. Filters begin anew in each stretch.
 
-    `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model. The
-    rate of a specific force is the mean of its disturbance over a sample.
+    `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model.
     """
     begins = jnp.diff(stretch, prepend=-1) != 0
     is_known, memory = ~jnp.isnan(measured), is_rate(measured.shape[1])
@@ -207,7 +206,7 @@ def filtered(
     def step(known: Filtered, row) -> tuple[Filtered, Filtered]:
         y, is_known, added, begins, by_rate, by_disturbance = row
         rate, disturbance = (jnp.where(begins, 0.0, x) for x in known)
-        error = jnp.where(is_known, y - rate, 0.0)
+        error = jnp.where(is_known, y - jnp.where(memory, rate, disturbance), 0.0)
         rate, disturbance = rate + by_rate * error, disturbance + by_disturbance * error
         later = Filtered(memory * rate + added * dt + reach * disturbance, kept * disturbance)
         return later, Filtered(rate, disturbance)

@@ -80,8 +80,8 @@ def fly_closed_loop(
     - `key`: for the gusts and the noise.
     - `substeps`: Runge-Kutta steps of the physics in each sample, a multiple of `loop.log_every`.
 
-    **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands at
-    sample k, or the mean speed of each rotor until sample k + 1. Its `result` is that of `simulate`. After a failure
+    **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands that
+    act from sample k on, or the speed of each rotor at sample k. Its `result` is that of `simulate`. After a failure
     the measurements are NaN and the rotor speeds are 0.
 
     **Raises:** `ValueError` that names the argument.
@@ -252,7 +252,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         (later, speeds), means = jax.lax.scan(step, (motion, speeds), (jnp.arange(steps), *middle))
         mean = means.mean(axis=0)
         signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)
-        omega = command if loop.logged == "commands" else mean
+        omega = command if loop.logged == "commands" else state.speeds
         return _State(later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
 
     weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())

@@ -76,8 +76,7 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, Motion, Array, Array,
     every, sensors, keys = loop.log_every, loop.sensors, jax.random.split(key, 3)
     commands = loop.logged == "commands"
     omega = logged[0] if sensors is None else _late(logged[0], sensors.clock_offset * every / dt)
-    omega = omega[::every] if commands else omega.reshape(-1, every, 4).mean(axis=1)
-    motion, rates, attitude, specific = jax.tree.map(lambda x: x[::every], logged[1:])
+    omega, motion, rates, attitude, specific = jax.tree.map(lambda x: x[::every], (omega, *logged[1:]))
     states = jnp.full((omega.shape[0], 12), jnp.nan).at[:, ANGLES].set(attitude)
     if sensors is not None:
         omega, step = omega + sensors.speed_noise * jax.random.normal(keys[0], omega.shape), sensors.speed_step
@@ -97,6 +96,7 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, Motion, Array, Array,
         specific_force=jnp.where(valid[:, None], specific, jnp.nan),
         result=result,
         commanded=commands,
+        held=commands,
     )
 
 

@@ -298,6 +298,7 @@ def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[
         lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=_SETTLED
     )
     rate, disturbance = 1 - gains.rate[-1], gains.disturbance[-1]
-    after = Covariance(p.rate * rate, p.cross * rate, p.disturbance - p.cross * disturbance)
+    seen = step.memory * p.cross + step.seen * p.disturbance
+    after = Covariance(p.rate * rate, p.cross * rate, p.disturbance - seen * disturbance)
     absorbed = disturbance * dt / (disturbance * step.reach + (1 - step.kept) * gains.rate[-1])
     return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

@@ -52,8 +52,10 @@ def recording_of(
         row = int(np.argmax(np.diff(t)))
         what = f"comes after a gap of {t[row + 1] - t[row]:.6g} s: at the median step of {dt:.3g} s the flight would "
         table.refuse(what + f"have {samples:.3g} samples; cut the file there", index=row + 1, column="t")
-    (time, omega, channels), figures = resample(t, omega, channels, dt)
-    if figures:
+    held = commanded or table.held
+    (time, omega, channels), figures = resample(t, omega, channels, dt, held=held)
+    if figures:  # resampled speeds are means from sample to sample
+        held = True
         found.append(figures)
         voltage = None if voltage is None else np.interp(time, t, voltage)
     if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
@@ -63,7 +65,7 @@ def recording_of(
         found.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
         time = dt * np.arange(time.size)
     states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
-    about = {"commanded": commanded, "name": os.fspath(table.path), "notes": tuple(found), "facts": facts}
+    about = {"commanded": commanded, "held": held, "name": os.fspath(table.path), "notes": tuple(found), "facts": facts}
     return Recording(time, omega, states, force if with_force else None, voltage, **about)
 
 

@@ -24,6 +24,8 @@ Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]
 RowPositions = Float[np.ndarray, " rows"]
 Resampled = tuple[RowPositions, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
+PARTS = 4
+"""The parts of an averaged sample in which its rotor speeds are kept. Two of them are half of a sample."""
 
 
 class Series(NamedTuple):
@@ -77,19 +79,37 @@ def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[RowPo
     return at
 
 
-def averages(t: Times, omega: Rotors, channels: Columns) -> Callable[[float], Resampled]:
+def speeds_within(
+    t: Times, omega: Rotors, *, held: bool
+) -> Callable[[RowPositions, float], Float[np.ndarray, "rows parts 4"]]:
+    """Root mean square of each rotor's speed in the parts of the samples around rows, a function of rows and step [s].
+
+    Arguments as of `averages`. Before the first time, speeds are those of the first row.
+    """
+    times, values = np.append(2 * t[0] - t[-1], t), np.concatenate([omega[:1], omega])
+    speeds = root_mean_square(Series(times, values), linear=not held)
+
+    def at(rows: RowPositions, dt: float) -> Float[np.ndarray, "rows parts 4"]:
+        edges = rows[0] - dt / 2 + dt / PARTS * np.arange(PARTS * rows.size + 1)
+        return speeds(edges)[:-1].reshape(rows.size, PARTS, -1)
+
+    return at
+
+
+def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
     """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
 
     Each measurement becomes the mean over a sample around its time, which removes vibration above the new rate without
     a delay. It is missing (NaN) if less than about half of that time was measured. Each rotor speed becomes the root
-    mean square over the sample that follows. `t`: times [s]; `omega`: rotor speeds [rad/s].
+    mean square over the sample that follows. `t`: times [s]; `omega`: rotor speeds [rad/s], `held` from row to row, or
+    those at the times.
     """
     own = (t[-1] - t[0]) / (t.size - 1)
     measured = np.isfinite(channels)
     some, gaps = measured.any(axis=0), ~measured.all(axis=0)
     total = integral(Series(t - own / 2, np.where(measured, channels, 0.0)[:, some]))
     share = integral(Series(t - own / 2, measured[:, some & gaps].astype(float)))
-    speeds = root_mean_square(Series(t, omega))
+    speeds = root_mean_square(Series(t, omega), linear=not held)
 
     def average(dt: float) -> Resampled:
         grid = _grid(t, dt)
@@ -186,7 +206,7 @@ def gyro_rows(
     for names, series in others.items():
         if series is not None:
             columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
-    return rows, table._replace(columns=columns)
+    return rows, table._replace(columns=columns, held=True)
 
 
 def grid_size(t: Times, dt: float) -> float:
@@ -194,12 +214,13 @@ def grid_size(t: Times, dt: float) -> float:
     return math.floor((t[-1] - t[0]) / dt + UNIFORM) + 1.0
 
 
-def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Resampled, str]:
+def resample(t: Times, omega: Rotors, channels: Columns, dt: float, *, held: bool) -> tuple[Resampled, str]:
     """Bring rows at uneven times [s] to the grid t_0, t_0 + dt, ...
 
-    `omega` is held until the next row (`root_mean_square`), `channels` are interpolated linearly (`at_rows`), with an
-    error of second order in dt. A gap is NaN, except for samples within 1 % of dt of a time of the grid. If all rows
-    are within 1 % of a step of a uniform grid, their values stay, and so do times that are off by rounding only.
+    `omega` is `held` until the next row, or interpolated (`root_mean_square`); `channels` are interpolated linearly
+    (`at_rows`), with an error of second order in dt. A gap is NaN, except for samples within 1 % of dt of a time of the
+    grid. If all rows are within 1 % of a step of a uniform grid, their values stay, and so do times that are off by
+    rounding only.
 
     **Returns:** time, rotor speeds, channels, and a note with the figures of the resampling, if there was any.
     """
@@ -222,7 +243,8 @@ def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Res
             f"; {counted(int(gap.sum()), 'gap')} of up to {1e3 * step.max():.4g} ms: the "
             f"{int((ends[1] - ends[0]).sum())} samples in gaps hold the rotor speeds and count as not measured"
         )
-    return (grid, root_mean_square(Series(t, omega))(grid), at_rows(grid, Series(t, channels), step=dt)), note
+    speeds = root_mean_square(Series(t, omega), linear=not held)(grid)
+    return (grid, speeds, at_rows(grid, Series(t, channels), step=dt)), note
 
 
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:

@@ -118,6 +118,7 @@ class Table(NamedTuple):
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
     - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
+    - `held`: whether measured rotor speeds are means until the next row, and not those at the time of their row.
     - `impossible`: by column, how many values `without_impossible` took out, and the first of them.
     """
 
@@ -129,6 +130,7 @@ class Table(NamedTuple):
     remedy: str = ""
     facts: LogFacts = LogFacts()
     impossible: Mapping[str, tuple[int, str]] = MappingProxyType({})
+    held: bool = False
 
     def refuse(self, what: str, *, index: int | None = None, column: str | None = None) -> NoReturn:
         """Raise an `InputError` about entry `index` of `column`."""
@@ -191,14 +193,14 @@ class LogFormat(NamedTuple):
     read: Callable[[Path], tuple[Table, tuple[str, ...]]]
 
 
-_ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocity", "stretch")
+_ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocity", "stretch", "within")
 
 
 class Recording(NamedTuple):
     """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
 
-    The arrays and `commanded` are as in `Flight`, in SI units. A recording is cleaned, cut and joined as it is, and
-    becomes a `Flight` once, at the end.
+    The arrays, `commanded`, `held` and `averaging_time` are as in `Flight`, in SI units. A recording is cleaned, cut
+    and joined as it is, and becomes a `Flight` once, at the end.
 
     - `name`: in messages and in the provenance. Usually the path of the file.
     - `notes`: what the reader changed in the data, one line each.
@@ -216,6 +218,9 @@ class Recording(NamedTuple):
     name: str = "flight"
     notes: tuple[str, ...] = ()
     facts: LogFacts = LogFacts()
+    held: bool = True
+    within: Float[np.ndarray, "samples parts 4"] | None = None
+    averaging_time: float = 0.0
 
     @classmethod
     def of(cls, flight: Flight, name: str = "flight") -> "Recording":
@@ -225,14 +230,15 @@ class Recording(NamedTuple):
             for field in _ARRAYS
             if (value := getattr(flight, field)) is not None
         }
-        return cls(**arrays, commanded=flight.commanded, name=name)
+        averaging_time = float(flight.averaging_time)
+        return cls(**arrays, commanded=flight.commanded, name=name, held=flight.held, averaging_time=averaging_time)
 
     @property
     def flight(self) -> Flight:
         """The `Flight`, in the precision of JAX."""
         arrays: dict[str, Any] = {field: getattr(self, field) for field in _ARRAYS}
         arrays["stretch"] = None if self.stretch is None else jax.device_put(self.stretch)
-        return Flight(**arrays, commanded=self.commanded)
+        return Flight(**arrays, commanded=self.commanded, held=self.held, averaging_time=self.averaging_time)
 
     @property
     def dt(self) -> float:

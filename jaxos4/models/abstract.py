@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._custom_types import Parameters, Scalar, StateVector
+from .._custom_types import Numeric, Parameters, Scalar, StateVector
 from ..airframe import Airframe
 from ..flight import Inputs
 from .state import CASCADE_ORDER, Forcing, Rates, State, stack, unstack
@@ -93,6 +93,10 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The forcing of a whole flight. Row k acts from sample k to sample k + 1."""
+
+    def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
+        """The forcing of the samples `place`, whose measurements may be means, see `Forcing.early`."""
+        return jax.tree.map(lambda leaf: leaf[place], self.forcing(inputs, parameters))
 
     @abc.abstractmethod
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:

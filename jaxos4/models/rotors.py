@@ -17,9 +17,8 @@ Commands = Callable[[Int[Array, "*rows"]], Float[Array, "*rows 4"]]
 
 # The lag that acts is at least this share of a sample, so that a step stays finite wherever a search looks.
 _SHORTEST_LAG = 0.05
-# Steps of the motors in a sample. The voltage, as a share of the full one, over which a motor passes from driving to
-# braking: the ripple of its current.
-_STEPS, _SMOOTH = 2, 0.005
+# The voltage, as a share of the full one, over which a motor passes from driving to braking: the ripple of its current.
+_SMOOTH = 0.005
 _LEAST = 1e-6
 
 
@@ -27,7 +26,8 @@ class Grid(NamedTuple):
     """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
 
     `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by
-    `battery_voltage`, to which the airframe's rotor speeds belong.
+    `battery_voltage`, to which the airframe's rotor speeds belong. `are_parts`: whether the samples are `Flight.within`
+    others.
     """
 
     dt: Scalar
@@ -36,9 +36,12 @@ class Grid(NamedTuple):
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]
     voltage: Float[Array, " samples"] | None = None
+    are_parts: bool = False
 
     @classmethod
-    def of(cls, inputs: Inputs, battery_voltage: Scalar | None, recordings: tuple[int, ...]) -> "Grid":
+    def of(
+        cls, inputs: Inputs, battery_voltage: Scalar | None, recordings: tuple[int, ...], *, are_parts: bool
+    ) -> "Grid":
         """The grid of a flight's inputs. `recordings`: of each stretch."""
         voltage, samples = inputs.voltage, inputs.omega.shape[0]
         voltage = None if voltage is None or battery_voltage is None else voltage / battery_voltage
@@ -47,17 +50,18 @@ class Grid(NamedTuple):
         recording, elapsed = jnp.asarray(recordings)[stretch], inputs.dt * jnp.arange(samples)
         if max(recordings) > 0:
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
-        return cls(inputs.dt, recording, first, last, elapsed, voltage)
+        return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts)
 
     def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Part":
         """Some samples in a row. `before`: see `Part`."""
-        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before)
+        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.are_parts)
 
 
 class Part(NamedTuple):
     """Some samples in a row: the sample time [s], their numbers, and which begin or end a stretch.
 
     `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
+    `are_parts`: see `Grid`.
     """
 
     dt: Scalar
@@ -65,6 +69,7 @@ class Part(NamedTuple):
     is_first: Bool[Array, " rows"]
     is_last: Bool[Array, " rows"]
     before: Float[Array, "4"]
+    are_parts: bool = False
 
 
 class Speeds(NamedTuple):
@@ -76,10 +81,15 @@ class Speeds(NamedTuple):
 
 
 def measured_speeds(omega: Commands, part: Part) -> Speeds:
-    """Speeds that are held over each sample. The last row of a stretch changes nothing."""
+    """Speeds that are held over each sample. The last row of a stretch changes nothing.
+
+    Means over parts of a sample change as those of the parts around them.
+    """
     speed = omega(part.rows)
     following = omega(jnp.where(part.is_last, part.rows, part.rows + 1))
-    return Speeds(speed, speed, following - speed)
+    if not part.are_parts:
+        return Speeds(speed, speed, following - speed)
+    return Speeds(speed, speed, (following - omega(jnp.where(part.is_first, part.rows, part.rows - 1))) / 2)
 
 
 def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
@@ -151,20 +161,20 @@ class Motor(NamedTuple):
         root = jnp.sqrt(jnp.maximum(self.curve**2 + 4 * (1 - self.curve) * command / self.full, _LEAST))
         return 2 * command / jnp.maximum(self.curve + root, _LEAST)
 
-    def step(self, omega: Speed, command: Speed, dt: Scalar) -> Speed:
-        """The speed after a time `dt` [s], by exponential Euler steps.
+    def step(self, omega: Speed, command: Speed, dt: Scalar, steps: int = 2) -> Speed:
+        """The speed after a time `dt` [s], by so many exponential Euler steps.
 
         They are exact for a first-order system, stable for any `dt`, and of second order.
         """
         w, u, lag = omega / self.full, command / self.full, jnp.maximum(self.lag, _SHORTEST_LAG * dt)
-        for _ in range(_STEPS):
+        for _ in range(steps):
             x, load = u - self.curve * w, (1 - self.curve) * w
             weak = (1 - self.braking) * jnp.exp(jnp.minimum(x, 0.0) / _SMOOTH)
             braking = self.braking * x - _SMOOTH * (1 - self.braking - weak)
             slope = jnp.where(x >= 0, 1.0, self.braking + weak) * self.curve + 2 * load
-            z = dt / _STEPS * slope / lag
+            z = dt / steps * slope / lag
             share = jnp.where(jnp.abs(z) > _LEAST, -jnp.expm1(-z) / jnp.where(jnp.abs(z) > _LEAST, z, 1.0), 1 - z / 2)
-            w = jnp.maximum(w + dt / _STEPS / lag * share * (jnp.where(x >= 0, x, braking) - load * w), 0.0)
+            w = jnp.maximum(w + dt / steps / lag * share * (jnp.where(x >= 0, x, braking) - load * w), 0.0)
         return w * self.full
 
 
@@ -174,7 +184,7 @@ def driven(omega: RotorSpeeds, motor: Motor, part: Part) -> Speeds:
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
         begin = jnp.where(is_first, settled, speed)
-        end = motor.step(begin, command, part.dt)
+        end = motor.step(begin, command, part.dt, 1 if part.are_parts else 2)
         return end, (begin, end)
 
     begin, end = jax.lax.scan(over_a_sample, part.before, (omega, motor.settled(omega), part.is_first))[1]

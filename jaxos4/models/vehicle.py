@@ -6,9 +6,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .._custom_types import Count, Parameters, Scalar, as_float
+from .._custom_types import Count, Numeric, Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Constant, Parameter
@@ -126,15 +127,49 @@ class FlightModel(AbstractModel):
 
         If the flight is padded (`Inputs.length`), blocks that are padding alone are not computed: they are 0.
         """
-        grid, before = Grid.of(inputs, self.battery_voltage, self.recordings), jnp.zeros_like(inputs.omega[0])
-        if inputs.length is None:
-            found, _ = self._driven(inputs, grid, grid.part(jnp.arange(len(inputs.omega)), before), parameters)
-        else:
-            found = self._driven_in_blocks(inputs, inputs.length, grid, before, parameters)
-        return found._replace(
-            recording=tuple((grid.recording == i).astype(before.dtype) for i in range(max(self.recordings) + 1)),
-            velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
+        if inputs.within is None:
+            return self._beside(inputs, self._rotors(inputs, parameters))
+        samples, parts, _ = inputs.within.shape
+        last = samples - 1 if inputs.stretches is None else inputs.stretches.last[:, None]
+        following = parts * np.arange(samples)[:, None] + parts // 2 + np.arange(parts)
+        following = jnp.minimum(following, parts * last + parts - 1)
+        fine = self._rotors(inputs.divided, parameters, are_parts=True)
+        return self._beside(inputs, jax.tree.map(lambda leaf: leaf[following].mean(axis=1), fine))
+
+    def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
+        """The forcing over each sample around its time, as `Flight.within` has the rotor speeds."""
+        if inputs.within is None:
+            return super().mean_forcing(inputs, parameters, place)
+        (samples, parts, _), is_mean = inputs.within.shape, jnp.asarray(inputs.averaging_time) > 0
+        number = np.arange(parts)
+        # By the time that is left in the sample. Before an instant in the middle, the first half alone counts.
+        left = jnp.where(is_mean, (2 * parts - 1 - 2 * number) / parts**2, 2 / parts * (number < parts // 2))
+        seen = jnp.where(is_mean, 1 / parts, (abs(number - (parts - 1) / 2) < 1) / 2)
+        fine = self._rotors(inputs.divided, parameters, are_parts=True)
+        fine = jax.tree.map(lambda leaf: leaf.reshape(samples, parts), fine)
+        whole, early = jax.tree.map(lambda leaf: leaf.mean(axis=1), fine), jax.tree.map(lambda leaf: leaf @ left, fine)
+        whole = whole._replace(specific_thrust=fine.thrust @ seen, early=early)
+        return self._beside(inputs, jax.tree.map(lambda leaf: leaf[place], whole), place)
+
+    def _beside(self, inputs: Inputs, rotors: Forcing, place: Int[Numeric, "*rows"] | None = None) -> Forcing:
+        """The forcing by the rotors, and what acts beside them. `place`: the samples of its rows; by default all."""
+        own, velocity = jnp.zeros(inputs.omega.shape[0], dtype=int), inputs.velocity
+        if inputs.stretches is not None:
+            own = jnp.asarray(self.recordings)[inputs.stretches.number]
+        if place is not None:
+            own, velocity = own[place], None if velocity is None else velocity[place]
+        shares = tuple((own == i).astype(rotors.roll.dtype) for i in range(max(self.recordings) + 1))
+        return rotors._replace(
+            recording=shares, velocity=None if velocity is None else tuple(jnp.moveaxis(velocity, -1, 0))
         )
+
+    def _rotors(self, inputs: Inputs, parameters, *, are_parts: bool = False) -> Forcing:
+        """The forcing by the rotors. `are_parts`: see `Grid`."""
+        grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=are_parts)
+        before = jnp.zeros_like(inputs.omega[0])
+        if inputs.length is None:
+            return self._driven(inputs, grid, grid.part(jnp.arange(len(inputs.omega)), before), parameters)[0]
+        return self._driven_in_blocks(inputs, inputs.length, grid, before, parameters)
 
     def _driven(self, inputs: Inputs, grid: Grid, part: Part, parameters) -> tuple[Forcing, Array]:
         """The forcing by the rotors over some samples, and the rotor speeds at the end of the last."""

@@ -231,7 +231,7 @@ def _pair(found: np.ndarray) -> int | None:
 
 def _response(piece: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
-    _, omega, rates = averages(piece.time, piece.omega, piece.states[:, RATE_COLUMNS])(step)
+    _, omega, rates = averages(piece.time, piece.omega, piece.states[:, RATE_COLUMNS], held=piece.held)(step)
     acceleration = np.diff(rates, axis=0) / step
     for i, axis in enumerate(excitation(piece).values()):
         if axis.verdict not in ("good", "weak"):

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import InputError
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..logs import FORMATS, Recording as Recording, Table, log_format
-from ..logs.sampling import averages
+from ..logs.sampling import averages, speeds_within
 
 # Sample times that differ by less than this share are equal.
 _EQUAL_STEPS = 1e-6
@@ -90,15 +90,17 @@ def cut(flight: Recording, stretch: Stretch) -> Recording:
 
 
 def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
-    """A flight averaged to samples of each length [s], see `averages`; unchanged where its own are not shorter."""
-    if max(steps) <= flight.dt * (1 + _EQUAL_STEPS):
-        return [flight] * len(steps)
+    """A flight averaged to samples of each length [s], see `averages`, with the rotor speeds `within` each.
+
+    Measurements stay as they are where its own samples are not shorter.
+    """
+    within = speeds_within(flight.time, flight.omega, held=flight.held)
     columns = [flight.channels] if flight.voltage is None else [flight.channels, flight.voltage[:, None]]
-    average = averages(flight.time, flight.omega, np.hstack(columns))
+    average = averages(flight.time, flight.omega, np.hstack(columns), held=flight.held)
 
     def at(dt: float) -> Recording:
         if dt <= flight.dt * (1 + _EQUAL_STEPS):
-            return flight
+            return flight._replace(within=within(flight.time, flight.dt))
         time, omega, means = average(dt)
         return flight._replace(
             time=time,
@@ -108,6 +110,9 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
             voltage=None if flight.voltage is None else means[:, 15],
             body_velocity=None,
             stretch=None,
+            held=True,
+            within=within(time, dt),
+            averaging_time=dt,
         )
 
     return [at(dt) for dt in steps]
@@ -157,6 +162,9 @@ def joined(pieces: Sequence[Recording]) -> Recording:
         body_velocity=_of_all(pieces, "body_velocity"),
         stretch=np.repeat(np.arange(len(sizes)), sizes),
         commanded=any(piece.commanded for piece in pieces),
+        held=all(piece.held for piece in pieces),
+        within=_of_all(pieces, "within"),
+        averaging_time=pieces[0].averaging_time,
     )
 
 

@@ -27,6 +27,7 @@ from .gains import (
     Observed,
     Series,
     Step,
+    Window,
     basis,
     first_covariance,
     next_gains,
@@ -38,6 +39,7 @@ Segments = Float[Array, " segments"]
 Scalars = tuple[Float[Array, "*#segments"], ...]
 Move = Callable[[State, Forcing, Scalars], State]
 Observe = Callable[[State, Forcing, Scalars], Scalars]
+Functions = tuple[Move, Move, Observe]
 
 LAGS = 8
 """The largest lag at which innovations are compared, in samples."""
@@ -77,45 +79,41 @@ class _Row(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """The estimates of the filters before a measurement: rates and disturbances.
-
-    That of a specific force is its value at the end of the sample, whose mean is measured.
-    """
+    """What the filters know at the beginning of a sample: rates and disturbances."""
 
     rates: Rates
     disturbance: tuple[Segments, ...]
 
 
 class _Feedback(NamedTuple):
-    """The parts of a filter that depend on the noise, by channel: its gains, and the disturbance over one sample."""
+    """The parts of a filter that depend on the noise, by channel: its `Gains`, and fields of `Step`."""
 
     rate: tuple[Segments, ...]
-    disturbance: tuple[Segments, ...]
+    rate_later: tuple[Segments, ...]
+    disturbance_later: tuple[Segments, ...]
+    seen: tuple[Segments, ...]
     reach: tuple[Segments, ...]
     kept: tuple[Segments, ...]
 
 
 def _advance(
-    move: Move, observe: Observe, known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
+    functions: Functions, known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """The estimates one sample later, and the innovations of this sample."""
-    outputs = observe(State(known.rates), forcing, scalars)
-    means = zip(feedback.reach, feedback.kept, known.disturbance, strict=True)  # of the disturbance over this sample
-    least = np.finfo(known.rates[0].dtype).tiny  # a disturbance that fades within the sample is 0 at its end
-    force = (
-        h + a / jnp.maximum(kept, least) * d
-        for h, (a, kept, d) in zip(outputs[RATES:], tuple(means)[RATES:], strict=True)
-    )
+    move, average, observe = functions
+    pushed = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
+    mean = average(State(known.rates), forcing, scalars).rates
+    outputs = observe(State(Rates(*(x + a for x, a in zip(mean, pushed, strict=False)))), forcing, scalars)
+    outputs = (*outputs[:RATES], *(h + a for h, a in zip(outputs[RATES:], pushed[RATES:], strict=True)))
     # What was not measured has no gain.
-    errors = tuple(z - h for z, h in zip(row.measured, (*outputs[:RATES], *force), strict=True))
-    disturbance = tuple(
-        d + gain * e for d, gain, e in zip(known.disturbance, feedback.disturbance, errors, strict=True)
-    )
-    rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors[:RATES], strict=False))
+    errors = tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
+    rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors, strict=False))
     following = move(State(Rates(*rates)), forcing, scalars).rates
-    pushed = (x + a * d for x, a, d in zip(following, feedback.reach, disturbance[:RATES], strict=False))
-    faded = tuple(share * d for share, d in zip(feedback.kept, disturbance, strict=True))
-    return _emptied(_Known(Rates(*pushed), faded), row.restarts_next), errors
+    later = zip(following, feedback.reach, known.disturbance, feedback.rate_later, errors, strict=False)
+    rates = Rates(*(x + a * d + gain * e for x, a, d, gain, e in later))
+    faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, strict=True)
+    disturbance = tuple(share * d + gain * e for share, d, gain, e in faded)
+    return _emptied(_Known(rates, disturbance), row.restarts_next), errors
 
 
 def _emptied(known: _Known, where: Bool[Array, " segments"]) -> _Known:
@@ -137,14 +135,14 @@ class _Carry(NamedTuple):
 
 
 def innovate(
-    move: Move,
-    observe: Observe,
+    functions: Functions,
     observed: Observed,
     forcing: Forcing,
     parameters: Parameters,
     noise: LogNoise,
     *,
     dt: Scalar,
+    window: Window,
     rows: Count | int,
     forcing_tangents: Forcing | None,
     forcing_parameters: tuple[int, ...],
@@ -155,16 +153,17 @@ def innovate(
 
     **Arguments:**
 
-    - `move`, `observe`: from a state, the forcing and the parameters, the state one sample later and the outputs of the
-      sensors.
+    - `functions`: each takes a state, the forcing and the parameters. The first returns the state one sample later, the
+      second its mean over what a measurement averages, the third the outputs of the sensors.
     - `observed`: its number of rows is a multiple of `BLOCK`.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters at the positions `forcing_parameters`.
+    - `window`: what a measurement averages.
     - `rows`: how many rows are filtered; the others are padding. It is data, so that flights of different lengths share
       a program.
     """
-    flight, at = (observed, forcing, forcing_tangents, rows, dt), (parameters, noise)
-    return with_batch(_innovate, _innovate_lanes, (move, observe), forcing_parameters, flight, at)
+    flight, at = (observed, forcing, forcing_tangents, rows, dt, window), (parameters, noise)
+    return with_batch(_innovate, _innovate_lanes, functions, forcing_parameters, flight, at)
 
 
 def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
@@ -187,7 +186,7 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, lanes * segments)), same)
         return eqx.combine(one, same)
 
-    *series, rows, dt = flight
+    *series, rows, dt, window = flight
     own = jax.tree.map(repeated, moving)
 
     def each(which: int) -> Callable:
@@ -197,26 +196,29 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         return function
 
     rows = fixed_flight[3] if rows is None else rows.max()  # in the rows of other lanes, nothing counts
-    dt = fixed_flight[4] if dt is None else repeated(dt)
-    flight = *lanes_before_last(tuple(series), tuple(fixed_flight[:3])), rows, dt
-    found = _filter((each(0), each(1)), positions, flight, in_each_segment(at, fixed_at))
+    dt, window = (
+        eqx.combine(jax.tree.map(repeated, one), same) for one, same in zip((dt, window), fixed_flight[4:], strict=True)
+    )
+    flight = *lanes_before_last(tuple(series), tuple(fixed_flight[:3])), rows, dt, window
+    functions = tuple(each(which) for which in range(len(moving)))
+    found = _filter(functions, positions, flight, in_each_segment(at, fixed_at))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
 
 
-def _innovate(functions: tuple[Move, Observe], positions: tuple[int, ...], flight: tuple, at: Any) -> Innovations:
+def _innovate(functions: Functions, positions: tuple[int, ...], flight: tuple, at: Any) -> Innovations:
     """The innovations of one flight."""
-    move, observe = (jax.vmap(each, in_axes=(0, 0, None)) for each in functions)
-    return _filter((move, observe), positions, flight, at)
+    each = tuple(jax.vmap(function, in_axes=(0, 0, None)) for function in functions)
+    return _filter(each, positions, flight, at)
 
 
 def _filter(
-    functions: tuple[Callable, Callable], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise]
+    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise]
 ) -> Innovations:
     """See `innovate`; functions of all segments. Parameters and noise may have an axis of segments, the last."""
-    (observed, forcing, forcing_tangents, rows, dt), (parameters, noise) = flight, at
+    (observed, forcing, forcing_tangents, rows, dt, window), (parameters, noise) = flight, at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
     unknowns = count + 3
-    step, push = jax.linearize(lambda noise: step_of(noise, dt), noise)
+    step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
     steps = step, jax.vmap(push)(basis(noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
     zero = jnp.zeros(segments, dtype=float)
@@ -238,7 +240,7 @@ def _filter(
         jnp.zeros((LAGS, channels, segments), dtype=float),
         nothing,
     )
-    advance = functools.partial(_advance, *functions)
+    advance = functools.partial(_advance, functions)
     filtered = functools.partial(_filter_rows, advance, parameters, steps, np.asarray(positions, int))
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
     row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, observed.restart, following)
@@ -268,7 +270,8 @@ def _filter_rows(
     units = tuple(np.eye(count, dtype=parameters.dtype))
 
     def feedback(gains: Gains, step: Step) -> _Feedback:
-        return _Feedback(*map(tuple, (gains.rate, gains.disturbance, step.reach, step.kept)))
+        fields = gains.rate, gains.rate_later, gains.disturbance_later, step.seen, step.reach, step.kept
+        return _Feedback(*map(tuple, fields))
 
     def body(carry, rows):
         (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry

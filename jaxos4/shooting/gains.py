@@ -2,9 +2,11 @@
 
 A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a
 force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
-The filter of a body rate knows the rate and its disturbance. A specific force is measured as its mean over a sample.
-Its filter knows the disturbance at the end of the sample and, in the place of the rate, the mean over the sample. Both
-rate and mean are integrals of the disturbance, but each sample has its own mean. Channels share no covariance.
+
+A measurement is the mean over a window of its sample (`Window`). The filter of a body rate knows the rate and the
+disturbance at the beginning of a sample. From them and from the noise within the sample follow three numbers: rate
+and disturbance at the end of the sample, and what is measured. Their joint covariance is exact, so innovations of the
+right model are white at every sample time. The filter of a specific force knows the disturbance alone.
 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
@@ -16,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Numeric, Scalar, as_float
+from .._custom_types import Numeric, Scalar
 from ..models.state import CHANNELS
 
 Channels = Float[Array, "channels segments"]
@@ -26,8 +28,22 @@ RATES = CHANNELS["rates"]
 """The number of body rates, which come first among the channels."""
 # Standard deviation of the rates before the first measurement of a segment [rad/s]: as good as unknown.
 _UNKNOWN_RATE = 1e3
-# The sample time over the time constant below which a Taylor series is more exact.
-_SHORT = 0.03
+# Nodes of the quadrature over each part of a sample: exact to rounding, as it is shorter than four time constants.
+_NODES = 8
+
+
+class Window(NamedTuple):
+    """The part of a sample over which a measurement is averaged [s].
+
+    `begin`: after the beginning of the sample. `length`: 0 for an instant.
+    """
+
+    begin: Scalar | float = 0.0
+    length: Scalar | float = 0.0
+
+
+INSTANT = Window()
+"""A measurement at the beginning of its sample."""
 
 
 class LogNoise(NamedTuple):
@@ -59,10 +75,16 @@ class Observed(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """The gains of rate and disturbance for a unit of innovation, and the variance of the innovation."""
+    """What a unit of innovation adds, and the variance of the innovation.
+
+    - `rate`, `disturbance`: at the beginning of the sample.
+    - `rate_later`: at the end, besides `rate`. `disturbance_later`: at the end.
+    """
 
     rate: Series
     disturbance: Series
+    rate_later: Series
+    disturbance_later: Series
     variance: Series
 
 
@@ -77,15 +99,22 @@ class Covariance(NamedTuple):
 class Step(NamedTuple):
     """The disturbance over one sample, of each channel.
 
-    - `kept`: the share of it that remains. `reach`: what a unit of it adds to the rate, or its mean over the sample.
-    - `added`: the covariance that its noise adds.
+    - `kept`: the share of it that remains. `reach`: what a unit of it adds to the rate; of a specific force, its mean.
+    - `seen`: what a unit of it adds to the measurement.
+    - `added`: the covariance that its noise adds at the end of the sample.
+    - `noise`: the variance that its noise adds to the measurement; `with_rate`, `with_disturbance`: the covariance with
+      the rate and the disturbance at the end.
     - `variance`: of the disturbance. `sensor`: of the sensor's noise.
-    - `memory`: 1 for a rate; 0 for the mean over a sample, which the next mean does not know.
+    - `memory`: 1 for a rate; 0 for a specific force, which has no state besides its disturbance.
     """
 
     kept: Channels
     reach: Channels
+    seen: Channels
     added: Covariance
+    noise: Channels
+    with_rate: Channels
+    with_disturbance: Channels
     variance: Channels
     sensor: Channels
     memory: Channels
@@ -103,67 +132,106 @@ def transition(time_constant: Float[Array, "channels *segments"], dt: Float[Arra
     return jnp.exp(-share), -time_constant * jnp.expm1(-share) / jnp.where(rate, 1.0, dt)
 
 
-def step_of(noise: LogNoise, dt: Float[Array, "..."]) -> Step:
-    """The step over one sample of this length, exact for an Ornstein-Uhlenbeck process."""
+def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) -> Step:
+    """The step over one sample of this length. Measurements are means over `window`."""
     strength, time_constant, sensor = (leaf.reshape(leaf.shape[0], -1) for leaf in noise)
     variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
-    share, (kept, reach) = dt / tau, transition(tau, dt)
-    lost, lost_twice = -jnp.expm1(-share), -jnp.expm1(-2 * share)
-    # For long time constants a difference of nearly equal numbers, and so its Taylor series.
-    series = share**3 / 3 * (1 - share * (3 / 4 - share * (7 / 20 - share * (1 / 8 - share * (31 / 840)))))
-    spread = jnp.where(share < _SHORT, series, share - 2 * lost + lost_twice / 2)
-    rate = is_rate(strength.shape[0])[:, None]
-    unit = jnp.where(rate, 1.0, 1 / dt)
-    added = Covariance(
-        2 * variance * jnp.square(tau * unit) * spread, variance * tau * unit * lost**2, variance * lost_twice
-    )
-    memory = jnp.broadcast_to(as_float(rate), variance.shape)
-    return Step(kept, reach, added, variance, jnp.exp(2 * sensor), memory)
+    rate = jnp.broadcast_to(is_rate(strength.shape[0])[:, None], variance.shape)
+    begin, end = jnp.asarray(window.begin, dtype=float), jnp.asarray(window.begin + window.length, dtype=float)
+    long = jnp.where(window.length > 0, window.length, 1.0)
 
+    # What a unit of the disturbance makes after a time: disturbance, rate, and the integral of the rate.
+    def faded(time: Array) -> Array:
+        return jnp.exp(-time / tau)
 
-def _measure(p: Covariance, is_measured: Bool[Array, "channels segments"], step: Step) -> tuple[Covariance, "Gains"]:
-    """The covariance after a measurement, and the gains that belong to it."""
-    variance = p.rate + step.sensor
-    weight = jnp.where(is_measured, 1 / variance, 0.0)
-    # The share that remains, without a difference of large numbers.
-    kept = jnp.where(is_measured, step.sensor / variance, 1.0)
-    disturbance = p.cross * weight
-    after = Covariance(p.rate * kept, p.cross * kept, p.disturbance - p.cross * disturbance)
-    return after, Gains(p.rate * weight, disturbance, jnp.where(is_measured, variance, 1.0))
+    def turned(time: Array) -> Array:
+        return -tau * jnp.expm1(-time / tau)
 
+    def swept(time: Array) -> Array:
+        return tau * (time - turned(time))
 
-def _predict(p: Covariance, step: Step) -> Covariance:
-    """The covariance one sample later."""
-    reach, kept, added, memory = step.reach, step.kept, step.added, step.memory
-    return Covariance(
-        memory * (p.rate + 2 * reach * p.cross) + reach**2 * p.disturbance + added.rate,
-        kept * (memory * p.cross + reach * p.disturbance) + added.cross,
-        kept**2 * p.disturbance + added.disturbance,
+    def measured(time: Array) -> Array:
+        """By a unit of the disturbance at this time of the sample."""
+        until_begin, until_end = jnp.maximum(begin - time, 0.0), jnp.maximum(end - time, 0.0)
+        mean = jnp.where(rate, swept(until_end) - swept(until_begin), turned(until_end) - turned(until_begin)) / long
+        instant = jnp.where(rate, turned(until_begin), faded(until_begin) * (time <= begin))
+        return jnp.where(window.length > 0, mean, instant)
+
+    def moved(time: Array) -> Array:
+        return jnp.where(rate, turned(dt - time), turned(dt - time) / dt)
+
+    # The parts of the sample before, in and after the window, and the nodes of a quadrature in each.
+    edges = jnp.stack(jnp.broadcast_arrays(jnp.zeros_like(begin), begin, end, dt))
+    nodes, weights = (x.reshape(-1, *(1,) * edges.ndim) for x in np.polynomial.legendre.leggauss(_NODES))
+    parts = edges[1:] - edges[:-1]
+    time = (edges[:-1] + (nodes + 1) / 2 * parts).reshape(-1, 1, *edges.shape[1:] or (1,))
+    share = (weights / 2 * parts).reshape(time.shape) * 2 * variance / tau
+    x, d, m = moved(time), faded(dt - time), measured(time)
+    products = x * x, x * d, d * d, m * m, m * x, m * d
+    x_x, x_d, d_d, m_m, m_x, m_d = ((share * each).sum(axis=0) for each in products)
+    kept, reach = transition(tau, dt)
+    return Step(
+        kept=kept,
+        reach=reach,
+        seen=measured(jnp.zeros_like(begin)),
+        added=Covariance(x_x, x_d, d_d),
+        noise=m_m,
+        with_rate=m_x,
+        with_disturbance=m_d,
+        variance=variance,
+        sensor=jnp.exp(2 * sensor),
+        memory=rate.astype(variance.dtype),
     )
 
 
 def first_covariance(step: Step, segments: int) -> Covariance:
-    """The covariance before the first measurement of a segment whose rates are known then."""
+    """The covariance at the beginning of a segment whose rates are known."""
     zero = jnp.zeros((step.variance.shape[0], segments), dtype=float)
-    begin = Covariance(zero, zero, zero + step.variance)
-    return jax.tree.map(lambda now, later: jnp.where(step.memory > 0, now, later), begin, _predict(begin, step))
+    return Covariance(zero, zero, zero + step.variance)
 
 
 def next_gains(
     p: Covariance, step: Step, is_measured: Bool[Array, "channels segments"], restart: Bool[Array, " segments"]
 ) -> tuple[Covariance, Gains]:
-    """The covariance one sample later, and the gains of this sample, from the covariance before it."""
+    """The covariance one sample later, and the gains of this sample, from the covariance at its beginning."""
     # After a restart the rates are unknown. XLA takes no longer than if this came before the loop.
     first = first_covariance(step, p.rate.shape[-1])
     first = first._replace(rate=first.rate + step.memory * _UNKNOWN_RATE**2)
-    p = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
-    p, gains = _measure(p, is_measured, step)
-    return _predict(p, step), gains
+    rate, cross, disturbance = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
+    kept, seen = step.kept, step.seen
+    # Covariances with the measurement, and with `gap`: the rate at the end less the measurement. The gap does not
+    # depend on the rate at the beginning, whose variance may be huge. So no difference of large numbers is computed.
+    rate_seen = step.memory * rate + seen * cross
+    disturbance_seen = step.memory * cross + seen * disturbance
+    own = seen * disturbance_seen + step.noise
+    measured = step.memory * rate_seen + own
+    lead = step.reach - seen
+    gap_seen = lead * disturbance_seen + step.with_rate - step.noise
+    gap = lead**2 * disturbance + step.added.rate - 2 * step.with_rate + step.noise
+    later_seen = kept * disturbance_seen + step.with_disturbance
+    gap_later = kept * lead * disturbance + step.added.cross - step.with_disturbance
+    later = kept**2 * disturbance + step.added.disturbance
+    variance = measured + step.sensor
+    weight = jnp.where(is_measured, 1 / variance, 0.0)
+    share = jnp.where(is_measured, step.sensor / variance, 1.0)
+    after = Covariance(
+        step.memory * (share * (measured + 2 * gap_seen) + gap - weight * gap_seen**2),
+        step.memory * (share * later_seen + gap_later - weight * gap_seen * later_seen),
+        later - weight * later_seen**2,
+    )
+    gains = Gains(
+        step.memory * rate_seen * weight,
+        disturbance_seen * weight,
+        step.memory * (own + gap_seen) * weight,
+        later_seen * weight,
+        jnp.where(is_measured, variance, 1.0),
+    )
+    return after, gains
 
 
-def gains_of(observed: Observed, noise: LogNoise, dt: Scalar) -> Gains:
+def gains_of(observed: Observed, noise: LogNoise, dt: Scalar, window: Window = INSTANT) -> Gains:
     """The gains of the filters of all channels."""
-    step = step_of(noise, dt)
+    step = step_of(noise, dt, window)
     first = first_covariance(step, observed.measured.shape[-1])
     return jax.lax.scan(
         lambda p, row: next_gains(p, step, *row), first, (~jnp.isnan(observed.measured), observed.restart)

@@ -26,9 +26,9 @@ from ..models.abstract import AbstractModel
 from ..models.state import Forcing
 from .abstract import AbstractProblem, Stages, Unknowns, Values, WindowUnknowns
 from .filters import Innovations, innovate
-from .gains import LogNoise, Observed, first_noise, is_rate
+from .gains import INSTANT, LogNoise, Observed, Window, first_noise, is_rate
 from .problem import ShootingProblem
-from .scans import Curvature, Parts, Shot, windowed
+from .scans import Curvature, Parts, Shot
 from .segments import Segments, observe_in_segments
 
 # About how many samples a segment has by default, and how many settle its filter.
@@ -106,6 +106,14 @@ class InnovationsProblem(AbstractProblem):
     def channels(self) -> tuple[str, ...]:
         """The names of the compared channels."""
         return tuple(CHANNEL_NAMES[column] for column in self.problem.columns)
+
+    @property
+    def window(self) -> Window:
+        """The part of a sample over which measurements are means, see `Flight.within`."""
+        if self.flight.within is None:
+            return INSTANT
+        length = self.flight.averaging_time
+        return Window((self.flight.dt - length) / 2, length)
 
     @property
     def cut(self) -> Segments:
@@ -225,12 +233,14 @@ class InnovationsProblem(AbstractProblem):
     def _innovations(self) -> Callable[[Parameters, LogNoise], Innovations]:
         """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
         problem, model, observed, forced = self.problem, self.model, self.observed(), self._forced()
-        settings = {"dt": self.flight.dt, "rows": self.cut.rows, "forcing_parameters": model.forcing_parameters}
+        settings = {"dt": self.flight.dt, "window": self.window, "rows": self.cut.rows}
+        settings |= {"forcing_parameters": model.forcing_parameters}
 
         def at(parameters: Parameters, noise: LogNoise) -> Innovations:
             forcing, tangents = forced(parameters)
             data = observed, forcing, parameters, noise
-            return innovate(problem.step, model.observe, *data, forcing_tangents=tangents, **settings)
+            functions = problem.advance, problem.average, model.observe
+            return innovate(functions, *data, forcing_tangents=tangents, **settings)
 
         return at
 
@@ -242,12 +252,15 @@ class InnovationsProblem(AbstractProblem):
         def segments_last(forcing: Forcing) -> Forcing:
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
 
+        def of(parameters: Parameters) -> Forcing:
+            return self.model.mean_forcing(inputs, parameters, samples)
+
         if not self.model.forcing_parameters:
-            known = segments_last(windowed(self.model.forcing(inputs, self.model.alpha), samples))
+            known = segments_last(of(self.model.alpha))
             return lambda parameters: (known, None)
 
         def forced(parameters: Parameters) -> tuple[Forcing, Forcing | None]:
-            forcing, tangents = problem.forcing_and_tangents(parameters, inputs, samples)
+            forcing, tangents = problem.forcing_and_tangents(of, parameters)
             return segments_last(forcing), segments_last(tangents)
 
         return forced

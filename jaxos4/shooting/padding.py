@@ -59,4 +59,5 @@ def pad_flight(flight: Flight, capacity: int) -> Flight:
         body_velocity=pad(flight.body_velocity),
         stretch=pad(flight.stretch),
         voltage=pad(flight.voltage),
+        within=pad(flight.within),
     )

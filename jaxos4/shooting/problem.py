@@ -11,14 +11,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialState, InitialStates, Numeric, Parameters, Scalar, StateVector, as_float
+from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
+from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
-from ..simulation import STEPPERS
+from ..simulation import STEPPERS, midpoint_step
 from .abstract import AbstractProblem, Stages, Unknowns
 from .scans import Curvature, Length, Rows, Shot, each_window, predict_window, shoot, shoot_with_derivatives, windowed
 from .stages import ROUNDING, shooting_stages
@@ -174,19 +174,21 @@ class ShootingProblem(AbstractProblem):
         rows, inputs, index = self.rows(), self.flight.inputs, self.cut()[0]
 
         def forced(parameters: Parameters) -> Rows:
-            forcing, tangents = self.forcing_and_tangents(parameters, inputs, index)
+            forcing, tangents = self.forcing_and_tangents(
+                lambda values: windowed(self.model.forcing(inputs, values), index), parameters
+            )
             return rows._replace(forcing=forcing, forcing_tangents=tangents)
 
         return forced if self.model.forcing_parameters else lambda parameters: rows
 
     def forcing_and_tangents(
-        self, parameters: Parameters, inputs: Inputs, index: Int[Numeric, "windows length"]
+        self, of: Callable[[Parameters], Forcing], parameters: Parameters
     ) -> tuple[Forcing, Forcing]:
-        """The forcing of each window, and its derivatives. `index`: the samples of each window."""
+        """The forcing that is a function `of` the parameters, and its derivatives in `Model.forcing_parameters`."""
         positions = np.asarray(self.model.forcing_parameters, dtype=int)
 
         def forcing(values: Float[Array, " positions"]) -> tuple[Forcing, Forcing]:
-            new = windowed(self.model.forcing(inputs, parameters.at[positions].set(values)), index)
+            new = of(parameters.at[positions].set(values))
             return new._replace(recording=(), velocity=None), new  # no parameter changes these fields
 
         slopes, new = jax.jacfwd(forcing, has_aux=True)(parameters[positions])
@@ -310,6 +312,20 @@ class ShootingProblem(AbstractProblem):
     def step(self, state: State, forcing: Forcing, parameters) -> State:
         """The state one sample later, down to the same level of the cascade."""
         return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
+
+    def average(self, state: State, forcing: Forcing, parameters) -> State:
+        """The mean over what a measurement averages, from the rates at the beginning of a sample."""
+        if forcing.early is None:  # measured at the beginning
+            return state
+        early = forcing.early._replace(recording=forcing.recording, velocity=forcing.velocity)
+        slope = self.model.angular_acceleration(state.rates, early, parameters)
+        return State(jax.tree.map(lambda x, dx: x + self.flight.dt / 2 * dx, state.rates, slope))
+
+    def advance(self, state: State, forcing: Forcing, parameters) -> State:
+        """The rates one sample later: by the midpoint rule if measurements are means, else by the problem's method."""
+        if forcing.early is None:
+            return self.step(state, forcing, parameters)
+        return midpoint_step(self.model, state, forcing, parameters, self.flight.dt)
 
     def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
         """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
