@@ -15,7 +15,7 @@ from ..models.abstract import PARAMETER_NAMES
 from ..models.os4 import CorrectedOS4
 from ..models.state import CASCADE_ORDER
 from ..shooting import ShootingProblem
-from .fit import Fit
+from .fit import NEGATIVE_NOTE, Fit
 from .prepare import Case
 from .results import ChannelFit, Constant, ParameterEstimate, RigidBody, finite_or_none
 
@@ -25,9 +25,6 @@ INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
 AXES = {"p": "roll", "q": "pitch", "r": "yaw"}
 # The scale of an accelerometer, with what forward flight adds to the lift of rotors, is known to 1 %.
 _SCALE = 0.01
-# Noise of measured rotor speeds may be this share of the changes of the rotors' torque in a sample. It makes moments of
-# inertia too large, by two to three times the share in simulated flights.
-NOISY, _TOO_LARGE = 0.05, 2.5
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
 _UNKNOWN = 1e3
 # A factor of an interval from this one on is noted: it is printed with one decimal.
@@ -47,6 +44,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
     prior = GAUSSIAN_PRIOR if case.is_vehicle else case.estimator.prior
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
     reasons = dict.fromkeys(unknowns.names, "not identifiable from this flight")
+    least = [0.0 if name in fit.negative else -np.inf for name in unknowns.names]
     limits = dict.fromkeys(unknowns.names, msgspec.UNSET if case.is_vehicle else None)
     if fit.evaluation is not None:
         information = identifiability(fit.evaluation, unknowns.bracket)
@@ -58,7 +56,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
             estimate=float(values[i]) if identifiable[i] else None,
             std=finite_or_none(std[i]),
             bound=finite_or_none(fit.bound[i]),
-            ci95=(float(values[i] - width[i]), float(values[i] + width[i])) if identifiable[i] else None,
+            ci95=(max(float(values[i] - width[i]), least[i]), float(values[i] + width[i])) if identifiable[i] else None,
             unit=unknowns.units[i],
             note=_note(fit, i, float(width[i])) if identifiable[i] else reasons[name],
             noise_limit=limits[name],
@@ -75,6 +73,8 @@ def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
 def _note(fit: Fit, i: int, half_width: float) -> str:
     value, seed = float(np.asarray(fit.estimate.parameters)[i]), fit.estimate.seed
     bracket = fit.problem.unknowns.bracket
+    if fit.problem.unknowns.names[i] in fit.negative:
+        return NEGATIVE_NOTE
     notes = ["below noise"] if abs(value) < half_width else []
     if not np.asarray(bracket.lower)[i] <= value <= np.asarray(bracket.upper)[i]:
         notes.append("outside its bracket")
@@ -119,11 +119,8 @@ def rigid_body(fit: Fit) -> RigidBody:
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
 
-def vehicle_constants(fit: Fit, speed_noise: float = 0.0) -> RigidBody:
-    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated.
-
-    `speed_noise`: see `SampleTime`; up to `NOISY` it widens the intervals.
-    """
+def vehicle_constants(fit: Fit) -> RigidBody:
+    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated."""
     model, free, values = fit.problem.model, fit.free, np.asarray(fit.estimate.parameters)
     known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), fit.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
@@ -137,7 +134,7 @@ def vehicle_constants(fit: Fit, speed_noise: float = 0.0) -> RigidBody:
     unknown = np.where(known, 0.0, (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(unknown)
     # What no likelihood sees makes all moments of inertia wrong by one factor.
-    scale = np.hypot(_SCALE * bool(gains), _TOO_LARGE * min(speed_noise, NOISY))
+    scale = _SCALE * bool(gains)
     shared = scale * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
     covariance += shared[:, None] * shared
     constants, thrust = {}, "mass" if gains else "thrust_coefficient"

@@ -40,7 +40,7 @@ _MOST, _FEWEST = 20, 4
 # The chance that parts of a flight that the model explains are taken to disagree.
 _CHANCE = 0.05
 PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
-_NEGATIVE_NOTE = "came out negative, which is impossible"
+NEGATIVE_NOTE = "came out negative, which is impossible; at the limit"
 _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 
 
@@ -53,8 +53,8 @@ class Fit(NamedTuple):
     - `rollouts`: of all searches together.
     - `diagnostics`: of the residuals; `evaluation`: the flight simulated at the estimate. `None` without an answer, and
       for innovations.
-    - `held`: parameters of a vehicle that are not estimated. `negative`: value and standard deviation of those that are
-      held at 0 because they came out negative.
+    - `held`: parameters of a vehicle that are not estimated. `negative`: value and standard deviation of those that
+      came out negative, and so are 0; the other intervals allow for their standard deviation.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `profiled`: by which factor the profile of the likelihood made an interval longer, by parameter.
     - `is_lowest`: false if the cost is known to be lower elsewhere.
@@ -161,11 +161,12 @@ def fit_innovations(
     - `first`: the estimate of all parameters, if it was computed before.
     """
     own, names = problem.problem.unknowns, problem.model.parameter_names
-    problem, found, rollouts, notes, negative = _searched(estimator, problem, first, progress)
+    problem, found, rollouts, notes, negative, freed = _searched(estimator, problem, first, progress)
     progress("computing errors")
-    values, std = np.asarray(found.parameters), _std(found)[: own.count]
+    values, covariance = np.asarray(found.parameters), np.asarray(found.covariance) + freed
+    std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))[: own.count]
     noise = problem.noise(values)
-    free, factor = np.flatnonzero(~np.isin(names, list(notes))), np.ones(values.size)
+    free, factor = np.flatnonzero(~np.isin(names, [*notes, *negative])), np.ones(values.size)
     if has_answer(found):
         factor[free] = _widening(problem, found, free, recording)
         notes = dict.fromkeys(not_identifiable(problem, factor[: own.count] * std), PRIOR_NOTE) | notes
@@ -174,7 +175,7 @@ def fit_innovations(
         for i, name in enumerate(names)
         if name in notes
     }
-    spread = as_float(np.asarray(found.covariance) * np.outer(factor, factor))
+    spread = as_float(covariance * np.outer(factor, factor))
     shooting = problem.problem if shooting is None else shooting
     sigma = np.array(shooting.sigma)
     sigma[shooting.columns] = np.exp(noise.sensor)
@@ -202,11 +203,12 @@ def not_identifiable(problem: InnovationsProblem, std: Float[np.ndarray, " param
 
 def _searched(
     estimator: AbstractEstimator, problem: InnovationsProblem, first: Estimate | None, progress: Progress
-) -> tuple[InnovationsProblem, Estimate, int, dict[str, str], dict[str, tuple[float, float]]]:
+) -> tuple[InnovationsProblem, Estimate, int, dict[str, str], dict[str, tuple[float, float]], np.ndarray]:
     """The problem with some parameters held at values that the flights do not contradict, and its estimate.
 
-    **Returns:** also the rollouts of all searches, why each of these parameters is held, and the value and standard
-    deviation of those that came out negative.
+    **Returns:** also the rollouts of all searches, why parameters are held at their plain value, the value and standard
+    deviation of those that came out negative and are held at 0, and the covariance that these would add if they were
+    free.
     """
     table, rollouts = problem.model.parameters, 0 if first is None else int(first.rollouts)
 
@@ -223,12 +225,16 @@ def _searched(
         progress("compiling, and fitting parameters and disturbances")
         first = search(problem)
     found, fixed, negative = first, {}, {}
+    freed = np.zeros(np.shape(first.covariance))
     if has_answer(found):
         rows = _with_values(table, found)
         negative = {row.name: (x, std) for row, x, std in rows if row.nonnegative and x < -_NEGATIVE * std}
     if negative:
         progress("fitting again without what came out negative")
-        problem, fixed = holding(dict.fromkeys(negative, 0.0)), dict.fromkeys(negative, _NEGATIVE_NOTE)
+        places = [problem.unknowns.names.index(name) for name in negative]
+        covariance = np.asarray(found.covariance)
+        freed = covariance[:, places] @ np.linalg.pinv(covariance[np.ix_(places, places)]) @ covariance[places]
+        problem = holding(dict.fromkeys(negative, 0.0))
         found = search(problem)
     plain = {
         row.name: row.plain
@@ -242,7 +248,7 @@ def _searched(
         rise = float(other.cost) + bracket_cost(problem.problem.unknowns, plain) - float(found.cost)
         if has_answer(other) and rise < _CLEARLY:
             problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
-    return problem, found, rollouts, fixed, negative
+    return problem, found, rollouts, fixed, negative, freed
 
 
 def bracket_cost(unknowns: Unknowns, values: Mapping[str, float]) -> float:

@@ -76,8 +76,10 @@ def identify(
     common = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other}
     sample_times: tuple[SampleTime, ...] = ()
     if isinstance(subject, Airframe):
-        cases = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **common)
-        case, fit, sample_times = _fit_vehicle(cases, estimator or DEFAULT, seed=seed, progress=progress)
+        wanted = own_settings(VehicleSettings, settings)
+        cases = prepare_vehicle(recordings, subject, wanted, **common)
+        choose, method = wanted.sample_time is None, estimator or DEFAULT
+        case, fit, sample_times = _fit_vehicle(cases, method, choose=choose, seed=seed, progress=progress)
     else:
         own = own_settings(FlightSettings, settings)
         case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
@@ -87,20 +89,25 @@ def identify(
 
 
 def _fit_vehicle(
-    cases: Sequence[Case], estimator: str | AbstractEstimator, *, seed: int, progress: Callable[[str], None]
+    cases: Sequence[Case],
+    estimator: str | AbstractEstimator,
+    *,
+    choose: bool,
+    seed: int,
+    progress: Callable[[str], None],
 ) -> tuple[Case, Fit, tuple[SampleTime, ...]]:
     """The case at the chosen sample time and its fit. Newton's method compares several sample times."""
     place, fit, sample_times = 0, None, ()
     is_default = isinstance(estimator, str) and estimator == DEFAULT
     if is_default or len(cases) > 1:
-        place, fit, sample_times = fit_at_sample_times(cases, progress=progress)
+        place, fit, sample_times = fit_at_sample_times(cases, choose=choose, progress=progress)
     case = cases[place]
     if fit is None or not is_default:
         case = with_estimator(case, estimator, seed=seed, progress=progress)
         fit = fit_case(case, progress=progress)
     before, fit = fit, with_profile(fit, case, progress=progress)
     # The row of the chosen sample time shows the final answer.
-    answer = answer_of(case, fit, cases[0].shooting.flight)
+    answer = answer_of(case, fit)
     if fit.searched is not before.searched:  # the other rows have the minimum that was left
         return case, fit, (answer,)
     return case, fit, (*sample_times[:place], answer, *sample_times[place + 1 :])

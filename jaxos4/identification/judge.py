@@ -15,7 +15,7 @@ from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
 from ..shooting import with_room
-from .answers import AXES, INVERSE, NOISY, overwhelmed, parameter_table, rigid_body, vehicle_constants
+from .answers import AXES, INVERSE, overwhelmed, parameter_table, rigid_body, vehicle_constants
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
@@ -255,8 +255,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         other = None if held_out is None else validate_on(fit, held_out, case.validate)
         return {"parameters": table, "rigid_body": rigid_body(fit), "validation": other}
     step = float(fit.problem.flight.dt)
-    noise = next(each.speed_noise for each in sample_times if each.sample_time == step)
-    body = vehicle_constants(fit, noise)
+    body = vehicle_constants(fit)
     predicted = skill = None
     if held_out is not None:
         progress("predicting what was not fitted")
@@ -279,8 +278,8 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         notes.append(f"Iz is not identified: {yaw}; fly more yaw, or in calmer air")
     own = fit.problem.unknowns
     widths = dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))
-    # One that is held at 0 came out negative. What is known of another held one is its bracket.
-    held = {name: fit.negative.get(name, (row.value, widths[name])) for name, row in fit.held.items()}
+    # What is known of a held one is its bracket.
+    held = {name: (row.value, widths[name]) for name, row in fit.held.items()} | fit.negative
     doubts = (
         *(() if fit.is_lowest else (_NOT_LOWEST,)),
         *(_implausible(cause, remedy) for cause, remedy in case.doubts),
@@ -288,9 +287,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         *(doubt for _, doubt in _contradicted(fit.problem.model, held)),
         *doubts_of(fit.problem.model, trusted, body.constants, skill, still, case.log_step),
     )
-    what = f"measured rotor speeds are noisy: noise is {noise:.0%} of their changes in a sample"
-    noisy = [_implausible(what, "give longer samples by `sample_time`, or log the speeds better")] * (noise > NOISY)
-    doubts += (*vibration(fit.disturbances, step), *noisy, *_moved(sample_times, step, body))
+    doubts += (*vibration(fit.disturbances, step), *_moved(sample_times, step, body))
     values = as_float(np.asarray(fit.estimate.parameters)[: own.count])
     return {
         "parameters": table,

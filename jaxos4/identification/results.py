@@ -141,14 +141,12 @@ class SampleTime(msgspec.Struct, frozen=True):
     """The moments of inertia of a vehicle at one sample time [s].
 
     - `correlation`: the largest of the innovations of a body rate. `samples`: how many innovations of a rate count.
-    - `speed_noise`: the share of noise in the changes of measured rotor speeds from sample to sample.
     """
 
     sample_time: float
     constants: dict[str, Constant]
     correlation: float
     samples: int
-    speed_noise: float = 0.0
 
 
 class Doubt(msgspec.Struct, frozen=True):

@@ -1,11 +1,11 @@
 """The sample time of a vehicle's fit: the shortest at which the answer does not depend on it.
 
-Short samples contain the vibration of the sensors and the noise of measured rotor speeds. Long samples hide motion. The
-flight is fitted at several sample times, from the longest on.
+Short samples contain the vibration of the sensors. Long samples hide motion. The flight is fitted at several sample
+times, from the longest on. A sample time that the user gives is fitted in the same way, and longer ones beside it.
 
-The rule: the shortest sample time at which innovations are nearly white, measured rotor speeds have little noise, and
-the moments of inertia are those of samples twice as long, within two standard deviations. If there is none: the
-shortest without vibration and noise. If all have it: the longest with an answer.
+The rule: the shortest sample time at which the innovations of all channels are nearly white, and the moments of inertia
+are those of samples twice as long, within two standard deviations, and known nearly as well. If there is none: the
+shortest without vibration. If all have it: the longest with an answer.
 """
 
 import math
@@ -16,28 +16,30 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..airframe import Airframe
 from ..estimate import REACH, Estimate
-from ..flight import Flight
 from ..results import result_names
 from ..shooting import InnovationsProblem, for_threads
-from .answers import AXES, NOISY, overwhelmed, vehicle_constants
+from .answers import overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
 from .held_out import compile_ahead
 from .prepare import Case, Progress
 from .results import Constant, SampleTime, has_answer
 
-# The limit of a correlation of white innovations: the first number plus so many standard errors. The largest of 24
-# correlations (3 rates, 8 lags) is compared.
+# The limit of a correlation of white innovations: the first number plus so many standard errors. The largest of some 30
+# correlations (3 rates, a specific force or more, 8 lags) is compared.
 WHITE, _CHANCE = 0.06, 3.0
 # Two answers agree within so many standard deviations and this share, which allows for errors of discretisation.
 AGREE, _DISCRETE = 2.0, 0.03
+# Intervals that are longer by this factor than those of samples twice as long agree with anything.
+_WIDER = 1.5
 # The share of the way to its limit at which an unknown counts as being there.
 _NEAR = 0.95
 
 
-def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[int, Fit, tuple[SampleTime, ...]]:
-    """The place of the case that the rule chooses, its fit, and the answers of all.
+def fit_at_sample_times(
+    cases: Sequence[Case], *, choose: bool = True, progress: Progress
+) -> tuple[int, Fit, tuple[SampleTime, ...]]:
+    """The place of the case that the rule chooses, its fit, and the answers of all. If not `choose`: the first place.
 
     The search for all parameters starts at the answer of the sample time before, if that is a minimum. What the flights
     do not show is held beside it, in another thread.
@@ -59,9 +61,8 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
         fits = [fit.result() for fit in fits][::-1]
     finally:  # after an error, what has not begun is not computed
         beside.shutdown(cancel_futures=True)
-    finest = cases[0].shooting.flight
-    answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
-    place = shortest(answers)
+    answers = tuple(map(answer_of, cases, fits))
+    place = shortest(answers) if choose else 0
     return place, fits[place], answers
 
 
@@ -80,27 +81,15 @@ def shortest(answers: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `answers`: the shortest sample time first."""
     answered = [i for i, answer in enumerate(answers) if answer.constants] or [0]
     limits = [WHITE + _CHANCE / math.sqrt(max(answer.samples, 1)) for answer in answers]
-    clean = [i for i in answered if abs(answers[i].correlation) <= limits[i] and answers[i].speed_noise <= NOISY]
-    clean = clean or answered[-1:]
-    return next((i for i in clean[:-1] if not moved(answers[i], answers[i + 1])), clean[0])
+    clean = [i for i in answered if abs(answers[i].correlation) <= limits[i]] or answered[-1:]
+    steady = (i for i in clean[:-1] if not moved(answers[i], answers[i + 1]) and not _vague(answers[i], answers[i + 1]))
+    return next(steady, clean[0])
 
 
-def noise_of_speeds(flight: Flight, finest: Flight, airframe: Airframe) -> float:
-    """The share of white noise in the changes of the rotors' roll or pitch torque from sample to sample.
-
-    Commands have no noise. White noise has second differences of 6 times its variance, and first differences of twice.
-    Its variance falls as samples of `finest` are averaged to longer ones. There the rotors are smoother.
-    """
-    if flight.commanded:
-        return 0.0
-    mixer = np.asarray(airframe.mixer, dtype=float)[:2].T
-
-    def median_square(each: Flight, order: int) -> np.ndarray:
-        return np.median(np.abs(np.diff(np.square(np.asarray(each.omega)) @ mixer, order, axis=0)), axis=0) ** 2
-
-    changes = median_square(flight, 1)
-    noise = median_square(finest, 2) / 6 * float(finest.dt) / float(flight.dt)
-    return float(np.max(2 * noise / np.where(changes > 0, changes, np.inf)))
+def _vague(answer: SampleTime, other: SampleTime) -> bool:
+    """Whether another sample time knows Ix or Iy clearly better."""
+    both = [name for name in ("Ix", "Iy") if name in answer.constants and name in other.constants]
+    return any(answer.constants[name].std > _WIDER * other.constants[name].std for name in both)
 
 
 def moved(answer: SampleTime, other: SampleTime) -> list[str]:
@@ -113,21 +102,16 @@ def moved(answer: SampleTime, other: SampleTime) -> list[str]:
     return [name for name in both if differs(answer.constants[name], other.constants[name])]
 
 
-def answer_of(case: Case, fit: Fit, finest: Flight) -> SampleTime:
-    """The answer of one sample time. `finest`: the flight with the shortest samples.
-
-    Without a thrust there is no scale of torques, and so no answer.
-    """
+def answer_of(case: Case, fit: Fit) -> SampleTime:
+    """The answer of one sample time. Without a thrust there is no scale of torques, and so no answer."""
     scales = [each.name for each in fit.problem.model.parameters if each.scales_torque]
     answered = fit.answered and not any(name in fit.held for name in scales)
-    flight = case.shooting.flight
-    noise = noise_of_speeds(flight, finest, fit.problem.model.airframe)
-    constants = vehicle_constants(fit, noise).constants if answered else {}
+    constants = vehicle_constants(fit).constants if answered else {}
     if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
-    correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
+    correlations = [row.correlation for row in fit.disturbances.values()] if fit.answered else []
     largest, samples = max(correlations, key=abs, default=1.0), 0
     if fit.answered and fit.estimate.parts is not None:
-        # The sum of the squares of the innovations of a body rate, which have a mean of 1.
-        samples = round(float(np.asarray(fit.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))
-    return SampleTime(float(flight.dt), constants, largest, samples, noise)
+        # The mean of the sums of the squares of innovations, each of which has a mean of 1.
+        samples = round(float(np.asarray(fit.estimate.parts.products)[:, :, 0].sum(axis=0).mean()))
+    return SampleTime(float(case.shooting.flight.dt), constants, largest, samples)

@@ -145,7 +145,9 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) 
     seconds = float(room.fitted.dt) * room.fitted.time.shape[0]
     most = _SEGMENTS * max(recordings // _FEW_RECORDINGS, 1)
     segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 1, most))
-    return InnovationsProblem(with_room(shooting, capacity_of(room.fitted.time.shape[0])), segments=segments)
+    least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
+    padded = with_room(shooting, capacity_of(room.fitted.time.shape[0]))
+    return InnovationsProblem(padded, segments=segments, least_noise=least_noise)
 
 
 def _held_out(

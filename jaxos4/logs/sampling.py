@@ -16,7 +16,7 @@ _FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
 _MEASURED = 0.45  # of a longer sample must be measured: below one half, because the ends have half of their rows
 _DISORDER = 0.01  # share of samples that may be late or repeated in an intact log
 _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
-_PAUSE = 1.0  # [s]; a longer time between samples is a pause of the log, and not its rate
+_PAUSE = 0.9  # [s]; a longer time between samples is a pause of the log, and not its rate
 _FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up to this share, are a rate
 
 Times = Float[np.ndarray, " samples"]
@@ -100,9 +100,10 @@ def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Calla
     """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
 
     Each measurement becomes the mean over a sample around its time, which removes vibration above the new rate without
-    a delay. It is missing (NaN) if less than about half of that time was measured. Each rotor speed becomes the root
-    mean square over the sample that follows. `t`: times [s]; `omega`: rotor speeds [rad/s], `held` from row to row, or
-    those at the times.
+    a delay. The first sample begins half of a row before the first row, so that whole rows are averaged, and samples
+    share none, if their length is a multiple of the rows' step. A measurement is missing (NaN) if less than about half
+    of that time was measured. Each rotor speed becomes the root mean square over the sample that follows. `t`: times
+    [s]; `omega`: rotor speeds [rad/s], `held` from row to row, or those at the times.
     """
     own = (t[-1] - t[0]) / (t.size - 1)
     measured = np.isfinite(channels)
@@ -112,8 +113,9 @@ def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Calla
     speeds = root_mean_square(Series(t, omega), linear=not held)
 
     def average(dt: float) -> Resampled:
-        grid = _grid(t, dt)
-        edges = np.minimum(np.append(grid - dt / 2, grid[-1] + dt / 2), t[-1] + own / 2)
+        samples = max(math.floor((t[-1] - t[0] + own) / dt + UNIFORM), 1)
+        edges = np.minimum(t[0] - own / 2 + dt * np.arange(samples + 1), t[-1] + own / 2)
+        grid = t[0] - own / 2 + dt * (np.arange(samples) + 0.5)
         covered = np.repeat(np.diff(np.maximum(edges, t[0] - own / 2))[:, None], channels.shape[1], axis=1)
         covered[:, some & gaps] = np.diff(share(edges), axis=0)
         means = np.full((grid.size, channels.shape[1]), np.nan)

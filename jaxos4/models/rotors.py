@@ -37,6 +37,7 @@ class Grid(NamedTuple):
     elapsed: Float[Array, " samples"]
     voltage: Float[Array, " samples"] | None = None
     are_parts: bool = False
+    at_instants: Bool[Array, ""] | bool = True
 
     @classmethod
     def of(
@@ -50,11 +51,13 @@ class Grid(NamedTuple):
         recording, elapsed = jnp.asarray(recordings)[stretch], inputs.dt * jnp.arange(samples)
         if max(recordings) > 0:
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
-        return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts)
+        return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts, inputs.averaging_time == 0)
 
     def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Part":
         """Some samples in a row. `before`: see `Part`."""
-        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.are_parts)
+        return Part(
+            self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.are_parts, self.at_instants
+        )
 
 
 class Part(NamedTuple):
@@ -70,6 +73,7 @@ class Part(NamedTuple):
     is_last: Bool[Array, " rows"]
     before: Float[Array, "4"]
     are_parts: bool = False
+    at_instants: Bool[Array, ""] | bool = True
 
 
 class Speeds(NamedTuple):
@@ -83,13 +87,16 @@ class Speeds(NamedTuple):
 def measured_speeds(omega: Commands, part: Part) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing.
 
-    Means over parts of a sample change as those of the parts around them.
+    Means over parts of a sample change as those of the parts around them. If measurements are `at_instants`, later parts
+    do not count: they hold the controller's answer to the noise of the measurement.
     """
     speed = omega(part.rows)
     following = omega(jnp.where(part.is_last, part.rows, part.rows + 1))
     if not part.are_parts:
         return Speeds(speed, speed, following - speed)
-    return Speeds(speed, speed, (following - omega(jnp.where(part.is_first, part.rows, part.rows - 1))) / 2)
+    before, earlier = (omega(jnp.where(part.is_first, part.rows, jnp.maximum(part.rows - i, 0))) for i in (1, 2))
+    so_far, around = (3 * speed - 4 * before + earlier) / 2, (following - before) / 2
+    return Speeds(speed, speed, jnp.where(part.at_instants, so_far, around))
 
 
 def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
@@ -107,24 +114,27 @@ def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
 def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
     """Commands that act `delay` [s] later. Before a stretch its first command acts, and after it its last one.
 
-    Cubics interpolate between samples (Catmull and Rom 1974): a delay of whole samples is exact, and the derivative in
-    the delay has no jumps at which a search could end.
+    Hermite's cubics interpolate between samples, with slopes from the samples before: a delay of whole samples is
+    exact, nothing acts before its time, and the derivative in the delay has no jumps at which a search could end.
     """
     count, samples = grid.first.shape[0], delay / grid.dt
     floor = jnp.floor(jax.lax.stop_gradient(samples))
-    f = samples - floor
+    s = 1 - (samples - floor)  # of the way from one sample to the next
+    values = (1 - s) ** 2 * (1 + 2 * s), s**2 * (3 - 2 * s)
+    slopes = s * (1 - s) ** 2, s**2 * (s - 1)
+    # From the newest sample to the oldest. The slope at a sample is (3, -4, 1) / 2 of it and the two before.
     weights = jnp.stack(
         [
-            f * (-0.5 + f - f * f / 2),
-            1 + f * f * (1.5 * f - 2.5),
-            f * (0.5 + 2 * f - 1.5 * f * f),
-            f * f * (f - 1) / 2,
+            values[1] + 1.5 * slopes[1],
+            values[0] - 2 * slopes[1] + 1.5 * slopes[0],
+            0.5 * slopes[1] - 2 * slopes[0],
+            0.5 * slopes[0],
         ]
     )
     shift = jnp.clip(floor, -count, count).astype(int)
 
     def at(rows: Int[Array, "*rows"]) -> Float[Array, "*rows 4"]:
-        near = rows - shift + np.array([1, 0, -1, -2])[:, None]
+        near = rows - shift - np.arange(4)[:, None]
         return jnp.tensordot(weights, omega(jnp.clip(near, grid.first[rows], grid.last[rows])), 1)
 
     return at

@@ -113,6 +113,12 @@ def _reaction(airframe: Airframe) -> Scalar:
     return jnp.asarray(airframe.rotor_inertia) / jnp.asarray(airframe.inertia)[2]
 
 
+def _unsure_reaction(airframe: Airframe) -> Scalar:
+    """Twice the airframe's value, because moments of inertia of rotors are estimated; wide if it has none."""
+    known = _reaction(airframe)
+    return jnp.where(known > 0, 2 * known, 0.01)
+
+
 def _limits(*limits: tuple[float, float, str, str]) -> Contradiction:
     """The cause and the remedy of the first limit (least, most, cause, remedy) broken by more than the error."""
 
@@ -258,7 +264,7 @@ TERMS: dict[str, Term] = {
     ),
     "reaction": Term(
         "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
-        (Parameter("rotor_reaction", "1", lambda frame: 0.01 + _reaction(frame), center=_reaction, nonnegative=True),),
+        (Parameter("rotor_reaction", "1", _unsure_reaction, center=_reaction, nonnegative=True),),
         angular_acceleration=_add_reaction,
     ),
     "accelerometer": Term(

@@ -140,11 +140,16 @@ class FlightModel(AbstractModel):
         """The forcing over each sample around its time, as `Flight.within` has the rotor speeds."""
         if inputs.within is None:
             return super().mean_forcing(inputs, parameters, place)
-        (samples, parts, _), is_mean = inputs.within.shape, jnp.asarray(inputs.averaging_time) > 0
-        number = np.arange(parts)
-        # By the time that is left in the sample. Before an instant in the middle, the first half alone counts.
-        left = jnp.where(is_mean, (2 * parts - 1 - 2 * number) / parts**2, 2 / parts * (number < parts // 2))
-        seen = jnp.where(is_mean, 1 / parts, (abs(number - (parts - 1) / 2) < 1) / 2)
+        samples, parts, _ = inputs.within.shape
+        edges, length = np.linspace(0, 1, parts + 1), jnp.asarray(inputs.averaging_time) / inputs.dt
+        after = jnp.clip(edges - (1 - length) / 2, 0, length)  # begin of the window
+        # The share of the measurement's rows that are left after a time: its integral over each part, doubled.
+        rows = jnp.round(1 / jnp.sqrt(jnp.maximum(1 - length**2, 1e-6)))
+        many = jnp.minimum(edges, (1 + length) / 2) - after**2 / jnp.where(length > 0, 2 * length, 1.0)
+        few = sum(jnp.where(i < rows, jnp.minimum(edges, (i + 0.5) / rows), 0.0) / rows for i in range(parts - 1))
+        left = 2 * jnp.diff(jnp.where(rows < parts, few, many))
+        wide = jnp.maximum(length, 2 / parts)  # an instant is seen as the parts before and after it
+        seen = jnp.diff(jnp.clip(edges - (1 - wide) / 2, 0, wide)) / wide
         fine = self._rotors(inputs.divided, parameters, are_parts=True)
         fine = jax.tree.map(lambda leaf: leaf.reshape(samples, parts), fine)
         whole, early = jax.tree.map(lambda leaf: leaf.mean(axis=1), fine), jax.tree.map(lambda leaf: leaf @ left, fine)

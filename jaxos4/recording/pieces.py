@@ -1,5 +1,6 @@
 """Flights as recordings, and their pieces: cut, averaged, joined, divided into measurements to fit and to predict."""
 
+import math
 import os
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -112,7 +113,8 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
             stretch=None,
             held=True,
             within=within(time, dt),
-            averaging_time=dt,
+            # Means of as many instants have the same variance in time as a mean over this time.
+            averaging_time=dt * math.sqrt(1 - (flight.dt / dt) ** 2),
         )
 
     return [at(dt) for dt in steps]

@@ -12,8 +12,9 @@ from ..errors import InputError, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
-from .motion import opposite_axes, refused_note, yaw_doubt
+from .motion import opposite_axes, refused_note, white_noise, yaw_doubt
 from .pieces import Recording, Stretch, averaged, cut, hold_out, joined, whole_windows
+from .speed_noise import without_noise
 from .usable import nothing_usable, stretches
 from .velocity import Ups, measures_velocity, velocity_of
 
@@ -27,10 +28,17 @@ _MOST_REASONS = 3
 _FEWEST_SAMPLES = 4
 # Sample times that differ by less than this factor count as equal.
 _NEARLY_EQUAL = 1.01
+# A sample time that the user gives becomes a multiple of the log's if that changes it by less than this share.
+_NEARLY_WHOLE = 0.05
+# The least noise of an accelerometer as a share of that by second differences, and the smallest change that is no
+# rounding error as a share of the largest value.
+_SHARE, _ROUNDING = 0.5, 1e-6
 # The velocity that a stretch gains [m/s], and the share of the weight that is not carried by other causes.
 _GAINED, _CARRIED = 1.0, 0.003
 # The least mean cosine of the tilt of a vehicle whose weight says how its accelerometer errs.
 _LEAST_UPRIGHT = 0.5
+# Noise of rotor speeds is noted from this share of their changes on.
+_NOISY = 0.1
 # The share of time of a rotor at its limit, and how close to full speed that is.
 _OFTEN, _FULL = 0.01, 0.999
 
@@ -46,6 +54,7 @@ class Prepared(NamedTuple):
     - `available`: what every recording offers to the terms of a model, see `Term.needs`.
     - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `_level`.
       `None`: unknown.
+    - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
     - `doubts`: cause and remedy of each doubt about the logs.
@@ -59,6 +68,7 @@ class Prepared(NamedTuple):
     length: int
     available: frozenset[str]
     level: tuple[float, float] | None
+    force_noise: Float[np.ndarray, "3"]
     seconds: tuple[float, float]
     notes: tuple[str, ...]
     doubts: tuple[tuple[str, str], ...]
@@ -90,8 +100,8 @@ def prepare(
     `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors, and
     messages do not name options of the fit.
 
-    **Returns:** the flight, averaged to `sample_time`; without it, to each sample time at which an answer is compared
-    with the others, the shortest first.
+    **Returns:** the flight, averaged to `sample_time`, by default the shortest, and to each longer one at which an
+    answer is compared with the others.
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
@@ -133,11 +143,20 @@ def prepare(
             )
         raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
     shortest = max(SAMPLE_TIME if sample_time is None else sample_time, slowest)
-    doublings = math.floor(math.log2(LONGEST_SAMPLE_TIME * _NEARLY_EQUAL / shortest)) if sample_time is None else 0
+    whole = max(round(shortest / slowest), 1) * slowest
+    if not predicted and (sample_time is None or abs(whole - shortest) < _NEARLY_WHOLE * shortest):
+        shortest = whole  # samples of whole rows
+    doublings = 0 if predicted else math.floor(math.log2(LONGEST_SAMPLE_TIME * _NEARLY_EQUAL / shortest))
     steps = [shortest * 2**k for k in range(max(doublings, 0) + 1)]
+    numbers, smooth = [number for number, _ in parts], []
+    for number, recording in enumerate(recordings):
+        own, noise, share = without_noise([piece for i, piece in parts if i == number], airframe)
+        smooth += own
+        if share > _NOISY:
+            how = f"white noise of {noise:.2g} rad/s, {share:.0%} of their changes from sample to sample"
+            notes.append(f"{recording.name}: rotor speeds have {how}; their expected values are used")
     about = tuple(notes), tuple(doubts), slowest
-    coarse = [averaged(piece, steps) for _, piece in parts]
-    numbers = [number for number, _ in parts]
+    coarse = [averaged(piece, steps) for piece in smooth]
     return tuple(
         _sampled(recordings, [*zip(numbers, pieces, strict=True)], airframe, step, holdout, about)
         for step, *pieces in zip(steps, *coarse, strict=True)
@@ -185,6 +204,7 @@ def _sampled(
         length,
         _available_inputs(whole, pieces, airframe),
         _level(fitted, ups, float(airframe.gravity)) if ups else None,
+        np.min([_force_noise(recording, step) for recording in recordings], axis=0),
         (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
         *about,
     )
@@ -220,6 +240,20 @@ def _level(fitted: Recording, every: Sequence[Ups], gravity: float) -> tuple[flo
         return None
     gained = _GAINED * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
     return (upright - gravity) / cosine, math.hypot(gained, _CARRIED * gravity, upright - other) / cosine
+
+
+def _force_noise(recording: Recording, step: float) -> Float[np.ndarray, "3"]:
+    """The least white noise of means over samples of `step` [s]: by second differences, and by one count of the sensor.
+
+    Vibration is not smooth from row to row, and so no disturbance. Without this limit, a fit may take it for one.
+    """
+    least, force = np.zeros(3), recording.specific_force
+    for axis, values in enumerate([] if force is None else force.T):
+        size = np.abs(np.diff(values))
+        count = np.min(size[size > _ROUNDING * np.nanmax(np.abs(values), initial=1.0)], initial=np.inf)
+        noise = max(_SHARE * white_noise(values, 2), count if np.isfinite(count) else 0.0)
+        least[axis] = np.nan_to_num(noise) * math.sqrt(min(recording.dt / step, 1.0))
+    return least
 
 
 def _seconds(recording: Recording) -> float:

@@ -60,6 +60,7 @@ class InnovationsProblem(AbstractProblem):
       flights (`ShootingProblem.length`) with equal numbers of segments and equal room share a program, whatever their
       lengths.
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
+    - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
     """
@@ -69,6 +70,7 @@ class InnovationsProblem(AbstractProblem):
     free_size: ClassVar[int] = 0  # pyright: ignore[reportIncompatibleMethodOverride]  # a filter finds its own state
     problem: ShootingProblem
     start: Values = eqx.field(converter=as_float)
+    least_noise: Float[Array, " channels"] = eqx.field(converter=as_float)
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
 
@@ -79,6 +81,7 @@ class InnovationsProblem(AbstractProblem):
         segments: int | None = None,
         settling: int = SETTLING,
         start: Float[ArrayLike, " unknowns"] | None = None,
+        least_noise: Float[ArrayLike, " channels"] | None = None,
     ):
         if segments is None:
             segments = max(round((problem.flight.time.shape[-1] - settling) / _SEGMENT), 1)
@@ -87,8 +90,12 @@ class InnovationsProblem(AbstractProblem):
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
         self.problem, self.segments, self.settling = problem.restrict("rates"), segments, settling
         # An array in any case, so that all starts share one program.
-        unknowns = problem.unknowns.count + 3 * self.problem.columns.size
+        channels = self.problem.columns.size
+        unknowns = problem.unknowns.count + 3 * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
+        self.least_noise = as_float(np.zeros(channels) if least_noise is None else least_noise)
+        if self.least_noise.shape != (channels,):
+            raise ValueError(f"`least_noise` must hold {channels} channels, got shape {self.least_noise.shape}.")
         if self.start.shape != (unknowns,):
             raise ValueError(f"`start` must hold {unknowns} unknowns, got shape {self.start.shape}.")
 
@@ -131,6 +138,7 @@ class InnovationsProblem(AbstractProblem):
         lowest, highest = first - np.log(_NOISE_REACH), first + np.log(_NOISE_REACH)
         shortest = jnp.where(is_rate(first.shape[0]), jnp.log(_SHORTEST * dt), np.log(_FORCE_SHORTEST))
         lowest, highest = lowest.at[:, 1].set(shortest), highest.at[:, 1].set(np.log(_LONGEST))
+        lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(self.least_noise, jnp.finfo(float).tiny)))
         levels = [(f"log_{name}_{level}", "1") for name in self.channels for level in ("strength", "time", "sensor")]
         precision = jnp.full(first.size, NOISE_PRECISION)
         return Unknowns(
