@@ -57,6 +57,7 @@ TOGETHER = (
 LONGEST = (
     *("experiments", "estimators", "vehicle", "experiments_vehicle", "network", "design", "study_resume"),
     *("study_cluster", "startup", "cli", "predict", "closed_loop", "study", "report_browser", "closed_loop_effects"),
+    "means",
     *("programs", "compare", "shooting", "unknowns", "filter_error", "flight_model_fits", "identify", "simulate"),
 )
 

@@ -76,15 +76,15 @@ def fall_and_turn(motion, speeds, change, v):
 
 
 def reference_motion(v, omega, samples, fine=10):
-    """Rates, attitude and velocity at each sample, mean rotor speeds over it, from commands: small midpoint steps."""
+    """Rates, attitude and velocity, and rotor speeds, at each sample, from commands: small midpoint steps."""
     v = jax.tree.map(np.asarray, v)  # JAX takes long for single numbers
     h, lag, delay = DT / fine, float(v.rotor_lag), float(v.rotor_delay)
     weight = float(v.airframe.mass * v.airframe.gravity)
     hover = np.sqrt(np.linalg.solve(np.asarray(v.airframe.mixer), [0, 0, 0, weight]))
-    motion, speeds, motions, means = np.zeros(9), hover, [], []
+    motion, speeds, motions, turning = np.zeros(9), hover, [], []
     for k in range(samples):
         motions.append(motion)
-        sums = np.zeros(4)
+        turning.append(speeds)
         for j in range(fine):
             row = int(np.floor(k + (j + 0.5) / fine - delay / DT))
             u = omega[row] if row >= 0 else hover
@@ -93,10 +93,8 @@ def reference_motion(v, omega, samples, fine=10):
             change = (after - speeds) / h
             half = motion + h / 2 * fall_and_turn(motion, speeds, change, v)
             motion = motion + h * fall_and_turn(half, middle, change, v)
-            sums += (speeds + after) / 2
             speeds = after
-        means.append(sums / fine)
-    return np.array(motions), np.array(means)
+    return np.array(motions), np.array(turning)
 
 
 def reference_commands(v, measured, wanted, inertia):
@@ -142,13 +140,18 @@ def test_the_motion_follows_from_the_commands(rough):
         assert np.abs(measured - reference_motion(wrong, omega, samples)[0]).max() > seen
 
 
-def test_measured_speeds_are_means_over_the_samples():
-    samples = 250
+def test_measured_speeds_are_those_at_the_time_of_the_sample():
+    """The commands at this time act from then on."""
+    samples = 400
     commanded, measured = (fly(loop_of(rotor_lag=0.04, logged=kind), references()) for kind in ("commands", "speeds"))
     assert (commanded.commanded, measured.commanded) == (True, False)
+    assert (commanded.held, measured.held) == (True, False)
     same = loop_of(rotor_lag=0.04, air=jaxos4.Air())
-    _, means = reference_motion(same, np.asarray(commanded.omega), samples)
-    np.testing.assert_allclose(np.asarray(measured.omega)[:samples], means, rtol=1e-5)
+    _, expected = reference_motion(same, np.asarray(commanded.omega), samples + 1)
+    found = np.asarray(measured.omega)[:samples]
+    np.testing.assert_allclose(found, expected[:-1], rtol=1e-5)
+    # The reference sees means over the samples.
+    assert np.abs(found - (expected[:-1] + expected[1:]) / 2).max() > 10
 
 
 def test_commands_follow_from_the_measurements(rough):

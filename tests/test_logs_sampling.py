@@ -9,7 +9,7 @@ from test_logs_ulog import grid
 
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import Table
-from jaxos4.logs.sampling import Series, gyro_rows, resample, root_mean_square
+from jaxos4.logs.sampling import PARTS, Series, gyro_rows, resample, root_mean_square, speeds_within
 
 # Uneven times
 
@@ -23,7 +23,7 @@ def test_resampling_is_second_order():
     errors = []
     for n in (250, 1000):  # a sine, sampled so often in 2 s at uneven times
         t = uneven(n, 2.0 / n)
-        (rows, _, channels), _ = resample(t, np.ones((n, 4)), np.sin(5 * t)[:, None], 2.0 / n)
+        (rows, _, channels), _ = resample(t, np.ones((n, 4)), np.sin(5 * t)[:, None], 2.0 / n, held=True)
         errors.append(np.abs(channels[:, 0] - np.sin(5 * rows)).max())
     assert 1.8 < np.log2(errors[0] / errors[1]) / 2 < 2.3
     assert errors[1] < 25 / 8 * (2 / 1000) ** 2 * 1.4**2
@@ -39,7 +39,7 @@ def test_nothing_is_invented_across_gaps(seed, lost, slow):
     y = np.cumsum(rng.normal(size=60))
     y[rng.random(60) < lost] = np.nan
     y[np.arange(60) % slow != 0] = np.nan
-    (grid, _, channels), _ = resample(t, np.ones((60, 4)), y[:, None], dt)
+    (grid, _, channels), _ = resample(t, np.ones((60, 4)), y[:, None], dt, held=True)
     ts, ys = t[np.isfinite(y)], y[np.isfinite(y)]
     for g, value in zip(grid, channels[:, 0], strict=True):
         if np.isnan(value):
@@ -57,10 +57,13 @@ def test_rows_that_are_missing_from_a_grid_are_not_measured(save):
     assert flight.time.shape == (20,)
     assert np.flatnonzero(np.isnan(p)).tolist() == [5, 11, 12]
     np.testing.assert_allclose(p[~np.isnan(p)], np.delete(np.arange(20.0), [5, 11, 12]), atol=1e-9)
-    np.testing.assert_allclose(flight.omega[[4, 5, 6, 10, 11, 12, 13], 0], [4, 4, 6, 10, 10, 10, 13], rtol=1e-9)
+    # Squares of measured speeds are linear from row to row, also in a gap: means up to the next row.
+    squares = np.interp(np.arange(20.0), np.delete(np.arange(20.0), [5, 11, 12]), p[~np.isnan(p)] ** 2)
+    means = np.append((squares[:-1] + squares[1:]) / 2, squares[-1])
+    np.testing.assert_allclose(flight.omega[:, 0], np.sqrt(means), rtol=1e-9)
     assert len(notes) == 1
     assert "17 rows were resampled to 20 samples, one every 10 ms" in notes[0]
-    assert "2 gaps of up to 30 ms: the 3 samples in gaps hold the rotor speeds" in notes[0]
+    assert "2 gaps of up to 30 ms: the 3 samples in gaps interpolate the rotor speeds" in notes[0]
 
 
 def columns(names, t, *values):
@@ -115,3 +118,29 @@ def test_impulse_is_conserved_whatever_the_rates(seed, measured):
         held = np.column_stack([np.interp(fine, t, column**2) for column in values.T])
     truth = held[:-1].mean(axis=0) * (rows[-1] - rows[0])
     np.testing.assert_allclose((got[:-1] ** 2 * np.diff(rows)[:, None]).sum(axis=0), truth, rtol=1e-3)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_speeds_within_a_sample_are_those_of_its_quarters(held):
+    """Root mean squares from half a sample before a row to half a sample after it, also at the ends of a recording.
+
+    Before the first row speeds are those of the first row, and after the last those of the last.
+    """
+    rng = np.random.default_rng(0)
+    t = 5 + np.cumsum(rng.uniform(0.001, 0.02, 60))
+    omega = rng.uniform(100, 900, (60, 4))
+    dt = (t[-1] - t[0]) / 18.2
+    rows = t[0] + dt * np.arange(19)
+    found = speeds_within(t, omega, held=held)(rows, dt)
+    assert found.shape == (rows.size, PARTS, 4)
+    count = 2000  # in each part
+    fine = rows[0] - dt / 2 + dt / PARTS / count * (np.arange(rows.size * PARTS * count) + 0.5)
+    squares = omega[np.maximum(np.searchsorted(t, fine, side="right") - 1, 0)] ** 2
+    if not held:
+        squares = np.stack([np.interp(fine, t, column**2) for column in omega.T], axis=1)
+    assert fine[0] < t[0] < t[-1] < fine[-1]
+    expected = np.sqrt(squares.reshape(rows.size, PARTS, count, 4).mean(axis=2))
+    np.testing.assert_allclose(found, expected, rtol=2e-3 if held else 1e-5)
+    np.testing.assert_allclose(found[0, : PARTS // 2], omega[[0, 0]], rtol=1e-12)
+    # It sees a shift by a quarter of a sample.
+    assert np.abs(found.reshape(-1, 4)[1:] - expected.reshape(-1, 4)[:-1]).max() > 100

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from helpers import CRAZYFLIE, compiled_programs, forcing_of
+from helpers import CRAZYFLIE, compiled_programs
 from scipy.spatial.transform import Rotation
 
 import jaxos4
@@ -20,7 +20,7 @@ from jaxos4.identification.fit import fit_case
 from jaxos4.identification.results import Constant, HeldParameter, SampleTime
 from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, noise_of_speeds, shortest
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.recording.pieces import as_recordings
+from jaxos4.recording.pieces import as_recordings, averaged
 from jaxos4.recording.preparation import prepare
 from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.gains import LogNoise
@@ -55,6 +55,11 @@ def case_of(flight, sample_time):
     nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
     (case,) = prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings, **nothing)
     return case
+
+
+@eqx.filter_jit
+def mean_forcing_of(model, inputs, parameters, place):
+    return model.mean_forcing(inputs, parameters, place)
 
 
 # The choice of the sample time.
@@ -179,14 +184,18 @@ def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeyp
 # The likelihood.
 
 
-def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples():
-    """The dense covariance of the means of an Ornstein-Uhlenbeck process, with a gap."""
-    samples, strength, tau, sensor = 80, 1.3, 0.3, 0.05
-    flight, rng = flown(), np.random.default_rng(2)
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share):
+    """The dense covariance of an Ornstein-Uhlenbeck process, with a gap.
+
+    `share`: of a sample that is averaged. Without any, it is the process at instants.
+    """
+    samples, strength, tau, sensor, rows = 80, 1.3, 0.3, 0.05, np.arange(80)
+    (recording,), rng = averaged(as_recordings(flown())[0], [DT]), np.random.default_rng(2)
     force = np.full((SAMPLES, 3), np.nan)
     force[:samples, 2] = 9.81 + rng.normal(size=samples)
     force[30:37] = np.nan
-    flight = dataclasses.replace(flight, specific_force=force)
+    flight = dataclasses.replace(recording.flight, averaging_time=share * DT)
     problem, silent = (
         dataclasses.replace(problem_of(dataclasses.replace(flight, specific_force=each)), segments=1)
         for each in (force, np.full_like(force, np.nan))
@@ -197,16 +206,21 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples():
     of_all, of_rates = (cost_of(each, jnp.asarray(parameters), noise) for each in (problem, silent))
 
     named = dict(zip(problem.unknowns.names, parameters.tolist(), strict=False))
-    forcing = forcing_of(problem.model, flight.inputs, jnp.asarray(parameters))
-    expected = named["thrust_gain"] * np.asarray(forcing.specific_thrust)[:samples] + named["az_bias"]
-    share, apart = DT / tau, np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
-    lost = 1 - np.exp(-share)
-    means = (strength / share) ** 2 * np.where(apart == 0, 2 * (share - lost), lost**2 * np.exp(-share * (apart - 1)))
+    forcing = mean_forcing_of(problem.model, flight.inputs, jnp.asarray(parameters), rows[None])
+    expected = named["thrust_gain"] * np.asarray(forcing.specific_thrust)[0] + named["az_bias"]
+    ratio, apart = DT / tau, np.abs(np.subtract.outer(rows, rows))
+    lost = 1 - np.exp(-ratio)
+    means = np.where(apart == 0, 2 * (ratio - lost), lost**2 * np.exp(-ratio * (apart - 1))) / ratio**2
+    process = strength**2 * (means if share else np.exp(-ratio * apart))
     known = np.isfinite(force[:samples, 2])
-    covariance = (means + sensor**2 * np.eye(samples))[np.ix_(known, known)]
+    covariance = (process + sensor**2 * np.eye(samples))[np.ix_(known, known)]
     off = (force[:samples, 2] - expected)[known]
     dense = (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(covariance)[1]) / 2
     np.testing.assert_allclose(of_all - of_rates, dense, rtol=1e-9)
+    # It sees whether a sample is averaged.
+    other = dataclasses.replace(problem.flight, averaging_time=(1 - share) * DT)
+    of_other = cost_of(eqx.tree_at(lambda p: p.problem.flight, problem, other), jnp.asarray(parameters), noise)
+    assert abs(of_other - of_all) > 1e-3 * abs(dense)
 
 
 def test_the_weight_tells_the_error_of_the_accelerometer():

@@ -243,7 +243,8 @@ def resample(t: Times, omega: Rotors, channels: Columns, dt: float, *, held: boo
         ]
         note += (
             f"; {counted(int(gap.sum()), 'gap')} of up to {1e3 * step.max():.4g} ms: the "
-            f"{int((ends[1] - ends[0]).sum())} samples in gaps hold the rotor speeds and count as not measured"
+            f"{int((ends[1] - ends[0]).sum())} samples in gaps {'hold' if held else 'interpolate'} the rotor speeds "
+            "and count as not measured"
         )
     speeds = root_mean_square(Series(t, omega), linear=not held)(grid)
     return (grid, speeds, at_rows(grid, Series(t, channels), step=dt)), note
