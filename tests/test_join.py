@@ -113,8 +113,10 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     channels = np.cumsum(rng.normal(size=(83, 3)), axis=0)
     channels[rng.uniform(size=channels.shape) < lost] = np.nan
     grid, _, found = averages(t, rng.uniform(100, 300, (83, 4)), channels, held=True)(dt)
-    np.testing.assert_allclose(grid, t[0] + dt * np.arange(grid.size), rtol=1e-12)
-    assert grid[-1] <= t[-1] + 1e-6 < grid[-1] + dt + 1e-6
+    # The first sample begins half of a row before the first row, and the last ends half of a row after the last.
+    edges = t[0] - 0.0005 + dt * np.arange(grid.size + 1)
+    np.testing.assert_allclose(grid, edges[:-1] + dt / 2, rtol=1e-12)
+    assert edges[-1] <= t[-1] + 0.0005 + 1e-6 < edges[-1] + dt + 1e-6
     np.testing.assert_allclose(found, averaged_slowly(t, channels, grid, dt), rtol=1e-9, atol=1e-9)
 
 

@@ -141,7 +141,7 @@ def test_a_prediction_is_the_solution_of_newton_and_euler(write, pitch, turning)
     states[::300, 9] += turning
     # No changes of velocity that the model would have to learn.
     states[np.arange(len(states)) % 300 > 0, 1:6:2] = np.nan
-    flight = dataclasses.replace(flight, omega=omega, states=states, commanded=False)
+    flight = dataclasses.replace(flight, omega=omega, states=states, commanded=True)
     # Without disturbances and offsets the filters know nothing: rates begin as measured.
     found = jaxos4.predict(write(result(gust=0.0, terms=terms)), flight, horizon=0.3, spacing=3.0)
     for start in range(found.time.size):

@@ -185,8 +185,15 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
         if (kind, name) != ("negative", "roll_damping"):
             assert (name in fit.held) == (std[i] > half_width[i] * 0.5**0.5), name
     if kind == "negative":
-        assert fit.held["roll_damping"].value == 0.0
-        assert "negative" in fit.held["roll_damping"].note
+        place = unknowns.names.index("roll_damping")
+        value, error = fit.negative["roll_damping"]
+        assert value < -2 * error < 0
+        assert fit.estimate.parameters[place] == 0.0
+        # All intervals allow for what is known of it without the limit.
+        assert fit.bound[place] == pytest.approx(error)
+        _, held = fit.searched
+        roll = unknowns.names.index("alpha3")
+        assert fit.bound[roll] > 1.001 * np.sqrt(held.covariance[roll, roll])
     assert {"alpha1", "alpha4", "alpha7"} <= set(fit.held)
     assert {"alpha3", "alpha6", "rotor_lag"}.isdisjoint(fit.held) == (kind != "hover")
     assert (std >= fit.bound * (1 - 1e-9)).all()
@@ -302,7 +309,7 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
     assert not lost.is_lowest
     assert stages.count("fitting again where the cost is lower") <= 2
     assert lost.searched[1].cost <= found.cost
-    answer = answer_of(case, lost, case.shooting.flight)
+    answer = answer_of(case, lost)
     assert judge(case, lost, [answer], progress=stages.append)["doubts"][0].result == "max_sweeps"
     # A search that did not converge has no profile.
     failed = fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.at_bound))

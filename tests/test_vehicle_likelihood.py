@@ -6,9 +6,9 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
-import scipy.signal
 from helpers import CRAZYFLIE, compiled_programs
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +18,7 @@ from jaxos4.identification import profile, sample_time
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.fit import fit_case
 from jaxos4.identification.results import Constant, HeldParameter, SampleTime
-from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, noise_of_speeds, shortest
+from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, shortest
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.recording.pieces import as_recordings, averaged
 from jaxos4.recording.preparation import prepare
@@ -53,7 +53,7 @@ def case_of(flight, sample_time):
     """As `jaxos4.identify` prepares it, so that all fits are one program."""
     settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=sample_time, holdout=0.0)
     nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
-    (case,) = prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings, **nothing)
+    case, *_ = prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings, **nothing)
     return case
 
 
@@ -102,25 +102,13 @@ def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(rows, place):
     assert moved(own, far) == moved(far, own) == ["Ix"]
 
 
-@pytest.mark.parametrize("noise", [0.0, 1.0, 10.0])
-def test_noise_of_measured_speeds_is_its_share_of_their_changes(noise):
-    """Rotors that follow random levels within 50 ms, with white noise [rad/s], averaged to longer samples."""
-    random, time = np.random.default_rng(0), DT * np.arange(16000)
-    levels = np.repeat(60 * random.normal(size=(time.size // 100, 4)), 100, axis=0)
-    speeds = 1700 + scipy.signal.lfilter([0.08], [1, -0.92], levels, axis=0)
-    error = noise * random.normal(size=speeds.shape)
-    finest = jaxos4.Flight(time, speeds + error, np.zeros((time.size, 12)))
-
-    def changes(omega):
-        torque = np.square(omega) @ np.asarray(CRAZYFLIE.mixer)[:2].T
-        return np.median(np.abs(np.diff(torque, axis=0)), axis=0) ** 2
-
-    for longer in (1, 2, 8):
-        noisy, wrong = (each.reshape(-1, longer, 4).mean(axis=1) for each in (speeds + error, 1700 + error))
-        flight = jaxos4.Flight(time[::longer], noisy, np.zeros((len(noisy), 12)))
-        share = np.max(changes(wrong) / changes(noisy))
-        assert noise_of_speeds(flight, finest, CRAZYFLIE) == pytest.approx(share, rel=0.3, abs=0.02)
-    assert noise_of_speeds(dataclasses.replace(flight, commanded=True), finest, CRAZYFLIE) == 0
+def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
+    """Its interval agrees with anything."""
+    near = table((A, 0.0), ((10.5, 20.0), 0.0), ((10.5, 20.0), 0.0))
+    wide = {name: Constant(row.estimate, 2.0, "kg m^2") for name, row in near[0].constants.items()}
+    vague = msgspec.structs.replace(near[0], constants=wide)
+    assert shortest(near) == 0
+    assert shortest([vague, *near[1:]]) == 1
 
 
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
@@ -156,16 +144,10 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     for name, row in vehicle_constants(weak).constants.items():
         assert row.estimate == pytest.approx(vehicle_constants(fit).constants[name].estimate)
         assert row.std > 0.4 * row.estimate
-    assert not answer_of(case, weak, case.shooting.flight).constants
-    # Noise of rotor speeds widens the intervals by 2.5 times its share, up to the limit of the doubt.
-    for share, added in ((0.02, 0.05), (0.5, 0.125)):
-        for name, row in vehicle_constants(fit, share).constants.items():
-            clear = vehicle_constants(fit).constants[name]
-            assert row.std == pytest.approx(np.hypot(clear.std, added * clear.estimate), rel=0.02)
-            assert row.estimate == clear.estimate
+    assert not answer_of(case, weak).constants
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
     unclear = fit._replace(held=dict.fromkeys(fit.problem.unknowns.names, held["thrust_gain"]))
-    assert not answer_of(case, unclear, case.shooting.flight).constants
+    assert not answer_of(case, unclear).constants
 
 
 def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeypatch):
@@ -227,15 +209,15 @@ def test_the_weight_tells_the_error_of_the_accelerometer():
     """Not of the thrust: the airframe says 20 % less than there is."""
     flight = flown()
     flight = dataclasses.replace(flight, specific_force=np.asarray(flight.specific_force) + [0.0, 0.0, 0.25])
-    (prepared,) = prepare(as_recordings(flight), CRAZYFLIE, sample_time=DT, holdout=0.0)
+    prepared, *_ = prepare(as_recordings(flight), CRAZYFLIE, sample_time=DT, holdout=0.0)
     value, error = prepared.level
     assert error < 0.1
     assert abs(value - 0.25) < 3 * error
     weak = eqx.tree_at(lambda a: a.thrust_coefficient, CRAZYFLIE, 0.8 * CRAZYFLIE.thrust_coefficient)
-    (other,) = prepare(as_recordings(flight), weak, sample_time=DT, holdout=0.0)
+    other, *_ = prepare(as_recordings(flight), weak, sample_time=DT, holdout=0.0)
     assert other.level == prepared.level
     lighter = eqx.tree_at(lambda a: a.gravity, CRAZYFLIE, 9.7)
-    (other,) = prepare(as_recordings(flight), lighter, sample_time=DT, holdout=0.0)
+    other, *_ = prepare(as_recordings(flight), lighter, sample_time=DT, holdout=0.0)
     assert other.level[0] - value == pytest.approx(0.11, rel=0.1)
 
 
@@ -255,12 +237,12 @@ def test_a_vehicle_that_circles_is_carried_by_its_force(measured, tilt, period):
     force = np.stack([0 * time, 0 * time, 9.81 / np.cos(bank) + 0.1], axis=1)
     force += 1e-3 * np.random.default_rng(0).normal(size=force.shape)
     flight = jaxos4.Flight(time=time, omega=np.full((time.size, 4), 1500.0), states=states, specific_force=force)
-    (prepared,) = prepare(as_recordings(flight), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
+    prepared, *_ = prepare(as_recordings(flight), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
     value, error = prepared.level
     assert abs(value - 0.1) < min(error, 0.06)
     assert error < (0.06 if len(measured) == 6 or not tilt else 0.5)
     upside_down = dataclasses.replace(flight, specific_force=force * [1.0, 1.0, -1.0])
-    (prepared,) = prepare(as_recordings(upside_down), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
+    prepared, *_ = prepare(as_recordings(upside_down), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
     assert prepared.level is None  # no calibration: the fit says that the axis points down
 
 
@@ -275,7 +257,7 @@ def test_a_vehicle_that_leans_is_carried_by_its_drag_too():
     flight = jaxos4.Flight(
         time=DT * np.arange(samples), omega=np.full((samples, 4), 1500.0), states=states, specific_force=force
     )
-    (prepared,) = prepare(as_recordings(flight), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
+    prepared, *_ = prepare(as_recordings(flight), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
     assert abs(prepared.level[0] - 0.1) < 1e-3
 
 

@@ -26,8 +26,8 @@ class Grid(NamedTuple):
     """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
 
     `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by
-    `battery_voltage`, to which the airframe's rotor speeds belong. `are_parts`: whether the samples are `Flight.within`
-    others.
+    `battery_voltage`, to which the airframe's rotor speeds belong. `at_instants`: of the parts of samples
+    (`Flight.within`), whether measurements are instants; `None`: the samples are whole ones.
     """
 
     dt: Scalar
@@ -36,8 +36,7 @@ class Grid(NamedTuple):
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]
     voltage: Float[Array, " samples"] | None = None
-    are_parts: bool = False
-    at_instants: Bool[Array, ""] | bool = True
+    at_instants: Bool[Array, ""] | None = None
 
     @classmethod
     def of(
@@ -51,20 +50,26 @@ class Grid(NamedTuple):
         recording, elapsed = jnp.asarray(recordings)[stretch], inputs.dt * jnp.arange(samples)
         if max(recordings) > 0:
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
-        return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts, inputs.averaging_time == 0)
+        return cls(
+            inputs.dt,
+            recording,
+            first,
+            last,
+            elapsed,
+            voltage,
+            jnp.asarray(inputs.averaging_time) == 0 if are_parts else None,
+        )
 
     def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Part":
         """Some samples in a row. `before`: see `Part`."""
-        return Part(
-            self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.are_parts, self.at_instants
-        )
+        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.at_instants)
 
 
 class Part(NamedTuple):
     """Some samples in a row: the sample time [s], their numbers, and which begin or end a stretch.
 
     `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
-    `are_parts`: see `Grid`.
+    `at_instants`: see `Grid`.
     """
 
     dt: Scalar
@@ -72,8 +77,7 @@ class Part(NamedTuple):
     is_first: Bool[Array, " rows"]
     is_last: Bool[Array, " rows"]
     before: Float[Array, "4"]
-    are_parts: bool = False
-    at_instants: Bool[Array, ""] | bool = True
+    at_instants: Bool[Array, ""] | None = None
 
 
 class Speeds(NamedTuple):
@@ -87,12 +91,12 @@ class Speeds(NamedTuple):
 def measured_speeds(omega: Commands, part: Part) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing.
 
-    Means over parts of a sample change as those of the parts around them. If measurements are `at_instants`, later parts
-    do not count: they hold the controller's answer to the noise of the measurement.
+    Means over parts of a sample change as those of the parts around them. If measurements are `at_instants`, later
+    parts do not count: they hold the controller's answer to the noise of the measurement.
     """
     speed = omega(part.rows)
     following = omega(jnp.where(part.is_last, part.rows, part.rows + 1))
-    if not part.are_parts:
+    if part.at_instants is None:
         return Speeds(speed, speed, following - speed)
     before, earlier = (omega(jnp.where(part.is_first, part.rows, jnp.maximum(part.rows - i, 0))) for i in (1, 2))
     so_far, around = (3 * speed - 4 * before + earlier) / 2, (following - before) / 2
@@ -114,27 +118,24 @@ def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
 def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
     """Commands that act `delay` [s] later. Before a stretch its first command acts, and after it its last one.
 
-    Hermite's cubics interpolate between samples, with slopes from the samples before: a delay of whole samples is
-    exact, nothing acts before its time, and the derivative in the delay has no jumps at which a search could end.
+    Cubics interpolate between samples (Catmull and Rom 1974): a delay of whole samples is exact, and the derivative in
+    the delay has no jumps at which a search could end.
     """
     count, samples = grid.first.shape[0], delay / grid.dt
     floor = jnp.floor(jax.lax.stop_gradient(samples))
-    s = 1 - (samples - floor)  # of the way from one sample to the next
-    values = (1 - s) ** 2 * (1 + 2 * s), s**2 * (3 - 2 * s)
-    slopes = s * (1 - s) ** 2, s**2 * (s - 1)
-    # From the newest sample to the oldest. The slope at a sample is (3, -4, 1) / 2 of it and the two before.
+    f = samples - floor
     weights = jnp.stack(
         [
-            values[1] + 1.5 * slopes[1],
-            values[0] - 2 * slopes[1] + 1.5 * slopes[0],
-            0.5 * slopes[1] - 2 * slopes[0],
-            0.5 * slopes[0],
+            f * (-0.5 + f - f * f / 2),
+            1 + f * f * (1.5 * f - 2.5),
+            f * (0.5 + 2 * f - 1.5 * f * f),
+            f * f * (f - 1) / 2,
         ]
     )
     shift = jnp.clip(floor, -count, count).astype(int)
 
     def at(rows: Int[Array, "*rows"]) -> Float[Array, "*rows 4"]:
-        near = rows - shift - np.arange(4)[:, None]
+        near = rows - shift + np.array([1, 0, -1, -2])[:, None]
         return jnp.tensordot(weights, omega(jnp.clip(near, grid.first[rows], grid.last[rows])), 1)
 
     return at
@@ -194,7 +195,7 @@ def driven(omega: RotorSpeeds, motor: Motor, part: Part) -> Speeds:
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
         begin = jnp.where(is_first, settled, speed)
-        end = motor.step(begin, command, part.dt, 1 if part.are_parts else 2)
+        end = motor.step(begin, command, part.dt, 2 if part.at_instants is None else 1)
         return end, (begin, end)
 
     begin, end = jax.lax.scan(over_a_sample, part.before, (omega, motor.settled(omega), part.is_first))[1]

@@ -84,15 +84,17 @@ def _noise(power: Changes) -> Float[np.ndarray, " frequencies"]:
     some = slice(*(round(edge * (len(power) - 1)) for edge in _BAND))
     directions, wanted = np.eye(power.shape[1]), np.maximum(power[some].T.ravel(), np.finfo(float).tiny)
     motion = np.hstack([np.kron(directions, growth[some, None] ** order) for order in (0, -1)])
-    found = []
-    for rate in _WRITTEN:
+
+    def fitted(rate: float) -> tuple[float, Float[np.ndarray, " frequencies"]]:
         shape = growth * np.sinc(frequency / rate) ** 4
         columns, model = np.hstack([motion, np.tile(shape[some], len(directions))[:, None]]), wanted
+        size = np.zeros(columns.shape[1])
         for _ in range(_PASSES):
-            *_, level = size = nnls(columns / model[:, None], wanted / model)[0]
+            size, _ = nnls(columns / model[:, None], wanted / model)
             model = np.maximum(columns @ size, np.finfo(float).tiny)
-        found.append(((np.log(model) + wanted / model).sum(), level * shape))
-    return min(found, key=lambda each: each[0])[1]
+        return float((np.log(model) + wanted / model).sum()), size[-1] * shape
+
+    return min(map(fitted, _WRITTEN), key=lambda each: each[0])[1]
 
 
 def _filtered(signal: Float[np.ndarray, "samples 4"], kept: Changes) -> Float[np.ndarray, "samples 4"]:

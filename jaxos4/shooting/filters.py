@@ -200,15 +200,15 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         eqx.combine(jax.tree.map(repeated, one), same) for one, same in zip((dt, window), fixed_flight[4:], strict=True)
     )
     flight = *lanes_before_last(tuple(series), tuple(fixed_flight[:3])), rows, dt, window
-    functions = tuple(each(which) for which in range(len(moving)))
+    functions = each(0), each(1), each(2)
     found = _filter(functions, positions, flight, in_each_segment(at, fixed_at))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
 
 
 def _innovate(functions: Functions, positions: tuple[int, ...], flight: tuple, at: Any) -> Innovations:
     """The innovations of one flight."""
-    each = tuple(jax.vmap(function, in_axes=(0, 0, None)) for function in functions)
-    return _filter(each, positions, flight, at)
+    move, average, observe = (jax.vmap(function, in_axes=(0, 0, None)) for function in functions)
+    return _filter((move, average, observe), positions, flight, at)
 
 
 def _filter(
