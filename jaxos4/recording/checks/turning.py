@@ -1,0 +1,84 @@
+"""Checks of the attitude against the integrated gyro: scales and axes."""
+
+import math
+
+import numpy as np
+
+from ...excitation import AXES
+from .attitude import scaled_angles
+from .evidence import Evidence
+from .finding import INERTIAS, Finding
+
+_DEGREES, _ABOUT = math.degrees(1), 0.05  # a scale this close to that of degrees is that of degrees
+_WELL = 0.3  # largest standard error of an axis that is judged, as a share of its scale
+_FOLLOWS = 0.2  # the least share of the attitude's turns that a gyro explains
+_ALL = (*INERTIAS, "attitude")
+
+
+def wrong_scale(evidence: Evidence) -> Finding | None:
+    """The attitude turns more or less than the gyro says."""
+    turns, limits = evidence.turns, evidence.limits
+    if turns is None:
+        return None
+    scale = np.hypot(*turns.matrix.value[:2, :2].T).tolist()
+    scale, error = np.array([*scale, abs(turns.matrix.value[2, 2])]), np.diagonal(turns.matrix.error)
+    judged = (error < _WELL * scale) & (turns.explained > _FOLLOWS)
+    far = np.abs(np.log(np.where(judged, scale, 1.0))) > max(math.log1p(limits.scale), 0)
+    far &= np.abs(scale - 1) > limits.standard_errors * error
+    if not far.any():
+        return None
+    mean = float(np.exp(np.log(scale[far]).mean()))
+    kinematics = scaled_angles(evidence.pieces, turns)
+    gyro = "the gyro's scale or the time stamps are wrong"
+    causes = {True: "the scale of the attitude is wrong", False: gyro}
+    clear = abs(kinematics) > limits.kinematics
+    cause = causes[kinematics > 0] if clear else f"{gyro}, or that of the attitude"
+    for factor, unit in ((_DEGREES, "degrees"), (1 / _DEGREES, "radians that were divided by 57.3")):
+        if abs(mean / factor - 1) < _ABOUT:
+            cause += f": it may be in {unit if mean > 1 else 'degrees per second'}"
+    which = "" if far.sum() == judged.sum() else f" in {' and '.join(np.array(AXES)[far])}"
+    only_attitude = clear and kinematics > 0
+    return Finding(
+        "attitude_scale" if only_attitude else "gyro_or_time_scale",
+        f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}",
+        ", ".join(f"{a} {s:.3f} +- {2 * e:.1g}" for a, s, e, j in zip(AXES, scale, error, judged, strict=True) if j),
+        "leave the attitude out, or correct it"
+        if only_attitude
+        else "compare a turn by hand with the gyro's integral, and the length of the log with a clock",
+        ("attitude",) if only_attitude else INERTIAS,
+        True,
+    )
+
+
+def wrong_axes(evidence: Evidence) -> Finding | None:
+    """Attitude and gyro turn about other axes, or in opposite directions, or not together."""
+    turns, limits = evidence.turns, evidence.limits
+    if turns is None:
+        return None
+    matrix, error = turns.matrix.value, limits.standard_errors * turns.matrix.error
+    opposite = [axis for axis, m, e in zip(AXES, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
+    tilts = matrix[:2, :2]
+    sizes = np.hypot(*tilts)
+    if (error[:2, :2] > sizes).any():
+        return None
+    unrelated = (np.abs(np.diagonal(matrix)) + np.diagonal(error) < _FOLLOWS)[:2].all() and sizes.max() < _FOLLOWS
+    if np.linalg.det(tilts) > 0 and not unrelated and opposite in ([], ["roll", "pitch"]):
+        return None
+    if unrelated or turns.explained[:2].max() < _FOLLOWS:
+        cause, size = (
+            "the attitude does not turn as the gyro says",
+            f"it explains {100 * turns.explained[:2].max():.0f} %",
+        )
+    elif opposite:
+        cause = f"attitude and gyro have opposite signs in {' and '.join(opposite)}"
+        size = f"slope {matrix[AXES.index(opposite[0])][AXES.index(opposite[0])]:.2f}"
+    else:
+        cause, size = "roll and pitch of attitude and gyro are exchanged", f"slope {matrix[0, 1]:.2f}"
+    return Finding(
+        "attitude_axes",
+        cause,
+        size,
+        "give both with x forward, y left, z up; angles in the order of docs/logs.md",
+        _ALL,
+        True,
+    )
