@@ -1,61 +1,91 @@
-"""The check of the sensors' clocks: the one that is recorded late or early."""
+"""The check of the clocks: the sensor, or the motors, that are recorded late or early."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from .evidence import Evidence
 from .finding import INERTIAS, Finding
 
-_SENSORS = ("gyro", "accelerometer", "attitude")
-_QUANTITIES = {"gyro": INERTIAS, "accelerometer": (*INERTIAS, "thrust", "motors"), "attitude": ("attitude",)}
+CLOCK = "_clock"
+"""The end of the name of a finding about clocks."""
+_CLOCKS = ("gyro", "accelerometer", "attitude", "motors")
+_VERBS = dict.fromkeys(_CLOCKS, "is") | {"motors": "are"}
+_QUANTITIES = {
+    "gyro": INERTIAS,
+    "accelerometer": (*INERTIAS, "thrust", "motors"),
+    "attitude": ("attitude",),
+    "motors": ("motors",),
+}
 _FOLLOWS, _COHERENT = 0.2, (0.2, 0.03)  # shares that gyro explains of attitude, and rotors of gyro and accelerometer
-# Errors of delays that are none of the clock's [s]: filters, gusts that a controller answers, lags of the rotors.
+# Standard deviations of delays that are no error of a clock [s]: filters, gusts that a controller answers, and the lag
+# and delay of rotors that follow commands, about their mean.
 _FILTERS, _GUSTS, _USUAL_LAG, _LAGS = 0.003, 0.004, 0.05, 0.025
 _LIKELIER = 6.0  # difference of chi^2: a cause 20 times less likely than another is left out
 
 
-def sensor_clocks(evidence: Evidence) -> Finding | None:
-    """Gyro, accelerometer or attitude at another time than the others.
+class _Delay(NamedTuple):
+    """How much of each clock is in a delay, the delay and its standard error [s], and what is no error of a clock."""
 
-    Each delay is a difference of two clocks, those of the rotors included. The sensor that is named explains all
-    delays best if all other clocks are right. Several are named if they explain them alike.
+    clocks: tuple[int, int, int, int]
+    late: float
+    error: float
+    usual: float
+
+
+def sensor_clocks(evidence: Evidence) -> Finding | None:
+    """One clock that differs from the others.
+
+    Each measured delay is a difference of two clocks. The clock that is named explains all delays best if the other
+    clocks are right. Several are named if they explain them alike.
     """
-    turns, response, limits = evidence.turns, evidence.response, evidence.limits
-    # How much of each clock is in a delay, the delay, and its error without and with what is no error of a clock [s].
-    delays: list[tuple[tuple[float, float, float], float, float, float]] = []
-    differ = False
-    if turns is not None and turns.explained[:2].max() > _FOLLOWS:
-        late, error = float(turns.delay.value), float(turns.delay.error)
-        delays.append(((-1, 0, 1), late, error, _FILTERS))
-        differ |= abs(late) > max(limits.late_attitude, limits.standard_errors * error)
-    if response is not None and response.coherent[:2].max() > _COHERENT[0]:
-        gyro, force, between = zip(response.delays.value.tolist(), response.delays.error.tolist(), strict=True)
-        lag, usual = (_USUAL_LAG - response.lag, _LAGS) if response.lag else (0.0, _GUSTS)
-        delays.append(((1, 0, 0), gyro[0] - lag, gyro[1], usual))
-        if response.coherent[2] > _COHERENT[1]:
-            delays.append(((1, -1, 0), *between, _GUSTS))
-            differ |= abs(between[0]) > max(limits.delay, limits.standard_errors * between[1])
+    delays, differ = _delays(evidence)
     if not differ:
         return None
-    clocks, late = np.array([each[0] for each in delays]), np.array([each[1] for each in delays])
-    error = np.array([math.hypot(*each[2:]) for each in delays])
+    clocks, late = np.array([each.clocks for each in delays]), np.array([each.late for each in delays])
+    error = np.array([math.hypot(each.error, each.usual) for each in delays])
     weights = clocks / error[:, None]
     measured = np.abs(clocks).any(axis=0)
-    wrong = (weights.T @ (late / error)) / np.where(measured, np.square(weights).sum(axis=0), 1.0)
-    misfit = np.where(measured, np.square(late[:, None] / error[:, None] - weights * wrong).sum(axis=0), np.inf)
-    named = np.flatnonzero(misfit < misfit.min() + _LIKELIER)
-    named = named[np.argsort(misfit[named])]
+    squares = np.where(measured, np.square(weights).sum(axis=0), 1.0)
+    wrong = weights.T @ (late / error) / squares
+    misfit = np.where(measured, np.square((late / error)[:, None] - weights * wrong).sum(axis=0), np.inf)
+    best = np.argsort(misfit)
+    named = [i for i in best if misfit[i] < misfit[best[0]] + _LIKELIER]
     causes = [
-        f"the {_SENSORS[i]} is recorded {1e3 * abs(wrong[i]):.0f} ms {'late' if wrong[i] > 0 else 'early'}"
+        f"the {_CLOCKS[i]} {_VERBS[_CLOCKS[i]]} recorded {1e3 * abs(wrong[i]):.0f} ms "
+        f"{'late' if wrong[i] > 0 else 'early'}"
         for i in named
     ]
-    spread = 2e3 / math.sqrt(np.square(weights[:, named[0]]).sum())
+    names = [_CLOCKS[i] for i in named]
     return Finding(
-        "_or_".join(_SENSORS[i] for i in named) + "_clock",
+        "_or_".join(names) + CLOCK,
         ", or ".join(causes),
-        f"{1e3 * wrong[named[0]]:.1f} +- {spread:.1g} ms",
-        "shift its time stamps, or log it without a filter",
-        tuple(dict.fromkeys(quantity for i in named for quantity in _QUANTITIES[_SENSORS[i]])),
-        bool(abs(wrong[named[0]]) > limits.late),
+        f"{1e3 * wrong[best[0]]:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.1g} ms",
+        "shift the time stamps, or log without a filter",
+        tuple(dict.fromkeys(quantity for name in names for quantity in _QUANTITIES[name])),
+        # The delay of the motors is estimated with the other parameters.
+        bool(abs(wrong[best[0]]) > evidence.limits.late and "motors" not in names),
     )
+
+
+def _delays(evidence: Evidence) -> tuple[list[_Delay], bool]:
+    """The delays that the log shows, and whether one of them is a finding."""
+    turns, response, limits = evidence.turns, evidence.response, evidence.limits
+    delays, differ = [], False
+    if turns is not None and turns.explained[:2].max() > _FOLLOWS:
+        late, error = float(turns.delay.value), float(turns.delay.error)
+        delays.append(_Delay((-1, 0, 1, 0), late, error, _FILTERS))
+        differ |= abs(late) > max(limits.late_attitude, limits.standard_errors * error)
+    if response is not None and response.coherent[:2].max() > _COHERENT[0]:
+        gyro, _, between = zip(response.delays.value.tolist(), response.delays.error.tolist(), strict=True)
+        late, usual = gyro[0], _GUSTS
+        if response.lag:  # commands: the rotors' own lag and delay are unknown
+            late, usual = gyro[0] + response.lag - _USUAL_LAG, _LAGS
+        delays.append(_Delay((1, 0, 0, -1), late, gyro[1], usual))
+        before = min(gyro[0] + response.lag, 0.0) if response.lag else gyro[0]
+        differ |= abs(before) > max(limits.late, limits.standard_errors * gyro[1])
+        if response.coherent[2] > _COHERENT[1]:
+            delays.append(_Delay((1, -1, 0, 0), *between, _GUSTS))
+            differ |= abs(between[0]) > max(limits.delay, limits.standard_errors * between[1])
+    return delays, differ

@@ -10,9 +10,10 @@ from ...flight import RATES
 from ..pieces import Recording, cut
 from ..usable import SHORTEST, stretches
 from .attitude import Turns, attitude_turns
-from .finding import Limits
+from .finding import Limits, Measured
 from .response import Response, rotor_response
 from .values import Plausible, plausible
+from .velocity import velocity_slopes
 
 _HELD = 1.5  # samples; motors that keep their values for less have new ones in each sample
 _FLYING, _CARRIED = 0.05, (0.5, 2.0)  # [rad/s], standard deviation of the rates; thrust as a share of the weight
@@ -75,6 +76,11 @@ class Evidence:
     def turns(self) -> Turns | None:
         """Attitude against gyro."""
         return attitude_turns(self.pieces)
+
+    @functools.cached_property
+    def velocity(self) -> Measured | None:
+        """The horizontal acceleration by the velocity, along and across that by force and attitude, relative to it."""
+        return velocity_slopes(self.pieces)
 
     @functools.cached_property
     def response(self) -> Response | None:

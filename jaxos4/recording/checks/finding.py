@@ -50,9 +50,13 @@ class Limits(msgspec.Struct, frozen=True):
     - `late`: between two sensors [s] that contradicts. 20 ms change inertias by 10 %. The filter of an accelerometer
       can be 10 ms later than that of the gyro.
     - `late_attitude`: of the attitude after the gyro [s]. Filters and cameras are late by up to 20 ms.
+    - `velocity`: of the horizontal acceleration by the velocity against that by force and attitude, relative.
+      Velocities that are averaged while the vehicle yaws differ by 5 %.
     - `gravity`: of the mean specific force, relative to gravity. It is up to 10 % larger in brisk flight.
     - `thrust`, `commanded_thrust`: of the airframe's thrust, relative, by measured speeds and by commands. A wrong
       thrust coefficient is measured by the accelerometer; this is a note.
+    - `vehicles`, `commanded_vehicles`: of the thrust between two logs of one vehicle, relative, by measured speeds and
+      by commands. A battery that empties changes the thrust of a command by up to 30 %.
     - `clipped`: the share of clipped values above which a channel cannot be used.
     - `motions`: of roll and pitch, independent ones. Fewer do not show how large the noise is: the standard deviation
       of a mean square is 37 % for 15. Two seconds of flight have 5 to 12, four have 7 to 21.
@@ -67,12 +71,18 @@ class Limits(msgspec.Struct, frozen=True):
     delay: float = 0.01
     late: float = 0.015
     late_attitude: float = 0.025
+    velocity: float = 0.15
     gravity: float = 0.3
     thrust: float = 0.25
     commanded_thrust: float = 1.0
+    vehicles: float = 0.1
+    commanded_vehicles: float = 0.4
     clipped: float = 0.1
     motions: float = 15.0
     held: float = 0.015
+
+
+LIMITS = Limits()
 
 
 class Measured(msgspec.Struct, frozen=True):

@@ -11,6 +11,7 @@ from .evidence import Evidence
 from .finding import INERTIAS, SENSOR_ROTATION, Finding, Measured
 
 _COHERENT = 0.1  # the least share of both angular accelerations that the rotors explain
+_VAGUE = 0.2  # [rad]; a larger error of the angle by the rotors is that of another airframe
 _ALONG = 0.17  # [rad]; a rotation turns roll and pitch by the same angle, up to this
 _SLOW, _BLOCKS = 0.1, 12  # [s], samples whose tilt is compared; blocks of the jackknife
 _EARTH = 0.6  # slope of the horizontal force on the tilt: 1 along the earth's axes, 0 or less along the body's
@@ -57,7 +58,7 @@ def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     errors = response.turning.error / sizes
     apart = abs(math.remainder(math.atan2(-c, a) - math.atan2(b, d), math.tau))
     across = math.hypot(errors[0, 1], errors[1, 0])
-    if not apart < max(_ALONG, evidence.limits.standard_errors * across):
+    if not apart < max(_ALONG, evidence.limits.standard_errors * across) or across > _VAGUE:
         return None
     return math.atan2(b - c, a + d), across / 2
 
@@ -77,7 +78,7 @@ def _by_attitude(evidence: Evidence) -> tuple[float, float] | None:
 def earth_axes(evidence: Evidence) -> Finding | None:
     """Specific force along the axes of the earth: its horizontal part follows the tilt."""
     slope = _on_tilt(evidence)
-    if slope is None or slope.value - evidence.limits.standard_errors * slope.error < _EARTH:
+    if slope is None or slope.value < max(_EARTH, evidence.limits.standard_errors * slope.error):
         return None
     return Finding(
         "earth_axes",
@@ -153,7 +154,7 @@ def wrong_thrust(evidence: Evidence) -> Finding | None:
     if not every or evidence.airframe is None:
         return None
     force, limits = evidence.force, evidence.limits
-    felt = float(force[:, 2].mean()) if force.size else float(evidence.airframe.gravity)
+    felt = float(np.linalg.norm(force.mean(axis=0))) if force.size else float(evidence.airframe.gravity)
     ratio = float(np.concatenate(every).mean()) / max(felt, 1e-3)
     limit = limits.commanded_thrust if evidence.logged.commanded else limits.thrust
     if 1 / (1 + limit) < ratio < 1 + limit:

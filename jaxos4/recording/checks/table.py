@@ -1,4 +1,4 @@
-"""The table of checks, and checks of several recordings of one vehicle."""
+"""The table of checks."""
 
 from collections.abc import Callable
 
@@ -6,12 +6,12 @@ from ...airframe import Airframe
 from ..pieces import Recording
 from .clocks import sensor_clocks
 from .evidence import Evidence
-from .finding import Finding, Limits
+from .finding import LIMITS, Finding, Limits
 from .log import clipped_values, impossible_values, rare_motors, short_flight, uneven_time
 from .mounting import earth_axes, thrust_direction, turned_about_vertical, wrong_thrust
 from .turning import wrong_axes, wrong_scale
+from .velocity_check import velocity_axes
 
-LIMITS = Limits()
 Check = Callable[[Evidence], Finding | None]
 
 CHECKS: tuple[Check, ...] = (
@@ -22,6 +22,7 @@ CHECKS: tuple[Check, ...] = (
     turned_about_vertical,
     earth_axes,
     thrust_direction,
+    velocity_axes,
     clipped_values,
     rare_motors,
     impossible_values,

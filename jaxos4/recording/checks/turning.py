@@ -20,24 +20,25 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
     turns, limits = evidence.turns, evidence.limits
     if turns is None:
         return None
-    scale = np.hypot(*turns.matrix.value[:2, :2].T).tolist()
-    scale, error = np.array([*scale, abs(turns.matrix.value[2, 2])]), np.diagonal(turns.matrix.error)
+    matrix, error = turns.matrix.value, np.diagonal(turns.matrix.error)
+    clear = np.abs(matrix) > limits.standard_errors * turns.matrix.error  # others only add noise
+    scale = np.linalg.norm(np.where(clear | np.eye(3, dtype=bool), matrix, 0.0), axis=1)
     judged = (error < _WELL * scale) & (turns.explained > _FOLLOWS)
-    far = np.abs(np.log(np.where(judged, scale, 1.0))) > max(math.log1p(limits.scale), 0)
+    far = np.abs(np.log(np.where(judged, scale, 1.0))) > math.log1p(limits.scale)
     far &= np.abs(scale - 1) > limits.standard_errors * error
     if not far.any():
         return None
     mean = float(np.exp(np.log(scale[far]).mean()))
     kinematics = scaled_angles(evidence.pieces, turns)
-    gyro = "the gyro's scale or the time stamps are wrong"
+    gyro = _gyro_or_time(evidence, mean)
     causes = {True: "the scale of the attitude is wrong", False: gyro}
-    clear = abs(kinematics) > limits.kinematics
-    cause = causes[kinematics > 0] if clear else f"{gyro}, or that of the attitude"
+    known = abs(kinematics) > limits.kinematics
+    cause = causes[kinematics > 0] if known else f"{gyro}, or that of the attitude"
     for factor, unit in ((_DEGREES, "degrees"), (1 / _DEGREES, "radians that were divided by 57.3")):
         if abs(mean / factor - 1) < _ABOUT:
             cause += f": it may be in {unit if mean > 1 else 'degrees per second'}"
     which = "" if far.sum() == judged.sum() else f" in {' and '.join(np.array(AXES)[far])}"
-    only_attitude = clear and kinematics > 0
+    only_attitude = known and kinematics > 0
     return Finding(
         "attitude_scale" if only_attitude else "gyro_or_time_scale",
         f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}",
@@ -82,3 +83,14 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
         _ALL,
         True,
     )
+
+
+def _gyro_or_time(evidence: Evidence, scale: float) -> str:
+    """What else than the attitude is wrong. A velocity shows whether it is the time."""
+    if evidence.velocity is not None:
+        slope, unlike = float(evidence.velocity.value[0]), evidence.limits.velocity
+        if abs(slope / scale - 1) < unlike < abs(slope - 1):
+            return "the time stamps are wrong, as the velocity changes by as much"
+        if abs(slope - 1) < unlike < abs(slope / scale - 1):
+            return "the gyro's scale is wrong"
+    return "the gyro's scale or the time stamps are wrong"

@@ -14,6 +14,7 @@ _SENSED = ("p", "q", "r", *FORCE_NAMES)  # a rotor at its limit is a fact, and n
 _QUANTILES = (0.005, 0.995)
 _NEIGHBOURS = np.array([-3, -2, -1, 1, 2, 3])
 _NEAR = 0.01  # of the range between the quantiles: values this close to the largest one are its neighbours
+_LEVELS = 10  # values that are repeated: those of a coarse signal
 _FEWEST = 20  # values; fewer have no usual range
 
 
@@ -99,9 +100,12 @@ def _stuck(values: Float[np.ndarray, " samples"], times: float, fewest: int) -> 
     held = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]])))
     usual = float(np.quantile(held, 0.9))  # samples for which a value is held
     edges = np.flatnonzero(np.diff(np.concatenate([[0], top.astype(int), [0]])))
-    visits = np.ceil((edges[1::2] - edges[::2]) / usual).sum()
-    below = x[~top].max(initial=-np.inf)
-    beside = np.count_nonzero(x[~top] >= min(x.max() - near, below)) / usual
-    if visits >= max(fewest, times * (beside + 1)):
+    at_top = np.ceil((edges[1::2] - edges[::2]) / usual).sum()
+    levels, counts = np.unique(x, return_counts=True)
+    levels = levels[counts > 1]
+    if levels.size > _LEVELS:  # the level below the top is near
+        near = max(near, 1.01 * float(np.median(np.diff(levels))))
+    beside = np.count_nonzero(x[~top] >= x.max() - near) / usual
+    if at_top >= max(fewest, times * (beside + 1)):
         out[known[top]] = True
     return out
