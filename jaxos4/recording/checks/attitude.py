@@ -77,10 +77,10 @@ def _every(pieces: Sequence[Recording], scale: np.ndarray | None = None) -> list
 def _turned(piece: Recording, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """How far attitude and gyro turn about the axes of the body within `_SPAN` [rad]; NaN in gaps."""
     angles, rates = piece.states[:, ANGLES], piece.states[:, RATES]
-    grid = np.arange(piece.time[0], piece.time[-1], _STEP)
-    late = round(_SPAN / _STEP)
-    if min(np.isfinite(angles).sum(axis=0).min(), np.isfinite(rates).sum(axis=0).min()) < 2 or grid.size < 4 * late:
+    late, fewest = round(_SPAN / _STEP), min(np.isfinite(x).sum(axis=0).min() for x in (angles, rates))
+    if fewest < 2 or piece.dt > _SPAN or np.ptp(piece.time) < 4 * _SPAN:
         return None
+    grid = np.arange(piece.time[0], piece.time[-1], _STEP)
     angles = np.column_stack([interpolated(grid, piece.time, column, turns=True) for column in angles.T]) / scale
     total = np.column_stack([interpolated(grid, *_integral(piece.time, column)) for column in rates.T])
     (roll, pitch, _), (d_roll, d_pitch, d_yaw) = angles[late // 2 : -late // 2].T, (angles[late:] - angles[:-late]).T

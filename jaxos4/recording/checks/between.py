@@ -20,7 +20,9 @@ def different_vehicles(
 
     Without an accelerometer, thrust is compared with the weight.
     """
-    ratios = [ratio for each in recordings if (ratio := _thrust_ratio(Evidence(each, airframe, limits))) is not None]
+    with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
+        every = [_thrust_ratio(Evidence(recording, airframe, limits)) for recording in recordings]
+    ratios = [ratio for ratio in every if ratio is not None]
     if len(ratios) < 2:
         return None
     (least, first), (most, second) = min(ratios), max(ratios)
@@ -52,7 +54,7 @@ def _thrust_ratio(evidence: Evidence) -> tuple[float, float] | None:
         thrusts.append(thrust[known])
         forces.append(force[known])
     thrust, force = np.concatenate([*thrusts, []]), np.concatenate([*forces, []])
-    if thrust.size < _BLOCKS or thrust.mean() <= 0:
+    if thrust.size < _BLOCKS or min(thrust.mean(), force.mean()) <= 0:
         return None
     parts = np.array(
         [x.mean() / y.mean() for x, y in zip(*(np.array_split(z, _BLOCKS) for z in (force, thrust)), strict=True)]

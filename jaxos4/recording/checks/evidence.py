@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from ...airframe import Airframe
 from ...flight import RATES
+from ...logs.sampling import held_regularly
 from ..pieces import Recording, cut
 from ..usable import SHORTEST, stretches
 from .attitude import Turns, attitude_turns
@@ -56,7 +57,7 @@ class Evidence:
             return self.pieces
         carried = float(np.median(thrust) / self.airframe.gravity)
         rates = whole.states[:, RATES]
-        moves = np.isfinite(rates).any() and max(np.std(x[np.isfinite(x)]) for x in rates.T) > _FLYING
+        moves = max((np.std(x[np.isfinite(x)]) for x in rates.T if np.isfinite(x).any()), default=0.0) > _FLYING
         return (whole,) if moves and _CARRIED[0] < carried < _CARRIED[1] else ()
 
     def thrust(self, piece: Recording) -> Float[np.ndarray, " samples"] | None:
@@ -91,7 +92,10 @@ class Evidence:
 
     @functools.cached_property
     def motor_step(self) -> float:
-        """The mean time between new motor values in flight [s]; 0 if each sample has one, or if they never change."""
-        changes = sum(np.count_nonzero((np.diff(piece.omega, axis=0) != 0).any(axis=1)) for piece in self.pieces)
-        seconds = sum(float(np.ptp(piece.time)) for piece in self.pieces)
-        return seconds / changes if changes and seconds > _HELD * changes * self.logged.dt else 0.0
+        """The time between new motor values in flight [s]; 0 if they change in each sample, or at no fixed rate."""
+        steps = [0.0]
+        for piece in self.pieces:
+            changes = piece.time[1:][(np.diff(piece.omega, axis=0) != 0).any(axis=1)]
+            if held_regularly(changes):
+                steps.append(float(np.median(np.diff(changes))))
+        return max(steps) if max(steps) > _HELD * self.logged.dt else 0.0

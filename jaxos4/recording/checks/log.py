@@ -90,7 +90,7 @@ def short_flight(evidence: Evidence) -> Finding | None:
         return None
     rates, dt, _ = max(every, key=lambda part: part[2])
     seconds, lasting = sum(part[2] for part in every), float(np.mean([dt * _correlated(column) for column in rates.T]))
-    motions = seconds / (2 * lasting)
+    motions = seconds / (2 * lasting) if lasting > 0 else math.inf  # nothing moves
     if motions >= evidence.limits.motions:
         return None
     return Finding(

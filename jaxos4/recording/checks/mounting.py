@@ -70,7 +70,7 @@ def _by_attitude(evidence: Evidence) -> tuple[float, float] | None:
         return None
     (a, b), (c, d) = turns.matrix.value[:2, :2]
     size, error = math.sqrt(abs(a * d - b * c)), math.hypot(turns.matrix.error[0, 1], turns.matrix.error[1, 0])
-    if a * d < b * c or error > size:
+    if a * d < b * c or error >= size:
         return None
     return math.atan2(c - b, a + d), error / (2 * size)
 

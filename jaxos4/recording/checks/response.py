@@ -49,8 +49,10 @@ class _Fit(NamedTuple):
 
 
 def rotor_response(pieces: Sequence[Recording], airframe: Airframe) -> Response | None:
-    """Compare gyro and accelerometer with the rotors. `None`: the flight is too short, or has no gyro."""
+    """Compare gyro and accelerometer with the rotors. `None`: the flight is too short, too slow, or has no gyro."""
     step = max(_STEP, *(piece.dt for piece in pieces))
+    if step > 0.5 / _BAND[1]:
+        return None
     segments = [segment for piece in pieces for segment in _segments(piece, airframe, step)]
     if len(segments) < _FEWEST_SEGMENTS:
         return None

@@ -60,7 +60,7 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     opposite = [axis for axis, m, e in zip(AXES, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
     tilts = matrix[:2, :2]
     sizes = np.hypot(*tilts)
-    if (error[:2, :2] > sizes).any():
+    if (error[:2, :2] >= sizes).any():
         return None
     unrelated = (np.abs(np.diagonal(matrix)) + np.diagonal(error) < _FOLLOWS)[:2].all() and sizes.max() < _FOLLOWS
     if np.linalg.det(tilts) > 0 and not unrelated and opposite in ([], ["roll", "pitch"]):

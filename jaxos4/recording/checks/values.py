@@ -49,10 +49,11 @@ def plausible(recording: Recording, *, spread: float = 8.0, times: float = 3.0, 
             impossible[name] = int(wrong.sum()), float(worst)
             column[wrong] = np.nan
         if name in _SENSED:
+            known = np.count_nonzero(np.isfinite(column))
             for sign in (1.0, -1.0):
                 stuck = _stuck(sign * column, times, fewest)
                 if stuck.any():
-                    end, known = float(column[stuck][0]), np.isfinite(column).sum()
+                    end = float(column[stuck][0])
                     count, share, before = clipped.get(name, (0, 0.0, end))
                     clipped[name] = (
                         count + int(stuck.sum()),
