@@ -61,7 +61,7 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
     return Finding(
         "_or_".join(names) + CLOCK,
         ", or ".join(causes),
-        f"{1e3 * wrong[best[0]]:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.1g} ms",
+        f"{1e3 * wrong[best[0]]:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
         "shift the time stamps, or log without a filter",
         tuple(dict.fromkeys(quantity for name in names for quantity in _QUANTITIES[name])),
         # The delay of the motors is estimated with the other parameters.
@@ -85,7 +85,7 @@ def _delays(evidence: Evidence) -> tuple[list[_Delay], bool]:
         delays.append(_Delay((1, 0, 0, -1), late, gyro[1], usual))
         before = min(gyro[0] + response.lag, 0.0) if response.lag else gyro[0]
         differ |= abs(before) > max(limits.late, limits.standard_errors * gyro[1])
-        if response.coherent[2] > _COHERENT[1]:
+        if response.coherent[2] > _COHERENT[1] and math.isfinite(between[1]):
             delays.append(_Delay((1, -1, 0, 0), *between, _GUSTS))
             differ |= abs(between[0]) > max(limits.delay, limits.standard_errors * between[1])
     return delays, differ

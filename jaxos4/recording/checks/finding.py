@@ -53,8 +53,8 @@ class Limits(msgspec.Struct, frozen=True):
     - `velocity`: of the horizontal acceleration by the velocity against that by force and attitude, relative.
       Velocities that are averaged while the vehicle yaws differ by 5 %.
     - `gravity`: of the mean specific force, relative to gravity. It is up to 10 % larger in brisk flight.
-    - `thrust`, `commanded_thrust`: of the airframe's thrust, relative, by measured speeds and by commands. A wrong
-      thrust coefficient is measured by the accelerometer; this is a note.
+    - `thrust`, `commanded_thrust`: of the airframe's thrust, relative, by measured speeds and by commands. The fit
+      measures the thrust by the accelerometer: errors of 20 % are harmless.
     - `vehicles`, `commanded_vehicles`: of the thrust between two logs of one vehicle, relative, by measured speeds and
       by commands. A battery that empties changes the thrust of a command by up to 30 %.
     - `clipped`: the share of clipped values above which a channel cannot be used.
@@ -73,7 +73,7 @@ class Limits(msgspec.Struct, frozen=True):
     late_attitude: float = 0.025
     velocity: float = 0.15
     gravity: float = 0.3
-    thrust: float = 0.25
+    thrust: float = 0.35
     commanded_thrust: float = 1.0
     vehicles: float = 0.1
     commanded_vehicles: float = 0.4

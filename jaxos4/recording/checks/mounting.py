@@ -41,7 +41,7 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
         quantities = (*INERTIAS, "attitude")
     else:
         cause, quantities = "the attitude is of axes at an angle about the vertical axis", ("attitude",)
-    ways = " and ".join(f"{math.degrees(a):.1f} +- {math.degrees(2 * e):.1g} degrees by the {n}" for (a, e), n in found)
+    ways = " and ".join(f"{math.degrees(a):.1f} +- {math.degrees(2 * e):.2g} degrees by the {n}" for (a, e), n in found)
     remedy = "leave the attitude out, or correct it"
     if quantities != ("attitude",):
         remedy = f"{_TURN}: {math.degrees(angle):.0f} degrees, counter-clockwise seen from above"
@@ -83,7 +83,7 @@ def earth_axes(evidence: Evidence) -> Finding | None:
     return Finding(
         "earth_axes",
         "the specific force is along the axes of the earth, and not of the body",
-        f"its horizontal part follows the tilt with a slope of {slope.value:.2f} +- {2 * slope.error:.1g}: 1 along the "
+        f"its horizontal part follows the tilt with a slope of {slope.value:.2f} +- {2 * slope.error:.2g}: 1 along the "
         "axes of the earth, 0 or less along those of the body",
         "log the accelerometer along the body's axes, or turn it by the attitude",
         ("thrust", *INERTIAS),

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from ...excitation import AXES
+from ..motion import excitation
 from .attitude import scaled_angles
 from .evidence import Evidence
 from .finding import INERTIAS, Finding
@@ -12,6 +13,7 @@ from .finding import INERTIAS, Finding
 _DEGREES, _ABOUT = math.degrees(1), 0.05  # a scale this close to that of degrees is that of degrees
 _WELL = 0.3  # largest standard error of an axis that is judged, as a share of its scale
 _FOLLOWS = 0.2  # the least share of the attitude's turns that a gyro explains
+_UNRELATED = 0.1  # a gyro that moves, and explains less, is of another flight than the attitude
 _ALL = (*INERTIAS, "attitude")
 
 
@@ -30,25 +32,22 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
         return None
     mean = float(np.exp(np.log(scale[far]).mean()))
     kinematics = scaled_angles(evidence.pieces, turns)
-    gyro = _gyro_or_time(evidence, mean)
-    causes = {True: "the scale of the attitude is wrong", False: gyro}
-    known = abs(kinematics) > limits.kinematics
-    cause = causes[kinematics > 0] if known else f"{gyro}, or that of the attitude"
-    for factor, unit in ((_DEGREES, "degrees"), (1 / _DEGREES, "radians that were divided by 57.3")):
+    gyro, known = _gyro_or_time(evidence, mean), abs(kinematics) > limits.kinematics
+    name, quantities = "attitude_or_gyro_or_time_scale", _ALL
+    cause = f"{gyro}, or that of the attitude"
+    remedy = "compare a turn by hand with the gyro's integral, and the length of the log with a clock"
+    if known and kinematics > 0:
+        name, quantities, cause = "attitude_scale", ("attitude",), "the scale of the attitude is wrong"
+        remedy = "leave the attitude out, or correct it"
+    elif known:
+        name, quantities, cause = "gyro_or_time_scale", INERTIAS, gyro
+    for factor, unit in ((_DEGREES, "the angles may be in degrees"), (1 / _DEGREES, "the gyro may be in degrees/s")):
         if abs(mean / factor - 1) < _ABOUT:
-            cause += f": it may be in {unit if mean > 1 else 'degrees per second'}"
+            cause += f"; {unit}"
     which = "" if far.sum() == judged.sum() else f" in {' and '.join(np.array(AXES)[far])}"
-    only_attitude = known and kinematics > 0
-    return Finding(
-        "attitude_scale" if only_attitude else "gyro_or_time_scale",
-        f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}",
-        ", ".join(f"{a} {s:.3f} +- {2 * e:.1g}" for a, s, e, j in zip(AXES, scale, error, judged, strict=True) if j),
-        "leave the attitude out, or correct it"
-        if only_attitude
-        else "compare a turn by hand with the gyro's integral, and the length of the log with a clock",
-        ("attitude",) if only_attitude else INERTIAS,
-        True,
-    )
+    axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(AXES, scale, error, judged, strict=True) if j]
+    cause = f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}"
+    return Finding(name, cause, ", ".join(axes), remedy, quantities, True)
 
 
 def wrong_axes(evidence: Evidence) -> Finding | None:
@@ -60,19 +59,17 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     opposite = [axis for axis, m, e in zip(AXES, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
     tilts = matrix[:2, :2]
     sizes = np.hypot(*tilts)
-    if (error[:2, :2] >= sizes).any():
+    follows = 100 * turns.explained[:2].max()
+    unrelated = follows < 100 * _UNRELATED and _moves(evidence)
+    if not unrelated and (error[:2, :2] >= sizes).any():
         return None
-    unrelated = (np.abs(np.diagonal(matrix)) + np.diagonal(error) < _FOLLOWS)[:2].all() and sizes.max() < _FOLLOWS
     if np.linalg.det(tilts) > 0 and not unrelated and opposite in ([], ["roll", "pitch"]):
         return None
-    if unrelated or turns.explained[:2].max() < _FOLLOWS:
-        cause, size = (
-            "the attitude does not turn as the gyro says",
-            f"it explains {100 * turns.explained[:2].max():.0f} %",
-        )
+    if unrelated:
+        cause, size = "the attitude does not turn as the gyro says", f"the gyro explains {follows:.0f} % of its turns"
     elif opposite:
-        cause = f"attitude and gyro have opposite signs in {' and '.join(opposite)}"
-        size = f"slope {matrix[AXES.index(opposite[0])][AXES.index(opposite[0])]:.2f}"
+        slope = np.diagonal(matrix)[AXES.index(opposite[0])]
+        cause, size = f"attitude and gyro have opposite signs in {' and '.join(opposite)}", f"slope {slope:.2f}"
     else:
         cause, size = "roll and pitch of attitude and gyro are exchanged", f"slope {matrix[0, 1]:.2f}"
     return Finding(
@@ -83,6 +80,11 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
         _ALL,
         True,
     )
+
+
+def _moves(evidence: Evidence) -> bool:
+    """Whether roll or pitch are excited well."""
+    return any(excitation(piece)[axis].verdict == "good" for piece in evidence.pieces for axis in AXES[:2])
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
