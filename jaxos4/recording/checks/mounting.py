@@ -28,23 +28,26 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     def turned(angle: tuple[float, float] | None) -> bool:
         return angle is not None and abs(angle[0]) > max(limits.angle, limits.standard_errors * angle[1])
 
-    found = [(angle, name) for angle, name in ((attitude, "attitude"), (rotors, "rotors")) if angle and turned(angle)]
-    if not found:
+    by_attitude, by_rotors = turned(attitude), turned(rotors)
+    if not by_attitude and not by_rotors:
         return None
-    (angle, _), quantities = found[0][0], INERTIAS
-    if len(found) == 2:
-        cause = "gyro and accelerometer are mounted at an angle about the vertical axis"
-    elif found[0][1] == "rotors":
-        cause = "the gyro is mounted at an angle about the vertical axis, or `rotor_positions` are"
-    elif rotors is None:
+    quantities, angle = INERTIAS, attitude if by_attitude and attitude else rotors or (0.0, 0.0)
+    if rotors is None:
         cause = "the gyro is mounted at an angle about the vertical axis, or the attitude is of other axes"
         quantities = (*INERTIAS, "attitude")
+    elif not by_attitude or attitude is None:
+        cause = "the gyro is mounted at an angle about the vertical axis, or `rotor_positions` are"
+    elif abs(math.remainder(rotors[0] - attitude[0], math.tau)) < abs(rotors[0]):
+        cause = "gyro and accelerometer are mounted at an angle about the vertical axis"
     else:
         cause, quantities = "the attitude is of axes at an angle about the vertical axis", ("attitude",)
-    ways = " and ".join(f"{math.degrees(a):.1f} +- {math.degrees(2 * e):.2g} degrees by the {n}" for (a, e), n in found)
+    known = {name: each for name, each in (("attitude", attitude), ("rotors", rotors)) if each is not None}
+    ways = " and ".join(
+        f"{math.degrees(a):.1f} +- {math.degrees(2 * e):.2g} degrees by the {name}" for name, (a, e) in known.items()
+    )
     remedy = "leave the attitude out, or correct it"
     if quantities != ("attitude",):
-        remedy = f"{_TURN}: {math.degrees(angle):.0f} degrees, counter-clockwise seen from above"
+        remedy = f"{_TURN}: {math.degrees(angle[0]):.0f} degrees, counter-clockwise seen from above"
     return Finding("mounting", cause, ways, remedy, quantities, True)
 
 
