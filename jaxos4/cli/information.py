@@ -33,7 +33,7 @@ def inspect(
     ] = None,
     out: options.OutOption = None,
 ) -> None:
-    """Show what a log contains, which parts of it can be used, and how much they excite each axis."""
+    """Show what a log contains, whether it agrees with itself, which parts can be used, and how much they excite."""
     check_outputs(log, airframe, out=out, airframe_out=airframe_out)
     if airframe_out is not None and airframe_out.exists():
         raise InputError(f"{airframe_out}: exists, and may hold what you measured; give another name.")
@@ -72,6 +72,9 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
     )
     for finding in found.findings:
         console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
+    for each in found.checks:
+        verb = "contradicts" if each.contradicted else "concerns"
+        console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
     for names, unit in _UNITS.items():
         measured = {name: found.measured[name] for name in names.split() if name in found.measured}
         if not measured:

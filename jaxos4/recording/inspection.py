@@ -11,6 +11,7 @@ import numpy as np
 from ..airframe import GRAVITY, GUESS, Airframe
 from ..flight import CHANNEL_NAMES
 from ..logs import log_format
+from .checks import CLOCK, Finding, self_checks
 from .motion import Excitation, excitation, motor_clock_note, opposite_axes, refused_note, rotor_signs, yaw_doubt
 from .pieces import Recording, Stretch, cut
 from .usable import nothing_usable, stretches
@@ -47,6 +48,7 @@ class Inspection(msgspec.Struct, frozen=True):
     - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
     - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
     - `findings`: why no vehicle can be identified from the log, and what to do, most important first.
+    - `checks`: faults that the log shows, see `jaxos4.recording.checks`.
     - `notes`: remarks of the reader.
     - `parts`: the stretches in order of time.
     """
@@ -59,6 +61,7 @@ class Inspection(msgspec.Struct, frozen=True):
     sample_time: float
     measured: dict[str, Channel]
     findings: tuple[str, ...]
+    checks: tuple[Finding, ...]
     notes: tuple[str, ...]
     parts: tuple[Part, ...]
 
@@ -82,7 +85,9 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     nothing = "" if usable else f"{nothing_usable(found)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(usable, airframe)
     doubt = yaw_doubt(opposite)
-    clock = "" if airframe is None else motor_clock_note(usable, airframe)
+    checks = self_checks(recording, airframe)
+    clocked = any(finding.name.endswith(CLOCK) for finding in checks)
+    clock = "" if airframe is None or clocked else motor_clock_note(usable, airframe)
     findings = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
@@ -93,6 +98,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         measured=_measured(recording),
         findings=findings,
+        checks=checks,
         notes=(*recording.notes, *filter(None, ("; ".join(doubt or ()), clock))),
         parts=tuple(parts),
     )

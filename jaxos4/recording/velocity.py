@@ -33,7 +33,7 @@ def velocity_of(recording: Recording) -> tuple[Float[np.ndarray, "samples 3"], U
     constant. They differ in long turns, and if the gyro errs. Both are the same if the attitude was measured.
     """
     angles, velocity = (_filled(recording, names) for names in (_ANGLES, _VELOCITY))
-    to_body = None if angles is None else _to_body(*angles.T)
+    to_body = None if angles is None else rotations_to_body(*angles.T)
     if to_body is not None and velocity is not None:
         return np.einsum("tij,tj->ti", to_body, velocity), (to_body[:, :, 2], to_body[:, :, 2])
     rates, force = _filled(recording, _RATES), recording.specific_force
@@ -64,7 +64,7 @@ def _without_gaps(values: Float[np.ndarray, "samples columns"]) -> Float[np.ndar
     return np.take_along_axis(values, source, axis=0)
 
 
-def _to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> Float[np.ndarray, "samples 3 3"]:
+def rotations_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> Float[np.ndarray, "samples 3 3"]:
     """The rotations from the earth frame, the inverse of R_z(psi) R_y(theta) R_x(phi)."""
     (sx, cx), (sy, cy), (sz, cz) = ((np.sin(angle), np.cos(angle)) for angle in (phi, theta, psi))
     rows = (

@@ -1,0 +1,116 @@
+"""Checks of the log itself: its time, its values, how often motors were written, and how long it is."""
+
+import math
+
+import numpy as np
+
+from ...flight import FORCE_NAMES, RATES
+from ...logs.table import counted
+from .evidence import Evidence
+from .finding import INERTIAS, Finding
+
+_UNIFORM = 0.05  # of the step; resampled logs are far below
+_UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
+_QUANTITIES = dict(zip(("p", "q", "r"), INERTIAS, strict=True)) | {"az": "thrust"}
+
+
+def uneven_time(evidence: Evidence) -> Finding | None:
+    """Samples that are not on a uniform grid, which a `Flight` from Python may have."""
+    steps = np.diff(evidence.logged.time)
+    step = float(np.median(steps))
+    uneven = np.abs(steps - step) > _UNIFORM * step
+    if not uneven.any():
+        return None
+    missing = 1 - (steps.size + 1) / (np.sum(steps) / step + 1)
+    if missing > 0:
+        size = f"{100 * missing:.2g} % of the samples are missing, in gaps of up to {1e3 * steps.max():.3g} ms"
+    else:
+        size = f"steps of {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms"
+    return Finding(
+        "uneven_time",
+        "the time of the flight is not uniform",
+        size,
+        "write the flight to a CSV and read it with `jaxos4.recording.read_recording`, which resamples it",
+        (*INERTIAS, "thrust", "motors", "damping", "attitude"),
+        True,
+    )
+
+
+def impossible_values(evidence: Evidence) -> Finding | None:
+    """Single values far from all others."""
+    found = evidence.plausible.impossible
+    if not found:
+        return None
+    return Finding(
+        "impossible_values",
+        "single values are impossible, and count as not measured",
+        ", ".join(f"{name}: {counted(number, 'value')}, as {worst:.4g}" for name, (number, worst) in found.items()),
+        "nothing is to be done if they are few",
+        (*INERTIAS, "thrust"),
+        False,
+    )
+
+
+def clipped_values(evidence: Evidence) -> Finding | None:
+    """Values at the end of a sensor's range."""
+    found = evidence.plausible.clipped
+    if not found:
+        return None
+    each = [f"{n}: {count} ({100 * share:.2g} %) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
+    many = max(share for _, share, _ in found.values()) > evidence.limits.clipped
+    return Finding(
+        "clipped_values",
+        "a sensor is clipped at the end of its range; these values count as not measured",
+        ", ".join(each),
+        "fly gentler, or set a larger range of the sensor",
+        tuple(_QUANTITIES[name] for name in found if name in _QUANTITIES),
+        many,
+    )
+
+
+def rare_motors(evidence: Evidence) -> Finding | None:
+    """Rotor speeds or commands that keep their value for longer than rotors take to answer."""
+    if evidence.motor_step <= evidence.limits.held:
+        return None
+    return Finding(
+        "rare_motors",
+        "motors were logged more rarely than rotors answer, so that the damping comes out too large",
+        f"new values every {1e3 * evidence.motor_step:.0f} ms",
+        "log motors at 100 Hz or more, on board",
+        ("damping",),
+        True,
+    )
+
+
+def short_flight(evidence: Evidence) -> Finding | None:
+    """Few independent motions of roll and pitch."""
+    every = [(piece.states[:, RATES[:2]], piece.dt, float(np.ptp(piece.time))) for piece in evidence.pieces]
+    every = [part for part in every if np.isfinite(part[0]).any(axis=0).all()]
+    if not every:
+        return None
+    rates, dt, _ = max(every, key=lambda part: part[2])
+    seconds, lasting = sum(part[2] for part in every), float(np.mean([dt * _correlated(column) for column in rates.T]))
+    motions = seconds / (2 * lasting) if lasting > 0 else math.inf  # nothing moves
+    if motions >= evidence.limits.motions:
+        return None
+    return Finding(
+        "short_flight",
+        "the flight is short, so that intervals may be too narrow",
+        f"{seconds:.1f} s, or {motions:.0f} independent motions of {2 * lasting:.2g} s",
+        f"fly for {_round_up(2 * evidence.limits.motions * 2 * lasting)} s or longer",
+        INERTIAS,
+        False,
+    )
+
+
+def _correlated(values: np.ndarray) -> float:
+    """The sum of the autocorrelation until it is first negative, in samples."""
+    values = np.nan_to_num(values - np.nanmean(values))
+    power = np.square(np.abs(np.fft.rfft(values, 1 << (2 * values.size - 1).bit_length())))
+    products = np.fft.irfft(power)[: values.size]
+    until = int(np.argmax(products < 0)) or values.size
+    return float(products[:until].sum() / max(products[0], 1e-300))
+
+
+def _round_up(seconds: float) -> int:
+    return 5 * math.ceil(seconds / 5)
