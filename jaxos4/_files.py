@@ -1,19 +1,22 @@
-"""Output files are written completely or not at all. TOML files are read, or refused in one line."""
+"""Output files are written completely or not at all. JSON and TOML files are read, or refused in one line."""
 
 import contextlib
 import errno
+import json
+import math
 import os
 import secrets
 import shutil
+import sys
 import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError
+from .errors import InputError, shortened
 
 # Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
 BROKEN = (
@@ -29,6 +32,9 @@ BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
 )
+
+_LARGEST_TEXT = 1 << 27  # bytes of a JSON or TOML file: a study with inputs of a million samples
+_LARGEST = sys.float_info.max  # of a number: a longer integer has no float, and Python does not print it
 
 
 @contextlib.contextmanager
@@ -65,7 +71,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
 def write_file(path: str | os.PathLike[str], content: str | bytes | memoryview) -> None:
     """Write a file completely or not at all. Text is written as UTF-8."""
     with write_atomically(path) as beside:
-        beside.write_bytes(content.encode() if isinstance(content, str) else content)
+        beside.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
 def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None:
@@ -100,12 +106,48 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The table in a TOML file. Raises `InputError` if the file is not TOML, `OSError` if it cannot be read."""
+    """The table in a TOML file. Errors are those of `read_json`."""
+    return _read_text(path, lambda content: tomllib.loads(content.decode()), "TOML", "correct that place", _LARGEST)
+
+
+def read_json(path: str | os.PathLike[str], remedy: str, largest: float = _LARGEST) -> Any:
+    """The value in a JSON file; `largest`: of its numbers.
+
+    **Raises:** `InputError`, which ends with the remedy, if it is no such file or `check_plain` refuses the value;
+    `OSError` if the file cannot be read.
+    """
+    return _read_text(path, json.loads, "JSON", remedy, largest)
+
+
+def _read_text(
+    path: str | os.PathLike[str], decode: Callable[[bytes], Any], kind: str, remedy: str, largest: float
+) -> Any:
+    with open(path, "rb") as file:
+        content = file.read(_LARGEST_TEXT + 1)
+    if len(content) > _LARGEST_TEXT:
+        raise InputError(f"{path}: has more than {_LARGEST_TEXT:,} bytes; {remedy}.")
     try:
-        with open(path, "rb") as file:
-            return tomllib.load(file)
+        value = decode(content)
     except RecursionError:
-        raise InputError(f"{path}: its tables are nested too deeply; use fewer levels.") from None
+        raise InputError(f"{path}: is nested too deeply; {remedy}.") from None
     except ValueError as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: not a TOML file ({reason}); correct that place.") from None
+        reason = shortened(" ".join(str(error).split()), 200)
+        raise InputError(f"{path}: not a {kind} file ({reason}); {remedy}.") from None
+    check_plain(path, value, remedy, largest)
+    return value
+
+
+def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST) -> None:
+    """Refuse, at any depth, a text that is not one printable line, and a finite number beyond `largest`."""
+    pending = [("", value)]
+    while pending:
+        place, each = pending.pop()
+        if isinstance(each, dict):
+            pending += ((f"{place}.{key}".strip("."), part) for key, part in each.items())
+            pending += ((place, key) for key in each)
+        elif isinstance(each, list | tuple):
+            pending += ((place, part) for part in each)
+        elif isinstance(each, str) and not each.isprintable():
+            raise InputError(f"{path}: `{shortened(place, 80)}` is not one line of text; {remedy}.")
+        elif isinstance(each, int | float) and largest < abs(each) != math.inf:
+            raise InputError(f"{path}: `{shortened(place, 80)}` is beyond {largest:.3g}; {remedy}.")

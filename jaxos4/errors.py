@@ -3,13 +3,23 @@
 import contextlib
 from collections.abc import Iterator
 
+_LONGEST = 5000  # characters of a message: a path alone may have 4096
+
 
 class InputError(ValueError):
-    """A file or an argument cannot be used."""
+    """A file or an argument cannot be used. The message is one printable line, whatever a file put into it."""
+
+    def __init__(self, message: str):
+        super().__init__(shortened(printable(message), _LONGEST))
 
 
 class TrainingError(RuntimeError):
     """A network could not be trained."""
+
+
+def printable(text: str) -> str:
+    """`text` on one line, with unprintable characters escaped: line breaks, controls, bytes that are not UTF-8."""
+    return text if text.isprintable() else "".join(x if x.isprintable() else repr(x)[1:-1] for x in text)
 
 
 def shortened(text: str, most: int) -> str:

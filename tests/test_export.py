@@ -250,7 +250,7 @@ def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tm
 @pytest.mark.parametrize(
     ("result", "fragments"),
     [
-        ("not JSON", ("found.json: not a result", "jaxos4 estimate --out")),
+        ("not JSON", ("found.json: not a JSON file", "jaxos4 estimate --out")),
         ({"log": "flight.csv"}, ("found.json: not a result", "estimator")),
         (
             {k: v for k, v in vehicle_result().items() if k != "airframe"},

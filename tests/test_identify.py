@@ -111,8 +111,9 @@ def test_a_log_shows_whether_its_vehicle_is_real(vehicle, tmp_path):
     speeds = commands._replace(commanded=False)
     assert vehicle_evidence(speeds) == ""
     (tmp_path / "log").write_bytes(everything())
-    assert vehicle_evidence(speeds._replace(name=str(tmp_path / "log"))) == "is a log of a vehicle (PX4 ULog)"
-    assert vehicle_evidence(speeds._replace(name="flight 1")) == ""
+    facts = read_recording(tmp_path / "log", full_scale=1.0).facts
+    assert vehicle_evidence(speeds._replace(facts=facts)) == "is a log of a vehicle (PX4 ULog)"
+    assert vehicle_evidence(jaxos4.Recording.of(speeds.flight)) == ""
 
 
 def test_each_measurement_is_either_fitted_or_held_out(vehicle):

@@ -146,7 +146,7 @@ def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole,
 
 def test_a_folder_whose_specification_is_damaged_is_refused(copy, run):
     other = '{"version": "0.0.1", "device": "d", "study": {"of": "old"}}'
-    contents = dict.fromkeys(("", "\x00\x01", "[1, 2]", "[" * 100_000), "not the specification of a study")
+    contents = dict.fromkeys(("", "\x00\x01", "[1, 2]", "[" * 100_000), "give another folder")
     for content, fragment in (contents | {other: "begun by jaxos4 0.0.1"}).items():
         (copy / "study.json").write_text(content)
         for option in ((), ("--dry-run",)):

@@ -1,6 +1,7 @@
 """The application: its commands and exit codes."""
 
 import functools
+import io
 import os
 import sys
 from collections.abc import Callable
@@ -8,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ..errors import InputError, TrainingError
+from ..errors import InputError, TrainingError, printable
 from ._jax import NO_CACHE, prepare
 from .estimate import estimate, train
 from .identified import export, predict
@@ -59,6 +60,9 @@ def main() -> None:
 
     Exit code 0: done, 1: the computation failed, 2: unusable arguments or input, 130: interrupted.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may hold what no encoding can print
     try:
         code = app(prog_name="jaxos4", standalone_mode=False) or 0
     except BrokenPipeError:  # the reader of our output has gone
@@ -68,7 +72,7 @@ def main() -> None:
         what = " ".join(str(error).split())
         if isinstance(error, OSError) and error.filename is not None:
             what = f"{error.filename}: {error.strerror}; give a path that can be used."
-        typer.echo(f"jaxos4: {what}", err=True)
+        typer.echo(f"jaxos4: {printable(what)}", err=True)
         raise SystemExit(1 if isinstance(error, TrainingError) else 2) from None
     except Exception as error:
         if not hasattr(error, "format_message"):  # what all errors of the parser have, in every version of typer

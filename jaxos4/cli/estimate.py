@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from ..errors import InputError, named
+from ..errors import InputError, named, printable
 from . import _options as options
 from ._output import check_outputs, end, in_options, option_names, stages, write_json
 
@@ -87,7 +87,7 @@ def estimate(
             progress=progress,
         )
     notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
-    title = ", ".join(path.name for path in flights)
+    title = ", ".join(printable(path.name) for path in flights)
     _publish(_with_command(found, airframe or _OS4, notes), out, report, title=title)
 
 
@@ -117,9 +117,9 @@ def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "
 
     provenance = msgspec.structs.replace(
         found.provenance,
-        airframe=airframe,
+        airframe=printable(airframe),
         notes=[*notes, *(in_options(note) for note in found.provenance.notes)],
-        command=shlex.join(["jaxos4", *sys.argv[1:]]),
+        command=printable(shlex.join(["jaxos4", *sys.argv[1:]])),
     )
     doubts = (msgspec.structs.replace(doubt, remedy=in_options(doubt.remedy)) for doubt in found.doubts)
     return msgspec.structs.replace(found, doubts=tuple(doubts), provenance=provenance)

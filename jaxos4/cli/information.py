@@ -43,7 +43,6 @@ def inspect(
         from rich.console import Console
 
         from ..airframe import load_airframe
-        from ..logs import log_format
         from ..recording import read_recording
         from ..recording.inspection import airframe_draft, inspect_log
 
@@ -57,7 +56,7 @@ def inspect(
         write_json(found.to_dict(), out)
     if airframe_out is not None:
         write_file(airframe_out, text)
-    _print_contents(console, found, log_format(log).label)
+    _print_contents(console, found, recording.facts.format.label if recording.facts.format else "")
     _print_parts(console, found)
     if airframe_out is not None:
         still = f"; weigh or measure, and fill in: {', '.join(missing)}"

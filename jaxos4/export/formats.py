@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
+from .._templates import in_xml, templates
 from .._version import __version__
-from ..errors import InputError
-from ..excitation import AXES
+from ..errors import InputError, printable
 from ..results import meaning
 from .result import Identified
 from .vehicle import RigidVehicle
@@ -90,11 +90,10 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
     def text(vehicle: RigidVehicle, *lines: str) -> str:
         made = f"Made by jaxos4 {__version__} from {found.source}."
         notes = (f"Note: {note}" for note in found.notes)
-        # A file's name can have line breaks.
-        comments = [" ".join(line.split()) for line in (made, *lines, *warning, _FRAME, *notes)]
+        comments = [made, *lines, *warning, _FRAME, *notes]
         sizes = {"radius": _ROTOR * vehicle.arm, "thickness": _FLAT * vehicle.arm, "lag": vehicle.lag or _NO_LAG}
         values = {"vehicle": vehicle, "comments": comments, **sizes, **target.values(vehicle)}
-        return _templates().get_template(f"{to}{target.suffix}.j2").render(values)
+        return _templates(target.suffix).get_template(f"{to}{target.suffix}.j2").render(values)
 
     draws, estimated = [found.draw(number, seed=seed) for number in range(samples)], text(found.vehicle)
     limits = re.findall(r"^\W*Note: (.*)$", estimated, re.MULTILINE)[len(found.notes) :]
@@ -107,12 +106,10 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 
 
 def _mujoco(vehicle: RigidVehicle) -> dict[str, Any]:
-    """Controls 1 to 4 are the thrusts of the rotors [N]; the others have no effect."""
-    names = ("x_drag", "y_drag", "z_drag", *(f"{axis}_torque" for axis in AXES))
-    constants, slopes = (0.0, 0.0, 0.0, *vehicle.torque), (*vehicle.drag, *vehicle.damping)
-    rows = zip(names, np.eye(6), constants, slopes, strict=True)
+    """The controls are the thrusts of the rotors [N]. Constant forces of the rotors make the constant torque."""
+    constant = vehicle._replace(torque=np.zeros(3)).hover_thrust - vehicle.hover_thrust
     delayed = math.ceil(vehicle.delay / _SHORTEST_TIMESTEP) + 1
-    return {"passive": [row for row in rows if row[2] or row[3]], "delayed": delayed, "shortest": _SHORTEST_TIMESTEP}
+    return {"constant": constant, "delayed": delayed, "shortest": _SHORTEST_TIMESTEP}
 
 
 def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
@@ -135,11 +132,8 @@ def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
 
 
 @functools.cache
-def _templates() -> jinja2.Environment:
-    made = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    made.loader, made.keep_trailing_newline = jinja2.PackageLoader("jaxos4.export", "."), True
-    # An XML comment must not contain two hyphens in a row.
-    made.filters["hyphens_apart"] = lambda line: re.sub("-(?=-)", "- ", line)
+def _templates(suffix: str) -> jinja2.Environment:
+    made = templates("jaxos4.export", printable if suffix == ".py" else in_xml)
     made.filters["short"] = lambda values: ", ".join(f"{value:.3g}" for value in np.atleast_1d(values))
     made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}
     return made

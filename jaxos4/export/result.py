@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import Airframe, airframe_from_table
-from ..errors import InputError, named
+from ..errors import InputError, named, printable
 from ..identification.results import ResultFile
 from ..linalg import covariance_root
+from ..result_file import result_file
 from .vehicle import CARRIED, INERTIAS, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
@@ -88,7 +89,7 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.
     """
-    file = ResultFile.of(path)
+    file = result_file(path)
     with named(path):
         airframe = airframe_from_table(file.airframe or {})
         values, estimated, notes = _parts(file)
@@ -99,7 +100,7 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
         drawn = tuple(name for name in estimated if name not in negative)
         places = [list(file.parameters).index(name) for name in drawn]
         found = Identified(
-            source=f"{Path(path).name} ({file.estimator}, {file.model} model, {file.result})",
+            source=f"{printable(Path(path).name)} ({file.estimator}, {file.model} model, {file.result})",
             result=file.result,
             airframe=airframe,
             values=_clipped(values),

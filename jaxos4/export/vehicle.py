@@ -18,6 +18,8 @@ CARRIED = (*INERTIAS.values(), "thrust_gain", *(f"{x}_offset" for x in AXES), "r
 CARRIED += ("roll_velocity", "pitch_velocity", "rotor_reaction", "thrust_curve", *NOT_NEGATIVE)
 # The full-scale rotor speed, in hover speeds, if the airframe does not have it.
 _FULL_SCALE = 2.0
+# No constant is this large in SI units.
+_BEYOND = 1e9
 
 
 class RigidVehicle(NamedTuple):
@@ -104,6 +106,8 @@ class RigidVehicle(NamedTuple):
                 return f"{name} = {moment:.3g} kg m^2 is not positive"
             if 2 * moment > self.inertia.sum():
                 return f"{name} = {moment:.3g} kg m^2 exceeds the sum of the other two moments of inertia"
+        if not all((np.abs(each) < _BEYOND).all() for each in self):
+            return "one of its constants is beyond those of every vehicle"
         if not self.thrust_coefficient > 0:
             return "the thrust is not positive"
         if not 0 <= 4 * self.rotor_inertia < self.inertia[2]:
@@ -116,6 +120,7 @@ class RigidVehicle(NamedTuple):
         return ""
 
 
+@np.errstate(all="ignore")  # `impossible` says what is not finite
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
     """The vehicle with an airframe and the parameters that were identified.
 

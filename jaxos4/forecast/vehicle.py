@@ -11,12 +11,13 @@ from jaxtyping import Float
 from .._custom_types import Parameters
 from .._xla import quick_jit
 from ..airframe import airframe_from_table
-from ..errors import InputError, named, shortened
+from ..errors import InputError, named, printable, shortened
 from ..flight import FORCE_NAMES
-from ..identification.results import Identification, ResultFile
+from ..identification.results import Identification
 from ..linalg import covariance_root
 from ..models.terms import TERMS
 from ..models.vehicle import FlightModel
+from ..result_file import result_file
 from ..shooting.gains import LogNoise
 
 _LEAST = 1e-9  # of a noise level, whose logarithm must be finite
@@ -57,9 +58,9 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
 
     **Raises:** `InputError`, one line, if the result has no vehicle or no estimate; `OSError` if it cannot be read.
     """
-    file = ResultFile.of(found)
+    file = result_file(found)
     given = isinstance(found, Identification)
-    name = f"{file.estimator}, {file.model} model" if given else Path(found).name
+    name = f"{file.estimator}, {file.model} model" if given else printable(Path(found).name)
     with named("" if given else found):
         used, airframe = file.provenance, airframe_from_table(file.airframe or {})
         if strangers := [term for term in used.terms or () if term not in TERMS]:

@@ -7,6 +7,7 @@ import os
 import warnings
 
 from ..airframe import Airframe
+from ..errors import printable
 from ..flight import Flight
 from .assemble import recording_of
 from .blackbox import BLACKBOX
@@ -20,7 +21,6 @@ from .table import (
     Sampling as Sampling,
     Table as Table,
     opened,
-    printable,
 )
 from .ulog import ULOG
 
@@ -53,7 +53,9 @@ def read_recording(path: Path, airframe: Airframe | None = None, *, full_scale: 
 
     If the log was written too rarely, its facts say so, and not its notes.
     """
-    return recording_of(*log_format(path).read(path), airframe, full_scale=full_scale)
+    kind = log_format(path)
+    found = recording_of(*kind.read(path), airframe, full_scale=full_scale)
+    return found._replace(facts=found.facts._replace(format=kind))
 
 
 def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..airframe import Airframe
+from ..errors import printable
 from ..flight import CHANNEL_NAMES, STATE_NAMES
 from .sampling import UNIFORM, grid_size, held_regularly, logged_rate, resample, unwrap
 from .table import COMMAND_NAMES, LIMITS, MAX_ROWS, PITCH, SPEED_NAMES, Recording, Sampling, Table, counted, quoted
@@ -26,7 +27,8 @@ def recording_of(
     found = [*notes, *([f"unknown columns are ignored: {shown}"] if table.unknown else [])]
     table = table._replace(columns={n: column for n, column in table.columns.items() if not np.isnan(column).all()})
     if not table.holds("t"):
-        table.refuse("there is no time; each row needs its time [s]", column="t")
+        names = ", ".join(map(quoted, [*(table.names.get(each, each) for each in table.columns), *table.unknown][:20]))
+        table.refuse(f"there is no time; each row needs its time [s]. There are {names}: rename one", column="t")
     if not any(map(table.holds, STATE_NAMES)):
         table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
     # Cells that hold no value were not logged, also those of a rotor.
@@ -65,7 +67,8 @@ def recording_of(
         found.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
         time = dt * np.arange(time.size)
     states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
-    about = {"commanded": commanded, "held": held, "name": os.fspath(table.path), "notes": tuple(found), "facts": facts}
+    about = {"commanded": commanded, "held": held, "name": printable(os.fspath(table.path))}
+    about |= {"notes": tuple(found), "facts": facts}
     return Recording(time, omega, states, force if with_force else None, voltage, **about)
 
 

@@ -127,7 +127,7 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
             if not line:
                 break
             with contextlib.suppress(csv.Error):
-                name, *values = next(csv.reader([line.rstrip("\n")]), [""])
+                name, *values = next(csv.reader([line.rstrip("\n")]), ()) or ("",)  # of a blank line, csv makes []
                 if values:
                     settings.setdefault(name.strip(), ",".join(values).strip())
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")

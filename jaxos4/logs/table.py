@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..errors import InputError, shortened
+from ..errors import InputError, printable, shortened
 from ..flight import FORCE_NAMES, Flight, with_force
 
 Path = str | os.PathLike[str]
@@ -29,6 +29,7 @@ large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 _JITTER = 0.95  # a log at a nominal rate may be this much slower
 _AT_ONCE = 1 << 20  # bytes
 _MOST_IMPOSSIBLE = 0.01  # share of the values of a column: more are a wrong unit, and not samples that went wrong
+_FARTHEST = 10.0  # a rotor turns at most so many times as fast as in all but 1 % of its flight
 
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
 COMMAND_NAMES = ("command1", "command2", "command3", "command4")
@@ -49,6 +50,7 @@ class LogFacts(NamedTuple):
     - `landed`: from when to when the vehicle itself says that it is on the ground [s], in the flight's time.
     - `rotor_positions`: x forward and y left of each rotor [m], in the order of the rotors in the flight.
     - `rotor_spins`: +1 for counter-clockwise seen from above, -1 for clockwise.
+    - `format`: of the file that was read.
     """
 
     motors: Sampling | None = None
@@ -57,6 +59,7 @@ class LogFacts(NamedTuple):
     landed: tuple[tuple[float, float], ...] = ()
     rotor_positions: tuple[tuple[float, float], ...] | None = None
     rotor_spins: tuple[float, ...] | None = None
+    format: "LogFormat | None" = None
 
     @property
     def too_slow(self) -> str:
@@ -158,7 +161,8 @@ class Table(NamedTuple):
         columns, impossible = dict(self.columns), dict(self.impossible)
         for name, limit in limits.items():
             values = columns.get(name, np.empty(0))
-            wrong = (values < limit.least) | (values > limit.largest)
+            largest = _most_of_rotor(values) if name in SPEED_NAMES else limit.largest
+            wrong = (values < limit.least) | (values > min(limit.largest, largest))
             if name == "t" or not wrong.any():
                 continue
             index, count = int(np.argmax(wrong)), int(np.count_nonzero(wrong))
@@ -173,6 +177,12 @@ class Table(NamedTuple):
             before, begin = impossible.get(name, (0, f"{first} at {self.columns['t'][index]:.6g} s"))
             impossible[name] = before + count, begin
         return self._replace(columns=columns, impossible=impossible)
+
+
+def _most_of_rotor(speeds: np.ndarray) -> float:
+    """The largest speed that is possible beside the others: so few are faster that they are not a wrong unit."""
+    turning = speeds[speeds > 0]
+    return _FARTHEST * float(np.quantile(turning, 1 - _MOST_IMPOSSIBLE)) if turning.size else math.inf
 
 
 class LogFormat(NamedTuple):
@@ -313,13 +323,8 @@ def refuse(
     path: Path, what: str, *, row: int | None = None, column: str | None = None, kind: str = "column"
 ) -> NoReturn:
     """Raise an `InputError` of one line: the place, `what` is wrong and what to do, without its full stop."""
-    places = [f"row {row}"] * (row is not None) + [f"{kind} {printable(column or '')}"] * (column is not None)
+    places = [f"row {row}"] * (row is not None) + [f"{kind} {column}"] * (column is not None)
     raise InputError(": ".join(filter(None, (printable(os.fspath(path)), ", ".join(places), what))) + ".")
-
-
-def printable(text: str) -> str:
-    """`text` on one line, with unprintable characters escaped."""
-    return text if text.isprintable() else repr(text)[1:-1]
 
 
 def quoted(text: str) -> str:

@@ -36,9 +36,10 @@ class Topics(NamedTuple):
     notes: list[str]
 
     def latest(self, topic: str, field: str) -> float | None:
-        """The last value of a field, or None if it was not logged."""
+        """The last value of a field, or None if it was not logged, or is damaged."""
         values = self.fields(topic).get(field)
-        return None if values is None or not values.size else float(values[-1])
+        last = math.nan if values is None or not values.size else float(values[-1])
+        return last if math.isfinite(last) else None
 
     def fields(self, topic: str, instance: int = 0) -> Fields:
         """The fields of a topic; none if it was not logged."""

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._custom_types import as_float
-from .._files import BROKEN, write_file
+from .._files import BROKEN, check_plain, write_file
 from .._version import __version__
-from ..airframe import Airframe
+from ..airframe import Airframe, airframe_from_table
 from ..bracket import Bracket
-from ..errors import InputError
+from ..errors import InputError, named
 from ..flight import Flight
 from ..models import MODELS
 from ..shooting import ShootingProblem
@@ -71,6 +72,9 @@ def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
     content = path if isinstance(path, io.BytesIO) else io.BytesIO(Path(path).read_bytes())
     place = "the network" if isinstance(path, io.BytesIO) else path
     try:
+        with zipfile.ZipFile(content) as archive:
+            if sum(each.file_size for each in archive.infolist()) > content.getbuffer().nbytes:
+                raise ValueError("it announces more than it holds")
         with np.load(content, allow_pickle=False) as file:
             return _restore(place, {name: file[name] for name in file.files})
     except InputError:
@@ -84,8 +88,14 @@ def _restore(place: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     header = json.loads(str(arrays["header"]))
     if header["format"] != _FORMAT:
         raise InputError(f"{place}: trained by another version of jaxos4; train it again with `jaxos4 train`.")
+    check_plain(place, header, "train it again with `jaxos4 train`")
     settings = NetworkEstimator(**header["settings"] | {"noise": tuple(header["settings"]["noise"])})
-    airframe = Airframe(**{f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
+    if any(array.dtype.kind not in "fiu" for name, array in arrays.items() if name != "header"):
+        raise ValueError("an array holds no numbers")
+    if settings.depth > len(arrays) or settings.width > max(map(np.size, arrays.values())):
+        raise ValueError("its layers are not those of its settings")
+    with named(place):
+        airframe = airframe_from_table({f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
     problem = ShootingProblem(
         MODELS[header["model"]](airframe),
         Flight(arrays["time"], arrays["omega"], arrays["states"]),

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import msgspec
 import numpy as np
 
+from .._templates import templates
 from ..airframe import GRAVITY, GUESS, Airframe
+from ..errors import printable
 from ..flight import CHANNEL_NAMES
-from ..logs import log_format
 from .checks import CLOCK, Finding, self_checks
 from .motion import Excitation, excitation, motor_clock_note, opposite_axes, refused_note, rotor_signs, yaw_doubt
 from .pieces import Recording, Stretch, cut
@@ -91,7 +91,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     findings = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
-        format=log_format(recording.name).name,
+        format=recording.facts.format.name if recording.facts.format else "",
         samples=recording.time.size,
         begin=float(recording.time[0]),
         end=float(recording.time[-1]),
@@ -134,19 +134,21 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
     forward, left, spins = signs or ((), (), None)
     spins = facts.rotor_spins or spins
-    template = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True)
-    template.loader = jinja2.PackageLoader("jaxos4.recording", ".")
-    text = template.get_template("airframe.toml.j2").render(
-        name=Path(recording.name).name,
-        facts=facts,
-        corners=list(zip(forward, left, strict=True)),
-        spins=None if spins is None else [int(spin) for spin in spins],
-        hover=hover,
-        full=full,
-        seconds=sum(float(np.ptp(part.time)) for part in parts),
-        commanded=recording.commanded,
-        guess=GUESS,
-        short=lambda value: np.vectorize(lambda x: float(f"{x:.4g}"))(value).tolist(),
+    text = (
+        templates("jaxos4.recording", printable)
+        .get_template("airframe.toml.j2")
+        .render(
+            name=Path(recording.name).name,
+            facts=facts,
+            corners=list(zip(forward, left, strict=True)),
+            spins=None if spins is None else [int(spin) for spin in spins],
+            hover=hover,
+            full=full,
+            seconds=sum(float(np.ptp(part.time)) for part in parts),
+            commanded=recording.commanded,
+            guess=GUESS,
+            short=lambda value: np.vectorize(lambda x: float(f"{x:.4g}"))(value).tolist(),
+        )
     )
     known = {"rotor_positions": facts.rotor_positions, "rotor_spins": spins, "hover_speed": hover}
     return text, ("mass", *(key for key, value in known.items() if value is None))

@@ -1,7 +1,6 @@
 """Flights as recordings, and their pieces: cut, averaged, joined, divided into measurements to fit and to predict."""
 
 import math
-import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
-from ..logs import FORMATS, Recording as Recording, Table, log_format
+from ..logs import FORMATS, Recording as Recording, Table
 from ..logs.sampling import averages, speeds_within
 
 # Sample times that differ by less than this share are equal.
@@ -70,7 +69,7 @@ def vehicle_evidence(recording: Recording) -> str:
         return "has commands, not rotor speeds"
     if recording.specific_force is not None:
         return "has an accelerometer"
-    if os.path.isfile(recording.name) and (kind := log_format(recording.name)) is not FORMATS[-1]:
+    if (kind := recording.facts.format) not in (None, FORMATS[-1]):
         return f"is a log of a vehicle ({kind.label})"
     return ""
 

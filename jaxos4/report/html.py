@@ -4,12 +4,12 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 
+from .._templates import templates
 from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
 from .text import MISSING, plain
 
@@ -33,10 +33,7 @@ def draw(figure: Figure, stem: str) -> Drawing:
 
 def render(template: str, **values: Any) -> str:
     """The page that a template in this folder makes of `values`."""
-    loader, undefined = jinja2.PackageLoader("jaxos4.report", "."), jinja2.StrictUndefined
-    environment = jinja2.Environment(
-        loader=loader, undefined=undefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
+    environment = templates("jaxos4.report")
     environment.filters |= {"inline": inline, "plain": plain, "number": _number}
     environment.filters["interval"] = lambda ends: "" if ends is None else " to ".join(map(_number, ends))
     environment.filters["share"] = lambda value: MISSING if value is None else f"{value:.2f}"

@@ -97,7 +97,7 @@ class _Feedback(NamedTuple):
 
 
 def _advance(
-    functions: Functions, known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
+    functions: tuple[Callable, ...], known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """The estimates one sample later, and the innovations of this sample."""
     move, average, observe = functions

@@ -20,7 +20,7 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
-from .._files import BROKEN, write_file
+from .._files import BROKEN, read_json, write_file
 from .._version import __version__
 from ..errors import InputError, shortened
 from ..models import MODELS
@@ -30,7 +30,7 @@ from .metrics import SCENARIO
 from .specification import AXES, Study
 
 # For each variable of a flight: its further dimensions, type, unit and description.
-_VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "truth": (("parameter",), "f8", "unit", "true parameter"),
     "estimate": (("parameter",), "f8", "unit", "estimated parameter; missing where `result` says that there is none"),
     "std": (("parameter",), "f8", "unit", "standard deviation that the estimator gives"),
@@ -56,6 +56,9 @@ _AXES = {
     "parameter": "parameter",
     "level": "share of intervals that should hold the truth",
 }
+WIDE = ("model", "airframe", "width", "parameter")
+"""The dimensions of the brackets."""
+
 RESULTS_FILE = "results.nc"
 _SPECIFICATION, _LOCK = "study.json", "lock"
 _UNFINISHED = ".*.part*"  # files that were being written when a run was killed
@@ -138,11 +141,13 @@ def read_store(directory: Path) -> Store:
     """Opens the folder of a study to read. Raises `InputError` if it holds no study, or one of another version."""
     path = directory / _SPECIFICATION
     try:
-        header = msgspec.json.decode(path.read_bytes())
+        header = read_json(path, "give another folder")
         if (version := header["version"]) == __version__:
             return Store(directory, msgspec.convert(header["study"], Study), header["device"])
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.") from None
+    except InputError:
+        raise
     except (*BROKEN, msgspec.MsgspecError) as error:
         what = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not the specification of a study ({what}); give another folder.") from None
@@ -180,8 +185,8 @@ def assemble(store: Store) -> xr.Dataset:
     study, coordinates, failures = store.study, _coordinates(store.study), []
     blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {
-        name: np.full([len(coordinates[dim][1]) for dim in _dims(name)], blank.get(name, np.nan), kind)
-        for name, (_, kind, _, _) in _VARIABLES.items()
+        name: np.full([len(coordinates[dim][1]) for dim in dims(name)], blank.get(name, np.nan), kind)
+        for name, (_, kind, _, _) in VARIABLES.items()
     }
     for cell in map(study.cell, range(study.count)):
         if (results := store.read(cell.number)) is None:
@@ -198,12 +203,15 @@ def assemble(store: Store) -> xr.Dataset:
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
         try:
-            for name in _VARIABLES:
-                arrays[name][shared if name == "truth" else lanes] = results[name]
-        except (KeyError, ValueError):
+            for name, (_, kind, *_) in VARIABLES.items():
+                found = results[name].astype(kind, casting="same_kind")
+                arrays[name][shared if name == "truth" else lanes] = found
+            if not np.isin(results["result"], np.arange(len(OUTCOMES))).all():
+                raise ValueError("unknown result")
+        except BROKEN:
             path = store.cell_file(cell.number)
             raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
-    variables = {name: (_dims(name), arrays[name], _named(*about[2:])) for name, about in _VARIABLES.items()}
+    variables = {name: (dims(name), arrays[name], _named(*about[2:])) for name, about in VARIABLES.items()}
     command = {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)}
     dataset = xr.Dataset(variables | _brackets(study), coordinates, provenance(study, store.device) | command)
     flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
@@ -211,31 +219,9 @@ def assemble(store: Store) -> xr.Dataset:
     return dataset
 
 
-def _dims(name: str) -> tuple[str, ...]:
+def dims(name: str) -> tuple[str, ...]:
     """The dimensions of a variable; the truth is the same for all estimators."""
-    return (*(SCENARIO[:-1] if name == "truth" else SCENARIO), "flight", *_VARIABLES[name][0])
-
-
-def read_results(directory: Path) -> xr.Dataset:
-    """Reads the Dataset in a study's folder.
-
-    **Raises:** `InputError` if there is no Dataset, or if the file is not the results of a study.
-    """
-    path = directory / RESULTS_FILE
-    if not directory.is_dir():
-        raise InputError(f"{directory}: no such folder; give one that `jaxos4 study` wrote.")
-    if not path.is_file():
-        raise InputError(f"{directory}: holds no {RESULTS_FILE}; give a folder that `jaxos4 study` wrote.")
-    try:
-        with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
-            dataset = opened.load()
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        what = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
-    needed = {*_VARIABLES, "center", "seen", "unit"}
-    if missing := ", ".join(sorted(needed - dataset.variables.keys() | _AXES.keys() - set(dataset.dims))):
-        raise InputError(f"{path}: not the results of a study: no {missing}; give a folder that `jaxos4 study` wrote.")
-    return dataset
+    return (*(SCENARIO[:-1] if name == "truth" else SCENARIO), "flight", *VARIABLES[name][0])
 
 
 def _coordinates(study: Study) -> dict[str, tuple]:
@@ -262,7 +248,7 @@ def provenance(study: Study, device: str) -> dict[str, str | int]:
 
 def _brackets(study: Study) -> dict[str, tuple]:
     """The brackets of all searches and networks, by model, airframe and width, and the channels that are seen."""
-    first, dims = study.cell(0).scenario, ("model", "airframe", "width", "parameter")
+    first = study.cell(0).scenario
     brackets = [
         fleet_of(study, first._replace(model=model, airframe=airframe, width=width)).bracket
         for model, airframe, width in itertools.product(study.models, study.airframes, study.widths)
@@ -271,8 +257,8 @@ def _brackets(study: Study) -> dict[str, tuple]:
     center, half = (np.stack([getattr(b, name) for b in brackets]).reshape(shape) for name in ("center", "half_width"))
     seen = [[first._replace(channels=c, estimator=e).seen for e in study.estimators] for c in study.channels]
     return {
-        "center": (dims, center, _named("unit", "middle of the bracket")),
-        "bracket_half_width": (dims, half, _named("unit", "half the width of the bracket")),
+        "center": (WIDE, center, _named("unit", "middle of the bracket")),
+        "bracket_half_width": (WIDE, half, _named("unit", "half the width of the bracket")),
         "seen": (("channels", "estimator"), seen, _named("1", "channels that the estimator looks at")),
     }
 

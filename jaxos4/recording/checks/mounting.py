@@ -100,9 +100,8 @@ def _on_tilt(evidence: Evidence) -> Measured | None:
     for piece in evidence.pieces:
         if piece.specific_force is None or np.isnan(piece.states[:, ANGLES]).all(axis=0).any():
             continue
-        _, _, means = averages(piece.time, piece.omega, np.hstack([piece.states[:, ANGLES], piece.specific_force]))(
-            max(_SLOW, piece.dt)
-        )
+        columns = np.hstack([piece.states[:, ANGLES], piece.specific_force])
+        _, _, means = averages(piece.time, piece.omega, columns, held=piece.held)(max(_SLOW, piece.dt))
         roll, pitch, yaw, ax, ay, az = means[np.isfinite(means).all(axis=1)].T
         tilt_x = np.cos(yaw) * np.tan(pitch) + np.sin(yaw) * np.tan(roll) / np.cos(pitch)
         tilt_y = np.sin(yaw) * np.tan(pitch) - np.cos(yaw) * np.tan(roll) / np.cos(pitch)

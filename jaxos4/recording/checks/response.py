@@ -77,7 +77,7 @@ def _segments(piece: Recording, airframe: Airframe, step: float) -> list[Complex
 
     Thrust and force are 0 in a segment in which the force was not measured.
     """
-    time, omega, sensed = averages(piece.time, piece.omega, piece.channels[:, _SENSED])(step)
+    time, omega, sensed = averages(piece.time, piece.omega, piece.channels[:, _SENSED], held=piece.held)(step)
     for column in sensed.T:
         if np.isfinite(column).sum() > 1:
             column[:] = interpolated(time, time, column, gap=_GAP)

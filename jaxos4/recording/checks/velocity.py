@@ -34,7 +34,7 @@ def _products(piece: Recording) -> Float[np.ndarray, "samples 3"]:
     if piece.specific_force is None or not np.isfinite(piece.states[:, [*ANGLES, *VELOCITY]]).any(axis=0).all():
         return np.empty((0, 3))
     columns = np.hstack([piece.states[:, [*ANGLES, *VELOCITY]], piece.specific_force])
-    _, _, means = averages(piece.time, piece.omega, columns)(max(_SLOW, piece.dt))
+    _, _, means = averages(piece.time, piece.omega, columns, held=piece.held)(max(_SLOW, piece.dt))
     angles, velocity, force = means[:, :3], means[:, 3:6], means[:, 6:]
     felt = np.einsum("tji,tj->ti", rotations_to_body(*angles.T), force) - [0.0, 0.0, GRAVITY]
     gained = np.diff(velocity, axis=0) / max(_SLOW, piece.dt)

@@ -1,0 +1,5 @@
+"""`python -m jaxos4`: the command line."""
+
+from .cli import console
+
+console()

@@ -1,0 +1,113 @@
+"""The door of a study's Dataset: what `results.nc` must hold for a report, checked before anything is drawn."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import xarray as xr
+
+from .._files import BROKEN, check_plain
+from ..errors import InputError, shortened
+from .dataset import RESULTS_FILE, VARIABLES, WIDE, dims
+from .metrics import SCENARIO
+from .specification import Scenario
+
+_AXES = get_type_hints(Scenario) | {"flight": int, "parameter": str, "level": float}
+_KINDS: dict[type, str] = {str: "UO", float: "fiu", int: "iu"}
+_LARGEST_RATIO, _SMALL = 1030, 1 << 20  # bytes of arrays for a byte of a compressed file, and those that always fit
+_SECONDS = 4  # to read a file, and one more for every 10 MB
+# HDF5 can loop for ever or crash on a damaged file, so another process reads all of it first.
+_PROBE = """
+import signal, sys, h5py
+path, seconds, most = sys.argv[1], *map(int, sys.argv[2:])
+if hasattr(signal, "alarm"):
+    signal.alarm(seconds)
+def read(_, node):
+    global most
+    dict(node.attrs)
+    if isinstance(node, h5py.Dataset):
+        most -= node.nbytes
+        if most < 0:
+            sys.exit("it announces more than it holds")
+        node[()]
+with h5py.File(path) as file:
+    read("", file)
+    file.visititems(read)
+"""
+_REMEDY = "give a folder that `jaxos4 study` wrote"
+
+
+def read_results(directory: Path) -> xr.Dataset:
+    """Reads the Dataset in a study's folder.
+
+    **Raises:** `InputError` if there is no Dataset, or if the file is not the results of a study.
+    """
+    path = directory / RESULTS_FILE
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such folder; {_REMEDY}.")
+    if not path.is_file():
+        raise InputError(f"{directory}: holds no {RESULTS_FILE}; {_REMEDY}.")
+    try:
+        _probe(path)
+        with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
+            dataset = opened.load()
+    except (OSError, *BROKEN) as error:
+        what = shortened(" ".join(str(error).split()), 120)
+        raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
+    if fault := _fault(dataset):
+        raise InputError(f"{path}: not the results of a study: {shortened(fault, 200)}; {_REMEDY}.")
+    _check_texts(path, dataset)
+    return dataset
+
+
+def _probe(path: Path) -> None:
+    """Raises `ValueError` if HDF5 cannot read the whole file, or takes longer than a sound one needs."""
+    size = path.stat().st_size
+    limits = str(_SECONDS + size // 10_000_000), str(_LARGEST_RATIO * size + _SMALL)
+    line = [sys.executable, "-P", "-c", _PROBE, os.path.abspath(path), *limits]
+    done = subprocess.run(line, capture_output=True, text=True, errors="replace", check=False)
+    if done.returncode:
+        raise ValueError((done.stderr.splitlines() or ["HDF5 cannot end"])[-1])
+
+
+def _fault(dataset: xr.Dataset) -> str:
+    """Why a Dataset is not that of a study; empty if it is one."""
+    needed = {name: (dims(name), _KINDS[float if kind[0] == "f" else int]) for name, (_, kind, *_) in VARIABLES.items()}
+    needed |= dict.fromkeys(("center", "bracket_half_width"), (WIDE, _KINDS[float]))
+    needed |= {"seen": (("channels", "estimator"), _KINDS[str]), "unit": (("parameter",), _KINDS[str])}
+    needed |= {axis: ((axis,), _KINDS[kind]) for axis, kind in _AXES.items()}
+    if missing := ", ".join(sorted(needed.keys() - dataset.variables.keys())):
+        return f"no {missing}"
+    for name, (names, kinds) in needed.items():
+        found = dataset[name]
+        if found.dims != names or found.dtype.kind not in kinds or not found.size:
+            return f"{name} is of another kind or shape"
+        if name in _AXES and (
+            len(set(found.values.tolist())) < found.size or found.isin([np.nan, np.inf, -np.inf]).any()
+        ):
+            return f"{name} has equal values, or one that is not finite"
+    level, about = dataset["level"].values, dataset["result"].attrs
+    if not ((level > 0) & (level < 1)).all():
+        return "level is not between 0 and 1"
+    names, codes = str(about.get("flag_meanings")).split(), np.atleast_1d(about.get("flag_values", ()))
+    if not len(names) == len(set(names)) == codes.size or not {"failed", "not_run"} <= set(names):
+        return "result has no names of its codes"
+    return "" if dataset["result"].isin(codes).all() else "result has an unknown code"
+
+
+def _check_texts(path: Path, dataset: xr.Dataset) -> None:
+    """Refuse texts of many lines, and cells that failed without saying which."""
+    texts: dict[str, Any] = {name: dataset[name].values.ravel().tolist() for name in (*_AXES, "seen", "unit")}
+    check_plain(path, texts | {name: str(each).splitlines() for name, each in dataset.attrs.items()}, _REMEDY)
+    try:
+        failures = json.loads(dataset.attrs.get("failures", "[]"))
+        wrong = [each for each in failures if not {"cell", "message", *SCENARIO} <= each.keys()]
+    except (*BROKEN, RecursionError):
+        failures, wrong = [], [None]
+    if wrong:
+        raise InputError(f"{path}: `failures` is not a list of cells that failed; {_REMEDY}.")
+    check_plain(path, failures, _REMEDY)
