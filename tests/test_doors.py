@@ -32,6 +32,7 @@ from jaxos4.export import TARGETS, export_vehicle, read_result
 from jaxos4.forecast.vehicle import vehicle_of
 from jaxos4.identification.problem import bracket_of
 from jaxos4.logs import read_log
+from jaxos4.logs.ulog_file import Topics
 from jaxos4.models import MODELS
 from jaxos4.recording import read_recording
 from jaxos4.recording.inspection import airframe_draft, inspect_log
@@ -344,3 +345,16 @@ def test_all_impossible_rotor_speeds_count_as_not_measured_and_not_only_the_larg
     rows = [[0.01 * k, *4 * [300.0 if k < 395 else 1800.0], math.sin(k), 0, 0] for k in range(400)]
     path.write_bytes(table_csv("t,omega1,omega2,omega3,omega4,p,q,r".split(","), np.array(rows)))
     assert read_recording(path).omega.max() == 1800.0
+
+
+def test_a_corrupt_field_of_an_esc_is_missing():
+    topics = {"esc_status": [{"esc[0].actuator_function": np.array([101.0, np.nan]), "esc[1].state": np.array([5.0])}]}
+    log = Topics("log", topics, {}, {}, [])
+    assert log.latest("esc_status", "esc[0].actuator_function") is None
+    assert log.latest("esc_status", "esc[1].state") == 5.0
+
+
+def test_an_exported_model_of_mujoco_has_four_controls(save):
+    found = read_result(save(json.dumps(RESULT), "found.json"))
+    actuators = ElementTree.fromstring(export_vehicle(found, "mujoco").text).findall("actuator/general")
+    assert [each.get("name") for each in actuators] == ["thrust1", "thrust2", "thrust3", "thrust4"]
