@@ -10,7 +10,7 @@ class InputError(ValueError):
     """A file or an argument cannot be used. The message is one printable line, whatever a file put into it."""
 
     def __init__(self, message: str):
-        super().__init__(shortened(printable(message), _LONGEST))
+        super().__init__(_middle_cut(printable(message), _LONGEST))
 
 
 class TrainingError(RuntimeError):
@@ -20,6 +20,12 @@ class TrainingError(RuntimeError):
 def printable(text: str) -> str:
     """`text` on one line, with unprintable characters escaped: line breaks, controls, bytes that are not UTF-8."""
     return text if text.isprintable() else "".join(x if x.isprintable() else repr(x)[1:-1] for x in text)
+
+
+def _middle_cut(text: str, most: int) -> str:
+    """The text, with its beginning and its end if it is longer than `most` characters."""
+    half = (most - 3) // 2
+    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
 
 
 def shortened(text: str, most: int) -> str:

@@ -46,9 +46,9 @@ def result_file(found: Identification | str | os.PathLike[str]) -> ResultFile:
     file cannot be read.
     """
     if isinstance(found, Identification):
-        return ResultFile.of(found)
+        return ResultFile.of(found.to_dict())
     value = read_json(found, _REMEDY, _LARGEST)
-    file = ResultFile.of(found)
+    file = ResultFile.of(value, found)
     with named(found):
         try:
             msgspec.convert(value, _Others)

@@ -66,6 +66,15 @@ def test_effects(report_of, plot):  # noqa: F811
         assert abs(case["summary"]["thrust"]["mean"]) < 0.05
 
 
+def test_sample_times(report_of):  # noqa: F811
+    """Every sample time has the same answer, within its interval."""
+    report = report_of("sample_times", flights=2, sample_times=[0.004, 0.016], duration=16.0)
+    for case in report["cases"]:
+        assert {row["result"] for row in case["flights"]} == {"successful"}
+        assert all(abs(case["summary"][name]["mean"]) < 0.08 for name in ("Ix", "Iy"))
+        assert case["summary"]["Ix"]["covered"] == 1
+
+
 def test_rotorpy(report_of, tmp_path):  # noqa: F811
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     cases = {"flights": 1, "kinds": ["calm"], "duration": 8.0, "estimators": ["filter-error"]}

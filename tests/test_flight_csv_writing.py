@@ -1,5 +1,6 @@
 """Flights to CSV and back: every bit, only what was measured, whole files or none."""
 
+import dataclasses
 import os
 import stat
 
@@ -91,7 +92,7 @@ def test_single_precision_gives_back_its_bits_and_moves_a_late_start(save):
         write_flight(flight, path)
         again = read_flight(path)
         assert again.states.dtype == jnp.float32
-        assert same(flight, again)
+        assert same(dataclasses.replace(flight, held=False), again)  # measured speeds of a file are those at its times
         late = csv(rows=[f"{1.7e9 + 0.01 * k:.2f},1,1,1,1,0,0,0" for k in range(500)])
         with pytest.warns(UserWarning, match="starts at 1700000000 s"):
             moved = read_flight(save(late))

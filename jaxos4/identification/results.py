@@ -2,7 +2,6 @@
 
 import math
 import os
-from pathlib import Path
 from typing import Any, SupportsFloat
 
 import msgspec
@@ -319,19 +318,16 @@ class ResultFile(msgspec.Struct, frozen=True, kw_only=True):
         return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
 
     @classmethod
-    def of(cls, found: Identification | str | os.PathLike[str]) -> "ResultFile":
-        """The result of a vehicle, or the one in a file that `jaxos4 estimate --out` wrote.
+    def of(cls, found: Any, name: str | os.PathLike[str] = "") -> "ResultFile":
+        """The result of a vehicle, from `Identification.to_dict` or from the values of a file called `name`.
 
         **Raises:** `InputError`, one line, if it is no result, has no vehicle or no estimate, or is not of this
-        version; `OSError` if the file cannot be read.
+        version.
         """
         remedy, again = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
-        with named("" if isinstance(found, Identification) else found):
+        with named(name):
             try:
-                if isinstance(found, Identification):
-                    own = msgspec.convert(found.to_dict(), cls)
-                else:
-                    own = msgspec.json.decode(Path(found).read_bytes(), type=cls)
+                own = msgspec.convert(found, cls)
             except msgspec.MsgspecError as error:
                 what = " ".join(str(error).split())[:200]
                 raise InputError(f"not a result ({what}); {remedy}.") from None

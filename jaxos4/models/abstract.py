@@ -94,9 +94,9 @@ class AbstractModel(eqx.Module):
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The forcing of a whole flight. Row k acts from sample k to sample k + 1."""
 
+    @abc.abstractmethod
     def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
         """The forcing of the samples `place`, whose measurements may be means, see `Forcing.early`."""
-        return jax.tree.map(lambda leaf: leaf[place], self.forcing(inputs, parameters))
 
     @abc.abstractmethod
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:

@@ -10,9 +10,9 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._custom_types import Scalar, as_float
+from .._custom_types import Numeric, Scalar, as_float
 from ..airframe import OS4, Airframe, alpha_from_inertia
 from ..flight import Inputs
 from .abstract import DEFAULT_HALF_WIDTH, PARAMETER_NAMES, AbstractModel, Parameter
@@ -66,6 +66,10 @@ class AbstractOS4(AbstractModel):
         omega, airframe = inputs.omega, self.airframe
         roll, pitch, yaw, thrust = (jnp.square(omega) @ airframe.mixer.T).T
         return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
+
+    def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
+        """That of `forcing`: measurements are instants."""
+        return jax.tree.map(lambda leaf: leaf[place], self.forcing(inputs, parameters))
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
         """See `AbstractModel`."""

@@ -139,7 +139,7 @@ class FlightModel(AbstractModel):
     def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
         """The forcing over each sample around its time, as `Flight.within` has the rotor speeds."""
         if inputs.within is None:
-            return super().mean_forcing(inputs, parameters, place)
+            return jax.tree.map(lambda leaf: leaf[place], self.forcing(inputs, parameters))
         samples, parts, _ = inputs.within.shape
         edges, length = np.linspace(0, 1, parts + 1), jnp.asarray(inputs.averaging_time) / inputs.dt
         after = jnp.clip(edges - (1 - length) / 2, 0, length)  # begin of the window

@@ -25,6 +25,8 @@ _BAND = (0.25, 0.9)
 # Rates at which the speeds may have been written before they were interpolated, in units of the highest frequency.
 _WRITTEN = (np.inf, 4.0, 2.8, 2.0, 1.7, 1.4, 1.2, 1.0)
 _PASSES = 20  # of the weighted fit
+# Noise with a smaller share of the power of the changes is none: it changes no answer.
+_NEGLIGIBLE = 1e-3
 # Spectra are averaged over this many neighbouring frequencies to either side.
 _NEIGHBOURS = 2
 
@@ -47,10 +49,12 @@ def without_noise(pieces: Sequence[Recording], airframe: Airframe) -> tuple[list
         return list(pieces), 0.0, 0.0
     noise = _noise(power)
     kept = 1 - noise[:, None] / np.maximum(power, noise[:, None] + np.finfo(float).tiny)
+    share = float(noise.sum() / max(power.mean(axis=1).sum(), np.finfo(float).tiny))
+    if share < _NEGLIGIBLE:
+        return list(pieces), 0.0, 0.0
     speeds = [np.maximum(_filtered(piece.omega @ axes, kept) @ axes.T, 0.0) for piece in pieces]
     smooth = [piece._replace(omega=each) for piece, each in zip(pieces, speeds, strict=True)]
-    share = noise.sum() / max(power.mean(axis=1).sum(), np.finfo(float).tiny)
-    return (smooth if noise.any() else list(pieces)), float(np.sqrt(noise.mean() / 2)), float(share)
+    return smooth, float(np.sqrt(noise.mean() / 2)), share
 
 
 def _power(signals: Sequence[Float[np.ndarray, "samples 4"]], dt: float) -> Changes | None:
