@@ -9,7 +9,7 @@ from test_logs_ulog import grid
 
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import Table
-from jaxos4.logs.sampling import PARTS, Series, gyro_rows, resample, root_mean_square, speeds_within
+from jaxos4.logs.sampling import PARTS, Series, gyro_rows, logged_rate, resample, root_mean_square, speeds_within
 
 # Uneven times
 
@@ -144,3 +144,11 @@ def test_speeds_within_a_sample_are_those_of_its_quarters(held):
     np.testing.assert_allclose(found[0, : PARTS // 2], omega[[0, 0]], rtol=1e-12)
     # It sees a shift by a quarter of a sample.
     assert np.abs(found.reshape(-1, 4)[1:] - expected.reshape(-1, 4)[:-1]).max() > 100
+
+
+@pytest.mark.parametrize("pause", [1.0, 0.95, 3.0])
+def test_pauses_between_short_sessions_are_no_rate(pause):
+    """Sessions of 0.4 s at 500 Hz."""
+    session = np.arange(0, 0.4, 0.002)
+    times = np.concatenate([i * (0.398 + pause) + session for i in range(20)])
+    assert logged_rate(times) == pytest.approx(500, rel=1e-3)

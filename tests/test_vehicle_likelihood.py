@@ -128,6 +128,41 @@ def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     assert noted <= {"alpha3", "alpha6", "alpha8"}
 
 
+def test_a_sample_time_that_is_given_has_the_answer_of_the_rule():
+    """The same samples, numbers and checks."""
+    chosen = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))
+    for place in (0, 2):
+        sample_time = chosen.sample_times[place].sample_time
+        given = jaxos4.identify(
+            flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS, sample_time=sample_time)
+        )
+        assert given.provenance.sample_time == pytest.approx(sample_time)
+        assert len(given.sample_times) == len(chosen.sample_times) - place
+        for one, other in zip(given.sample_times[1:], chosen.sample_times[place + 1 :], strict=True):
+            for name, row in one.constants.items():
+                assert row.estimate == pytest.approx(other.constants[name].estimate, rel=1e-6)
+        if sample_time == chosen.provenance.sample_time:
+            assert given.result == chosen.result
+            for name, row in given.rigid_body.constants.items():
+                assert row.estimate == pytest.approx(chosen.rigid_body.constants[name].estimate, rel=1e-6)
+                assert row.std == pytest.approx(chosen.rigid_body.constants[name].std, rel=1e-4)
+
+
+@pytest.mark.parametrize(("noise", "count"), [(0.3, 0.0), (0.0, 0.005), (0.001, 0.1)])
+def test_the_noise_of_an_accelerometer_is_at_least_its_count_and_half_of_its_second_differences(noise, count):
+    force = (
+        9.81
+        + 0.2 * np.sin(2 * np.pi * 0.5 * DT * np.arange(SAMPLES))
+        + noise * np.random.default_rng(0).normal(size=SAMPLES)
+    )
+    force = count * np.round(force / count) if count else force
+    flight = dataclasses.replace(flown(), specific_force=np.stack([np.full(SAMPLES, np.nan)] * 2 + [force], axis=1))
+    for prepared in prepare(as_recordings(flight), CRAZYFLIE, holdout=0.0):
+        rows = round(float(prepared.fitted.dt) / DT)
+        least = max(noise / 2, count) / np.sqrt(rows)
+        assert prepared.force_noise[2] == pytest.approx(least, rel=0.1)
+
+
 def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     case = case_of(flown(), 2 * DT)
