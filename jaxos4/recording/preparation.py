@@ -12,6 +12,8 @@ from ..errors import InputError, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
+from .checks import plausible, self_checks
+from .checks.finding import INERTIAS
 from .motion import opposite_axes, refused_note, white_noise, yaw_doubt
 from .pieces import Recording, Stretch, averaged, cut, hold_out, joined, whole_windows
 from .speed_noise import without_noise
@@ -114,6 +116,13 @@ def prepare(
             raise InputError(f"{recording.name}: given twice; give each log once.")
         if np.isnan(recording.states[:, RATES]).all(axis=0).any():
             raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
+        for finding in self_checks(recording, airframe):
+            about = f"{recording.name}: {finding.cause} ({finding.size})", finding.remedy
+            if finding.contradicted and {*finding.quantities} & {*INERTIAS}:
+                doubts.append(about)
+            else:
+                notes.append("; ".join(about))
+        recording = plausible(recording).recording
         slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
         pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
         if slow:

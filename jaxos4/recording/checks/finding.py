@@ -7,8 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 INERTIAS = ("Ix", "Iy", "Iz")
-SENSOR_ROTATION = "sensor_rotation"
-"""The key of the airframe's file with the angles at which gyro and accelerometer are mounted."""
 
 
 class Finding(msgspec.Struct, frozen=True):

@@ -8,7 +8,7 @@ from ...airframe import GRAVITY
 from ...flight import ANGLES
 from ...logs.sampling import averages
 from .evidence import Evidence
-from .finding import INERTIAS, SENSOR_ROTATION, Finding, Measured
+from .finding import INERTIAS, Finding, Measured
 
 _COHERENT = 0.1  # the least share of both angular accelerations that the rotors explain
 _VAGUE = 0.2  # [rad]; a larger error of the angle by the rotors is that of another airframe
@@ -17,7 +17,7 @@ _SLOW, _BLOCKS = 0.1, 12  # [s], samples whose tilt is compared; blocks of the j
 _EARTH = 0.6  # slope of the horizontal force on the tilt: 1 along the earth's axes, 0 or less along the body's
 _STEADY = 0.9  # of the force in a hand or in rolls, the mean vector is shorter than this share of the mean size
 _UNIT_G = (0.8, 1.25)  # mean force in units of g
-_TURN = f"set `{SENSOR_ROTATION}` in the airframe's file"
+_TURN = "turn p, q and ax, ay of the log"
 
 
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
