@@ -3,9 +3,9 @@
 Short samples contain the vibration of the sensors. Long samples hide motion. The flight is fitted at several sample
 times, from the longest on. A sample time that the user gives is fitted in the same way, and longer ones beside it.
 
-The rule: the shortest sample time at which the innovations of all channels are nearly white, and the moments of inertia
-are those of samples twice as long, within two standard deviations, and known nearly as well. If there is none: the
-shortest without vibration. If all have it: the longest with an answer.
+The rule: the shortest sample time at which the innovations of the body rates are nearly white, and the moments of
+inertia are those of samples twice as long, within two standard deviations, and known nearly as well. If there is none:
+the shortest without vibration. If all have it: the longest with an answer.
 """
 
 import math
@@ -19,14 +19,14 @@ import numpy as np
 from ..estimate import REACH, Estimate
 from ..results import result_names
 from ..shooting import InnovationsProblem, for_threads
-from .answers import overwhelmed, vehicle_constants
+from .answers import AXES, overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
 from .held_out import compile_ahead
 from .prepare import Case, Progress
 from .results import Constant, SampleTime, has_answer
 
-# The limit of a correlation of white innovations: the first number plus so many standard errors. The largest of some 30
-# correlations (3 rates, a specific force or more, 8 lags) is compared.
+# The limit of a correlation of white innovations: the first number plus so many standard errors. The largest of 24
+# correlations (3 rates, 8 lags) is compared.
 WHITE, _CHANCE = 0.06, 3.0
 # Two answers agree within so many standard deviations and this share, which allows for errors of discretisation.
 AGREE, _DISCRETE = 2.0, 0.03
@@ -109,9 +109,9 @@ def answer_of(case: Case, fit: Fit) -> SampleTime:
     constants = vehicle_constants(fit).constants if answered else {}
     if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
-    correlations = [row.correlation for row in fit.disturbances.values()] if fit.answered else []
+    correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
     largest, samples = max(correlations, key=abs, default=1.0), 0
     if fit.answered and fit.estimate.parts is not None:
-        # The mean of the sums of the squares of innovations, each of which has a mean of 1.
-        samples = round(float(np.asarray(fit.estimate.parts.products)[:, :, 0].sum(axis=0).mean()))
+        # The sum of the squares of the innovations of a body rate, which have a mean of 1.
+        samples = round(float(np.asarray(fit.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))
     return SampleTime(float(case.shooting.flight.dt), constants, largest, samples)
