@@ -157,19 +157,27 @@ def prepare(
         shortest = whole  # samples of whole rows
     doublings = 0 if predicted else math.floor(math.log2(LONGEST_SAMPLE_TIME * _NEARLY_EQUAL / shortest))
     steps = [shortest * 2**k for k in range(max(doublings, 0) + 1)]
-    numbers, smooth = [number for number, _ in parts], []
-    for number, recording in enumerate(recordings):
-        own, noise, share = without_noise([piece for i, piece in parts if i == number], airframe)
-        smooth += own
-        if share > _NOISY:
-            how = f"white noise of {noise:.2g} rad/s, {share:.0%} of their changes from sample to sample"
-            notes.append(f"{recording.name}: rotor speeds have {how}; their expected values are used")
+    numbers, smooth = [number for number, _ in parts], _smooth(recordings, parts, airframe, notes)
     about = tuple(notes), tuple(doubts), slowest
     coarse = [averaged(piece, steps) for piece in smooth]
     return tuple(
         _sampled(recordings, [*zip(numbers, pieces, strict=True)], airframe, step, holdout, about)
         for step, *pieces in zip(steps, *coarse, strict=True)
     )
+
+
+def _smooth(
+    recordings: Sequence[Recording], parts: Sequence[tuple[int, Recording]], airframe: Airframe, notes: list[str]
+) -> list[Recording]:
+    """The parts without the noise of measured rotor speeds. Adds a note for each recording whose noise is large."""
+    smooth = []
+    for number, recording in enumerate(recordings):
+        own, noise, share = without_noise([piece for i, piece in parts if i == number], airframe)
+        smooth += own
+        if share > _NOISY:
+            how = f"white noise of {noise:.2g} rad/s, {share:.0%} of their changes from sample to sample"
+            notes.append(f"{recording.name}: rotor speeds have {how}; their expected values are used")
+    return smooth
 
 
 def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None:
