@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from ..airframe import Airframe
 from ..analysis.prediction import HORIZONS, starts
@@ -21,6 +22,7 @@ from ..recording import preparation
 from ..recording.pieces import Recording
 from ..recording.preparation import Prepared
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
+from ..shooting.feedthrough import FEEDTHROUGHS, input_innovations
 from .prepare import Case, Progress, VehicleSettings, airframe_name, name_and_class, versions
 from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
 from .results import Provenance
@@ -147,7 +149,22 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) 
     segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     padded = with_room(shooting, capacity_of(room.fitted.time.shape[0]))
-    return InnovationsProblem(padded, segments=segments, least_noise=least_noise)
+    passed = _input_innovations(shooting, capacity_of(room.fitted.time.shape[0]))
+    return InnovationsProblem(padded, segments=segments, least_noise=least_noise, input_innovations=passed)
+
+
+def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.ndarray, "samples feedthroughs 3"] | None:
+    """Those of a flight that is padded to `capacity` samples; 0 where measurements are instants."""
+    flight = shooting.flight
+    if flight.within is None:
+        return None
+    found = np.zeros((capacity, FEEDTHROUGHS, 3))
+    if float(flight.averaging_time) > 0:
+        samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
+        torque = np.square(np.asarray(flight.within)) @ mixer[:3].T
+        stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
+        found[:samples] = input_innovations(torque, shooting.recorded()[:, :3], stretch, float(flight.dt))
+    return found
 
 
 def _held_out(

@@ -51,7 +51,7 @@ BLOCK = 32
 class Innovations(NamedTuple):
     """The innovations of each segment and their negative log-likelihood.
 
-    The unknowns of a channel are the parameters, and then its own `LogNoise`.
+    The unknowns of a channel are the parameters, and then its own `LogNoise` and feedthroughs.
 
     - `feasible`: whether the rates stay below `FASTEST`.
     - `information`: the Fisher information.
@@ -137,9 +137,11 @@ class _Carry(NamedTuple):
 def innovate(
     functions: Functions,
     observed: Observed,
+    input_innovations: Float[Array, "time feedthroughs channels segments"],
     forcing: Forcing,
     parameters: Parameters,
     noise: LogNoise,
+    feedthrough: Float[Array, "channels feedthroughs"],
     *,
     dt: Scalar,
     window: Window,
@@ -156,13 +158,18 @@ def innovate(
     - `functions`: each takes a state, the forcing and the parameters. The first returns the state one sample later, the
       second its mean over what a measurement averages, the third the outputs of the sensors.
     - `observed`: its number of rows is a multiple of `BLOCK`.
+    - `input_innovations`, `feedthrough`: what they explain of the innovations of the same samples, see
+      `jaxos4.shooting.feedthrough`.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters at the positions `forcing_parameters`.
     - `window`: what a measurement averages.
     - `rows`: how many rows are filtered; the others are padding. It is data, so that flights of different lengths share
       a program.
     """
-    flight, at = (observed, forcing, forcing_tangents, rows, dt, window), (parameters, noise)
+    flight, at = (
+        (observed, input_innovations, forcing, forcing_tangents, rows, dt, window),
+        (parameters, noise, feedthrough),
+    )
     return with_batch(_innovate, _innovate_lanes, functions, forcing_parameters, flight, at)
 
 
@@ -195,11 +202,11 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
 
         return function
 
-    rows = fixed_flight[3] if rows is None else rows.max()  # in the rows of other lanes, nothing counts
+    rows = fixed_flight[4] if rows is None else rows.max()  # in the rows of other lanes, nothing counts
     dt, window = (
-        eqx.combine(jax.tree.map(repeated, one), same) for one, same in zip((dt, window), fixed_flight[4:], strict=True)
+        eqx.combine(jax.tree.map(repeated, one), same) for one, same in zip((dt, window), fixed_flight[5:], strict=True)
     )
-    flight = *lanes_before_last(tuple(series), tuple(fixed_flight[:3])), rows, dt, window
+    flight = *lanes_before_last(tuple(series), tuple(fixed_flight[:4])), rows, dt, window
     functions = each(0), each(1), each(2)
     found = _filter(functions, positions, flight, in_each_segment(at, fixed_at))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
@@ -212,12 +219,12 @@ def _innovate(functions: Functions, positions: tuple[int, ...], flight: tuple, a
 
 
 def _filter(
-    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise]
+    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise, Array]
 ) -> Innovations:
-    """See `innovate`; functions of all segments. Parameters and noise may have an axis of segments, the last."""
-    (observed, forcing, forcing_tangents, rows, dt, window), (parameters, noise) = flight, at
+    """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
+    (observed, passed, forcing, forcing_tangents, rows, dt, window), (parameters, noise, feedthrough) = flight, at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
-    unknowns = count + 3
+    unknowns = count + len(LogNoise._fields) + feedthrough.shape[1]
     step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
     steps = step, jax.vmap(push)(basis(noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
@@ -242,9 +249,12 @@ def _filter(
     )
     advance = functools.partial(_advance, functions)
     filtered = functools.partial(_filter_rows, advance, parameters, steps, np.asarray(positions, int))
+    wide = feedthrough if feedthrough.ndim > 2 else feedthrough[..., None]
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
     row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, observed.restart, following)
-    data = row, observed.counts, forcing, forcing_tangents
+    # By how much each innovation differs from what the controller let through, and its derivatives.
+    left = jnp.einsum("tfcl,cfl->tcl", passed, jnp.broadcast_to(wide, (*wide.shape[:2], segments)))
+    data = row, observed.counts, (left, jnp.moveaxis(passed, 2, 1)), forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
     def block(i: Count, carry: _Carry) -> _Carry:
@@ -261,10 +271,15 @@ def _filter_rows(
     carry: _Carry,
     row: _Row,
     counts: Bool[Array, "time segments"],
+    passed: tuple[Series, Float[Array, "time channels feedthroughs segments"]],
     forcing: Forcing,
     forcing_tangents: Forcing | None,
 ) -> _Carry:
-    """The filters after some more rows. `steps`: the disturbance over a sample, with its derivatives in the noise."""
+    """The filters after some more rows.
+
+    `steps`: the disturbance over a sample, with its derivatives in the noise. `passed`: what feedthroughs explain of
+    the innovations, with its derivatives in them.
+    """
     count, segments = parameters.shape[0], counts.shape[1]
     scalars, own = tuple(parameters), parameters.shape[1:]
     units = tuple(np.eye(count, dtype=parameters.dtype))
@@ -306,9 +321,9 @@ def _filter_rows(
     (covariance, known, feasible), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
     (errors, *slopes), variance, variance_slopes = found
     counts = row.is_measured & counts[:, None]
-    found, last = _likelihood(
-        counts, variance, variance_slopes, carry.last, feasible, errors, jnp.concatenate(slopes, axis=2)
-    )
+    errors, slopes = errors - passed[0], jnp.concatenate([*slopes, -passed[1]], axis=2)
+    noise = slice(count, count + len(LogNoise._fields))
+    found, last = _likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, noise)
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)
 
@@ -321,17 +336,20 @@ def _likelihood(
     feasible: Bool[Array, " segments"],
     errors: Series,
     slopes: Float[Array, "time channels unknowns segments"],
+    noise: slice,
 ) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
-    """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations."""
-    count = slopes.shape[2] - 3
+    """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations.
+
+    `noise`: the places of the noise among the unknowns.
+    """
     weight = jnp.where(counts, 1 / variance, 0.0)
     logarithm = jnp.where(counts, jnp.log(variance), 0.0)
     relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, 3, segments)
     gradient = jnp.einsum("tcul,tcl->cul", slopes, weight * errors)
     surprise = (weight > 0) * (1 - weight * errors**2) / 2
-    gradient = gradient.at[:, count:].add(jnp.einsum("tcul,tcl->cul", relative, surprise))
+    gradient = gradient.at[:, noise].add(jnp.einsum("tcul,tcl->cul", relative, surprise))
     information = jnp.einsum("tcul,tcvl->cuvl", slopes * weight[:, :, None], slopes)
-    information = information.at[:, count:, count:].add(jnp.einsum("tcul,tcvl->cuvl", relative, relative) / 2)
+    information = information.at[:, noise, noise].add(jnp.einsum("tcul,tcvl->cuvl", relative, relative) / 2)
     cost = (weight * errors**2 + logarithm).sum(axis=(0, 1)) / 2
     standard = jnp.concatenate([last, jnp.sqrt(weight) * errors])
     now = standard[LAGS:]

@@ -49,7 +49,8 @@ class InnovationsProblem(AbstractProblem):
     Each channel has a disturbance with a strength and a time constant, and white noise of its sensor. The logarithms of
     the three are unknowns like the parameters, and follow them: `log_p_strength`, `log_p_time`, `log_p_sensor`, then
     those of q, r, and each specific force that the model predicts. The bracket is a Gaussian prior, whose standard
-    deviation is its half-width.
+    deviation is its half-width. With `input_innovations`, each channel has further unknowns, `p_feedthrough_1`
+    and so on: see `jaxos4.shooting.feedthrough`.
 
     **Arguments:**
 
@@ -61,6 +62,8 @@ class InnovationsProblem(AbstractProblem):
       lengths.
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
+    - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample; by default
+      nothing, as of instants, which the controller answers later.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
     """
@@ -71,6 +74,7 @@ class InnovationsProblem(AbstractProblem):
     problem: ShootingProblem
     start: Values = eqx.field(converter=as_float)
     least_noise: Float[Array, " channels"] = eqx.field(converter=as_float)
+    input_innovations: Float[Array, "samples feedthroughs 3"] = eqx.field(converter=as_float)
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
 
@@ -82,6 +86,7 @@ class InnovationsProblem(AbstractProblem):
         settling: int = SETTLING,
         start: Float[ArrayLike, " unknowns"] | None = None,
         least_noise: Float[ArrayLike, " channels"] | None = None,
+        input_innovations: Float[ArrayLike, "samples feedthroughs 3"] | None = None,
     ):
         if segments is None:
             segments = max(round((problem.flight.time.shape[-1] - settling) / _SEGMENT), 1)
@@ -90,8 +95,13 @@ class InnovationsProblem(AbstractProblem):
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
         self.problem, self.segments, self.settling = problem.restrict("rates"), segments, settling
         # An array in any case, so that all starts share one program.
-        channels = self.problem.columns.size
-        unknowns = problem.unknowns.count + 3 * channels
+        channels, samples = self.problem.columns.size, problem.flight.time.shape[-1]
+        self.input_innovations = as_float(np.zeros((samples, 0, 3)) if input_innovations is None else input_innovations)
+        if self.input_innovations.shape[::2] != (samples, 3):
+            raise ValueError(
+                f"`input_innovations` must have shape ({samples}, feedthroughs, 3), got {self.input_innovations.shape}."
+            )
+        unknowns = problem.unknowns.count + len(self._own) * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
         self.least_noise = as_float(np.zeros(channels) if least_noise is None else least_noise)
         if self.least_noise.shape != (channels,):
@@ -139,11 +149,15 @@ class InnovationsProblem(AbstractProblem):
         shortest = jnp.where(is_rate(first.shape[0]), jnp.log(_SHORTEST * dt), np.log(_FORCE_SHORTEST))
         lowest, highest = lowest.at[:, 1].set(shortest), highest.at[:, 1].set(np.log(_LONGEST))
         lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(self.least_noise, jnp.finfo(float).tiny)))
-        levels = [(f"log_{name}_{level}", "1") for name in self.channels for level in ("strength", "time", "sensor")]
+        first, lowest, highest = (
+            jnp.pad(x, ((0, 0), (0, len(self._own) - 3)), constant_values=value)
+            for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf))
+        )
+        names = tuple(each.format(name) for name in self.channels for each in self._own)
         precision = jnp.full(first.size, NOISE_PRECISION)
         return Unknowns(
-            names=own.names + tuple(name for name, _ in levels),
-            units=own.units + tuple(unit for _, unit in levels),
+            names=own.names + names,
+            units=own.units + tuple("1" if name.startswith("log") else "rad/s" for name in names),
             center=jnp.concatenate([own.center, first.ravel()]),
             half_width=jnp.concatenate([own.half_width, 1 / jnp.sqrt(precision)]),
             free=jnp.concatenate([own.free, jnp.ones(first.size, dtype=bool)]),
@@ -158,7 +172,9 @@ class InnovationsProblem(AbstractProblem):
         """`start` where it is not NaN; all rows are equal if it is a whole start."""
         unknowns, count = self.unknowns.usable, self.problem.unknowns.count
         place = np.arange(unknowns.count) - count
-        times = jnp.where((place >= 0) & (place % 3 == 1), jnp.log(jnp.asarray(_TIMES))[:, None], unknowns.center)
+        times = jnp.where(
+            (place >= 0) & (place % len(self._own) == 1), jnp.log(jnp.asarray(_TIMES))[:, None], unknowns.center
+        )
         times = jnp.clip(times, unknowns.lowest, unknowns.highest)
         return jnp.where(jnp.isnan(self.start) | ~unknowns.free, times, self.start)
 
@@ -176,7 +192,16 @@ class InnovationsProblem(AbstractProblem):
 
     def noise(self, unknowns: Float[Numeric, " unknowns"]) -> LogNoise:
         """The noise levels among the unknowns."""
-        return LogNoise(*unknowns[self.problem.unknowns.count :].reshape(-1, 3).T)
+        return LogNoise(*self._of_channels(unknowns)[:, :3].T)
+
+    @property
+    def _own(self) -> tuple[str, ...]:
+        """The names of the unknowns of a channel."""
+        feedthroughs = tuple(f"{{}}_feedthrough_{i + 1}" for i in range(self.input_innovations.shape[-2]))
+        return ("log_{}_strength", "log_{}_time", "log_{}_sensor", *feedthroughs)
+
+    def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "channels own"]:
+        return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
 
     def first_state(self) -> tuple[InitialStates, InitialStates]:
         """Nothing: the initial state is no unknown."""
@@ -198,7 +223,7 @@ class InnovationsProblem(AbstractProblem):
 
         def evaluate(values: Values, initial_state: InitialStates) -> Curvature:
             del initial_state
-            found = innovations(values[:count], self.noise(values))
+            found = innovations(values[:count], self.noise(values), self._of_channels(values)[:, 3:])
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, count)
             off = values - unknowns.center
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
@@ -230,23 +255,33 @@ class InnovationsProblem(AbstractProblem):
         """False: the noise is found with the parameters, so that no cost is too large."""
         return jnp.zeros_like(cost, dtype=bool)
 
+    @property
+    def _place(self) -> Int[Array, "segments time"]:
+        """The samples of each segment; the last one instead of those that do not exist."""
+        return jnp.minimum(jnp.asarray(self.cut.place), self.flight.time.shape[0] - 1)
+
     def observed(self) -> Observed:
         """The measurements in segments, see `observe_in_segments`."""
         return observe_in_segments(self.problem, self.cut, self.settling)
 
-    def innovations(self, parameters: Parameters, noise: LogNoise) -> Innovations:
-        """The innovations of all segments."""
-        return self._innovations()(parameters, noise)
+    def innovations(
+        self, parameters: Parameters, noise: LogNoise, feedthrough: Float[Array, "channels feedthroughs"] | None = None
+    ) -> Innovations:
+        """The innovations of all segments. `feedthrough`: by default 0."""
+        nothing = jnp.zeros((self.problem.columns.size, self.input_innovations.shape[-2]))
+        return self._innovations()(parameters, noise, nothing if feedthrough is None else feedthrough)
 
-    def _innovations(self) -> Callable[[Parameters, LogNoise], Innovations]:
+    def _innovations(self) -> Callable[[Parameters, LogNoise, Array], Innovations]:
         """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
         problem, model, observed, forced = self.problem, self.model, self.observed(), self._forced()
+        passed = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
+        passed = jnp.pad(passed, ((0, 0), (0, 0), (0, problem.columns.size - passed.shape[2]), (0, 0)))
         settings = {"dt": self.flight.dt, "window": self.window, "rows": self.cut.rows}
         settings |= {"forcing_parameters": model.forcing_parameters}
 
-        def at(parameters: Parameters, noise: LogNoise) -> Innovations:
+        def at(parameters: Parameters, noise: LogNoise, feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
-            data = observed, forcing, parameters, noise
+            data = observed, passed, forcing, parameters, noise, feedthrough
             functions = problem.advance, problem.average, model.observe
             return innovate(functions, *data, forcing_tangents=tangents, **settings)
 
@@ -255,7 +290,7 @@ class InnovationsProblem(AbstractProblem):
     def _forced(self) -> Callable[[Parameters], tuple[Forcing, Forcing | None]]:
         """The forcing of all segments and its tangents, as functions of the parameters; segments are the last axis."""
         problem, inputs = self.problem, self.flight.inputs._replace(length=self.problem.length)
-        samples = jnp.minimum(jnp.asarray(self.cut.place), self.flight.time.shape[0] - 1)
+        samples = self._place
 
         def segments_last(forcing: Forcing) -> Forcing:
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
@@ -277,13 +312,13 @@ class InnovationsProblem(AbstractProblem):
 def joined(
     gradient: Float[Array, "channels some"], information: Float[Array, "channels some some"], count: int
 ) -> tuple[Values, Float[Array, "unknowns unknowns"]]:
-    """Gradient and information about all unknowns, from those of each channel about parameters and own noise."""
-    channels = gradient.shape[0]
-    size = count + 3 * channels
+    """Gradient and information about all unknowns, from those of each channel about parameters and its own."""
+    channels, each = gradient.shape[0], gradient.shape[1] - count
+    size = count + each * channels
     total = jnp.concatenate([gradient[:, :count].sum(axis=0), gradient[:, count:].ravel()])
     whole = jnp.zeros((size, size), dtype=float).at[:count, :count].set(information[:, :count, :count].sum(axis=0))
     for i in range(channels):
-        own = slice(count + 3 * i, count + 3 * (i + 1))
+        own = slice(count + each * i, count + each * (i + 1))
         whole = whole.at[:count, own].set(information[i, :count, count:])
         whole = whole.at[own, :count].set(information[i, count:, :count])
         whole = whole.at[own, own].set(information[i, count:, count:])
