@@ -22,7 +22,7 @@ from ..recording import preparation
 from ..recording.pieces import Recording
 from ..recording.preparation import Prepared
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from ..shooting.feedthrough import FEEDTHROUGHS, input_innovations
+from ..shooting.feedthrough import input_innovations
 from .prepare import Case, Progress, VehicleSettings, airframe_name, name_and_class, versions
 from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
 from .results import Provenance
@@ -154,17 +154,15 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) 
 
 
 def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.ndarray, "samples feedthroughs 3"] | None:
-    """Those of a flight that is padded to `capacity` samples; 0 where measurements are instants."""
+    """Those of a flight that is padded to `capacity` samples."""
     flight = shooting.flight
     if flight.within is None:
         return None
-    found = np.zeros((capacity, FEEDTHROUGHS, 3))
-    if float(flight.averaging_time) > 0:
-        samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
-        torque = np.square(np.asarray(flight.within)) @ mixer[:3].T
-        stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
-        found[:samples] = input_innovations(torque, shooting.recorded()[:, :3], stretch, float(flight.dt))
-    return found
+    samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
+    torque = np.square(np.asarray(flight.within)) @ mixer[:3].T
+    stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
+    found = input_innovations(torque, shooting.recorded()[:, :3], stretch, float(flight.dt))
+    return np.pad(found, ((0, capacity - samples), (0, 0), (0, 0)))
 
 
 def _held_out(

@@ -26,8 +26,8 @@ class Grid(NamedTuple):
     """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
 
     `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by
-    `battery_voltage`, to which the airframe's rotor speeds belong. `at_instants`: of the parts of samples
-    (`Flight.within`), whether measurements are instants; `None`: the samples are whole ones.
+    `battery_voltage`, to which the airframe's rotor speeds belong. `are_parts`: the samples are parts of those of the
+    flight (`Flight.within`), with their mean speeds.
     """
 
     dt: Scalar
@@ -36,7 +36,7 @@ class Grid(NamedTuple):
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]
     voltage: Float[Array, " samples"] | None = None
-    at_instants: Bool[Array, ""] | None = None
+    are_parts: bool = False
 
     @classmethod
     def of(
@@ -50,26 +50,18 @@ class Grid(NamedTuple):
         recording, elapsed = jnp.asarray(recordings)[stretch], inputs.dt * jnp.arange(samples)
         if max(recordings) > 0:
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
-        return cls(
-            inputs.dt,
-            recording,
-            first,
-            last,
-            elapsed,
-            voltage,
-            jnp.asarray(inputs.averaging_time) == 0 if are_parts else None,
-        )
+        return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts)
 
     def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Part":
         """Some samples in a row. `before`: see `Part`."""
-        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.at_instants)
+        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.are_parts)
 
 
 class Part(NamedTuple):
     """Some samples in a row: the sample time [s], their numbers, and which begin or end a stretch.
 
     `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
-    `at_instants`: see `Grid`.
+    `are_parts`: see `Grid`.
     """
 
     dt: Scalar
@@ -77,7 +69,7 @@ class Part(NamedTuple):
     is_first: Bool[Array, " rows"]
     is_last: Bool[Array, " rows"]
     before: Float[Array, "4"]
-    at_instants: Bool[Array, ""] | None = None
+    are_parts: bool = False
 
 
 class Speeds(NamedTuple):
@@ -91,16 +83,14 @@ class Speeds(NamedTuple):
 def measured_speeds(omega: Commands, part: Part) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing.
 
-    Means over parts of a sample change as those of the parts around them. If measurements are `at_instants`, later
-    parts do not count: they hold the controller's answer to the noise of the measurement.
+    Means over parts of a sample change as those of the parts around them.
     """
     speed = omega(part.rows)
     following = omega(jnp.where(part.is_last, part.rows, part.rows + 1))
-    if part.at_instants is None:
+    if not part.are_parts:
         return Speeds(speed, speed, following - speed)
-    before, earlier = (omega(jnp.where(part.is_first, part.rows, jnp.maximum(part.rows - i, 0))) for i in (1, 2))
-    so_far, around = (3 * speed - 4 * before + earlier) / 2, (following - before) / 2
-    return Speeds(speed, speed, jnp.where(part.at_instants, so_far, around))
+    before = omega(jnp.where(part.is_first, part.rows, jnp.maximum(part.rows - 1, 0)))
+    return Speeds(speed, speed, (following - before) / 2)
 
 
 def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
@@ -195,7 +185,7 @@ def driven(omega: RotorSpeeds, motor: Motor, part: Part) -> Speeds:
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
         begin = jnp.where(is_first, settled, speed)
-        end = motor.step(begin, command, part.dt, 2 if part.at_instants is None else 1)
+        end = motor.step(begin, command, part.dt, 1 if part.are_parts else 2)
         return end, (begin, end)
 
     begin, end = jax.lax.scan(over_a_sample, part.before, (omega, motor.settled(omega), part.is_first))[1]

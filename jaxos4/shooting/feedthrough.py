@@ -1,12 +1,11 @@
 """What a controller answers within a sample.
 
-A measurement of filter error may be the mean over a sample, and the controller answers faster. So the torque in the
-sample holds answers to the noise of what is measured there, and the innovation correlates with it: a likelihood given
-the torque of the same sample is biased. But this torque is known before the sample, up to the *input innovation* v: the
-controller's answers, and what a pilot does. With white noise of the rows of the log, v depends on them through the
-innovation e alone, besides what is independent of everything that the filter estimates. So the filter stays as it is,
-and only its innovation is compared given v: e - k v, with an unknown *feedthrough* k. See "Controllers that are faster
-than a sample" in `docs/method/filter_error.md`.
+A sample of filter error may last longer than the controller takes to answer. Then the torque in the sample holds
+answers to the noise of what is measured in it, so torque and innovation correlate, and a likelihood that takes this
+torque for an input is biased. All of the torque is known before the sample, but for its *input innovation* v: the
+answers, and what a pilot does. With white noise in the rows of the log, v depends on what is measured through the
+filter's innovation e alone. So the filter stays as it is, and its innovation is compared given v: as e - k v, with an
+unknown *feedthrough* k. See "Controllers that are faster than a sample" in `docs/method/filter_error.md`.
 """
 
 from collections.abc import Iterator

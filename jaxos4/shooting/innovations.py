@@ -63,7 +63,7 @@ class InnovationsProblem(AbstractProblem):
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
     - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample; by default
-      nothing, as of instants, which the controller answers later.
+      nothing: the controller answers no measurement within its sample.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
     """
