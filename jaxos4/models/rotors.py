@@ -54,11 +54,11 @@ class Grid(NamedTuple):
 
     def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Part":
         """Some samples in a row. `before`: see `Part`."""
-        return Part(self.dt, rows, rows == self.first[rows], rows == self.last[rows], before, self.are_parts)
+        return Part(self.dt, rows, self.first[rows], self.last[rows], before, self.are_parts)
 
 
 class Part(NamedTuple):
-    """Some samples in a row: the sample time [s], their numbers, and which begin or end a stretch.
+    """Some samples in a row: the sample time [s], their numbers, and the first and last sample of their stretches.
 
     `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
     `are_parts`: see `Grid`.
@@ -66,10 +66,15 @@ class Part(NamedTuple):
 
     dt: Scalar
     rows: Int[Array, " rows"]
-    is_first: Bool[Array, " rows"]
-    is_last: Bool[Array, " rows"]
+    first: Int[Array, " rows"]
+    last: Int[Array, " rows"]
     before: Float[Array, "4"]
     are_parts: bool = False
+
+    @property
+    def is_first(self) -> Bool[Array, " rows"]:
+        """Whether a sample begins a stretch."""
+        return self.rows == self.first
 
 
 class Speeds(NamedTuple):
@@ -83,14 +88,17 @@ class Speeds(NamedTuple):
 def measured_speeds(omega: Commands, part: Part) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing.
 
-    Means over parts of a sample change as those of the parts around them.
+    Means over parts of a sample change between their edges, where cubics through the means of the four parts around an
+    edge have their values.
     """
-    speed = omega(part.rows)
-    following = omega(jnp.where(part.is_last, part.rows, part.rows + 1))
+
+    def near(offset: int) -> RotorSpeeds:
+        return omega(jnp.clip(part.rows + offset, part.first, part.last))
+
+    speed = near(0)
     if not part.are_parts:
-        return Speeds(speed, speed, following - speed)
-    before = omega(jnp.where(part.is_first, part.rows, jnp.maximum(part.rows - 1, 0)))
-    return Speeds(speed, speed, (following - before) / 2)
+        return Speeds(speed, speed, near(1) - speed)
+    return Speeds(speed, speed, (8 * (near(1) - near(-1)) - (near(2) - near(-2))) / 12)
 
 
 def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
