@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from helpers import CINERAT
 from scipy.integrate import simpson
 
 import jaxos4
@@ -18,19 +19,6 @@ from jaxos4.models.state import Rates, State
 from jaxos4.recording.pieces import as_recordings
 from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise, Window, step_of
-
-# A vehicle with measured rotor speeds and a large rotor inertia.
-VEHICLE = jaxos4.Airframe(
-    mass=0.428,
-    inertia=(6.3e-4, 7.5e-4, 8.9e-4),
-    rotor_positions=[(-0.0455, -0.0635), (0.0455, -0.0635), (-0.0455, 0.0635), (0.0455, 0.0635)],
-    rotor_spins=(-1.0, 1.0, 1.0, -1.0),
-    thrust_coefficient=2.66e-7,
-    drag_coefficient=2.66e-9,
-    rotor_inertia=9e-7,
-    max_rotor_speed=4100.0,
-)
-
 
 # The filters.
 
@@ -104,10 +92,10 @@ def cost_of(problem, parameters, noise):
 def test_the_likelihood_of_rates_is_that_of_a_joint_gaussian_of_means(share):
     """60 samples with gaps, a vehicle without gyroscopic coupling. `share`: of a sample that is averaged."""
     samples, dt, rng = 60, 0.01, np.random.default_rng(4)
-    model = jaxos4.FlightModel(VEHICLE, terms=("offset",))
+    model = jaxos4.FlightModel(CINERAT, terms=("offset",))
     parameters = np.array([0, 0, 1500.0, 0, 0, 1300.0, 0, 1100.0, 2.0, -1.0, 0.5])
     within = 1950 + 100 * rng.normal(size=(samples, PARTS, 4))
-    torque = np.square(within.reshape(-1, 4)) @ np.asarray(VEHICLE.mixer)[:3].T * parameters[[2, 5, 7]]
+    torque = np.square(within.reshape(-1, 4)) @ np.asarray(CINERAT.mixer)[:3].T * parameters[[2, 5, 7]]
     edges = np.concatenate([np.zeros((1, 3)), np.cumsum((torque + parameters[8:]) * dt / PARTS, axis=0)])
     # The rates are linear over each part.
     mean = ((edges[:-1] + edges[1:]) / 2).reshape(samples, PARTS, 3).mean(axis=1) if share else edges[2::PARTS]
@@ -155,7 +143,7 @@ def lively(samples, seed):
 
 def test_derivatives_of_the_likelihood_of_means_are_those_of_finite_differences():
     """In the parameters that act on the two moments of the torque in different ways, and in the noise."""
-    model = jaxos4.FlightModel(VEHICLE, terms=("damping", "delay", "reaction"))
+    model = jaxos4.FlightModel(CINERAT, terms=("damping", "delay", "reaction"))
     problem = jaxos4.ShootingProblem(model, lively(60, 0), sigma=np.full(12, 0.02), channels="rates", method="rk4")
     names, levels = model.parameter_names, np.log([[40.0, 20.0, 10.0], [0.2, 0.01, 1.0], [0.02, 0.01, 0.03]])
     # Without gyroscopic torques, a channel's noise changes no other channel's innovations.
@@ -183,7 +171,7 @@ def gradient_of(problem, parameters, noise):
 
 def test_stretches_and_padding_do_not_change_the_forcing_of_means():
     """Each stretch is as if it were alone, and so is what comes before the padding."""
-    model = jaxos4.FlightModel(VEHICLE, terms=("motor", "delay", "reaction", "accelerometer"))
+    model = jaxos4.FlightModel(CINERAT, terms=("motor", "delay", "reaction", "accelerometer"))
     values = model.alpha.at[model.parameter_names.index("rotor_delay")].set(0.0041)
     parts = [lively(samples, i) for i, samples in enumerate((40, 30))]
     whole = jaxos4.join(parts, length=10)
@@ -219,8 +207,8 @@ def wanted(time):
 
 def change_of(rates, speeds, change, values):
     """p', q', r' as `FlightModel` prints them."""
-    (p, q, r), (roll, pitch, yaw) = rates, np.asarray(VEHICLE.mixer)[:3] @ np.square(speeds)
-    v, spins = values, np.asarray(VEHICLE.rotor_spins)
+    (p, q, r), (roll, pitch, yaw) = rates, np.asarray(CINERAT.mixer)[:3] @ np.square(speeds)
+    v, spins = values, np.asarray(CINERAT.rotor_spins)
     return np.array(
         [
             v["alpha1"] * q * r - v["alpha2"] * (spins @ speeds) * q + v["alpha3"] * roll + v["roll_offset"]
@@ -234,7 +222,7 @@ def change_of(rates, speeds, change, values):
 
 def simulated(steps, values, *, motor):
     """Rates and rotor speeds at fine times from half of the longest sample before 0, by RK4."""
-    full = float(VEHICLE.max_rotor_speed)
+    full = float(CINERAT.max_rotor_speed)
 
     def spin(speeds, time):
         if not motor:
@@ -269,7 +257,7 @@ def test_means_and_edges_are_those_of_a_fine_simulation(motor):
     torques change within the sample.
     """
     terms = ("offset", "damping", "delay", "reaction", "accelerometer") + (("motor",) if motor else ())
-    model = jaxos4.FlightModel(VEHICLE, terms=terms)
+    model = jaxos4.FlightModel(CINERAT, terms=terms)
     values = dict.fromkeys(model.parameter_names, 0.0) | {"alpha3": 1587.0, "alpha6": 1333.0, "alpha8": 1124.0}
     values |= {"thrust_gain": 1.0, "rotor_delay": DELAY} | DAMPED | OF_RATES | (OF_MOTORS if motor else {})
     parameters = jnp.array([values[name] for name in model.parameter_names])
@@ -277,7 +265,7 @@ def test_means_and_edges_are_those_of_a_fine_simulation(motor):
     log, time = FINE * np.arange(-400, 2600), FINE * np.arange(2400) - TIMES[0] / 2
     within = speeds_within(log, wanted(log), held=motor)
     squares = np.square(fine[:, 3:] if motor else wanted(time - DELAY)).sum(axis=1)
-    thrust = squares * float(VEHICLE.thrust_coefficient / VEHICLE.mass)
+    thrust = squares * float(CINERAT.thrust_coefficient / CINERAT.mass)
     errors = []
     for dt in TIMES:
         count, length = round(1.0 / dt), round(dt / FINE)
@@ -336,14 +324,14 @@ def answers(**settings):
     Its physics have steps of 0.5 ms, and its log those of 2 ms, with the speeds at these times.
     """
     dt, keys = 0.002, jax.random.split(jax.random.key(0))
-    loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=0.03, logged="speeds", **settings)
+    loop = jaxos4.ClosedLoop(CINERAT, rotor_lag=0.03, logged="speeds", **settings)
     references = jaxos4.random_references(duration=20.0, dt=dt, key=keys[0])
     flight = jaxos4.fly_closed_loop(loop, references, dt=dt, key=keys[1])
     terms = ("offset", "damping", "delay", "reaction", "accelerometer")
     nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
     fits = jaxos4.VehicleSettings(terms=terms, holdout=0.0)
     found = []
-    for case in prepare_vehicle(as_recordings(flight), VEHICLE, fits, **nothing):
+    for case in prepare_vehicle(as_recordings(flight), CINERAT, fits, **nothing):
         if round(1e3 * float(case.shooting.flight.dt)) in (8, 32):
             answer = case.estimator(case.problem)
             values = zip(answer.parameters.tolist(), answer.std.tolist(), strict=True)
@@ -354,8 +342,8 @@ def answers(**settings):
 
 def truth():
     """What the airframe implies."""
-    ix, iy, iz = np.asarray(VEHICLE.inertia).tolist()
-    return dict(zip(SHARED, (1 / ix, 1 / iy, 1 / iz, float(VEHICLE.rotor_inertia) / iz), strict=True))
+    ix, iy, iz = np.asarray(CINERAT.inertia).tolist()
+    return dict(zip(SHARED, (1 / ix, 1 / iy, 1 / iz, float(CINERAT.rotor_inertia) / iz), strict=True))
 
 
 def test_a_flight_in_still_air_has_the_same_answer_at_8_and_32_ms():

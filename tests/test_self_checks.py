@@ -4,7 +4,7 @@ import equinox as eqx
 import msgspec
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CINERAT, CRAZYFLIE
 
 import jaxos4
 from jaxos4.closed_loop import fly_standard
@@ -18,15 +18,6 @@ from jaxos4.recording.checks.response import rotor_response
 from jaxos4.recording.pieces import cut
 
 INERTIAS = {"Ix", "Iy", "Iz"}
-CINERAT = jaxos4.Airframe(
-    mass=0.428,
-    inertia=(6.3e-4, 7.5e-4, 8.9e-4),
-    rotor_positions=[(-0.0455, -0.0635), (0.0455, -0.0635), (-0.0455, 0.0635), (0.0455, 0.0635)],
-    rotor_spins=(-1.0, 1.0, 1.0, -1.0),
-    thrust_coefficient=2.66e-7,
-    drag_coefficient=2.66e-9,
-    rotor_inertia=9e-7,
-)
 WIND = {"wind": 1.0, "drag": 0.3, "inflow": 0.6, "flapping": 2.0}
 P, Q, AX, AY, AZ = 7, 9, 0, 1, 2
 

@@ -1,0 +1,150 @@
+"""What a controller answers within a sample: input innovations, and the likelihood given them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import CINERAT
+
+import jaxos4
+from jaxos4.identification.vehicle import prepare_vehicle
+from jaxos4.recording.pieces import as_recordings
+from jaxos4.shooting import InnovationsProblem
+from jaxos4.shooting.feedthrough import FEEDTHROUGHS, input_innovations
+from jaxos4.shooting.gains import LogNoise
+
+DT, SAMPLES = 0.01, 600
+NOISE = LogNoise(*(jnp.log(jnp.full(3, x)) for x in (2.0, 0.1, 0.02)))
+
+
+@pytest.fixture
+def rng():
+    """Random numbers, the same for each test."""
+    return np.random.default_rng(0)
+
+
+def in_loop(rng, *, pilot):
+    """Torque in four parts of each sample, and the rates: a controller that answers the two samples before.
+
+    `pilot`: the standard deviation of what the controller adds of its own.
+    """
+    rates = np.cumsum(rng.normal(size=(SAMPLES, 3)), axis=0) / 10
+    torque = np.zeros((SAMPLES, 4, 3))
+    for k in range(2, SAMPLES):
+        answer = -2 * rates[k - 1] + rates[k - 2] + 0.5 * torque[k - 1, 3]
+        torque[k] = answer + pilot * rng.normal(size=(4, 3))
+    return torque, rates
+
+
+def test_a_torque_that_follows_from_the_past_has_no_innovation(rng):
+    torque, rates = in_loop(rng, pilot=0.0)
+    assert not input_innovations(torque, rates, np.zeros(SAMPLES, int), DT).any()
+
+
+def test_innovations_are_what_the_past_does_not_tell(rng):
+    """They have a mean square of 1 and no correlation with the past, and hold most of what the pilot did."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    found = input_innovations(torque, rates, np.zeros(SAMPLES, int), DT)
+    assert found.shape == (SAMPLES, FEEDTHROUGHS, 3)
+    assert not found[:10].any()
+    for axis in range(3):
+        own = found[10:, :, axis]
+        np.testing.assert_allclose(own.T @ own / len(own), np.eye(FEEDTHROUGHS), atol=1e-9)
+        for lag in range(1, 11):
+            past = np.column_stack([torque[10 - lag : SAMPLES - lag, :, axis], rates[10 - lag : SAMPLES - lag, axis]])
+            np.testing.assert_allclose(own.T @ past / len(own), 0.0, atol=1e-9)
+
+
+def test_a_stretch_is_not_told_by_the_stretch_before(rng):
+    torque, rates = in_loop(rng, pilot=1.0)
+    stretch = np.repeat([0, 1], SAMPLES // 2)
+    found = input_innovations(torque, rates, stretch, DT)
+    begins = SAMPLES // 2 + np.arange(10)
+    assert not found[begins].any()
+    torque[: SAMPLES // 2], rates[: SAMPLES // 2] = 0.0, 0.0
+    alone = input_innovations(torque[SAMPLES // 2 :], rates[SAMPLES // 2 :], stretch[SAMPLES // 2 :], DT)
+    assert alone[10:].any(axis=(1, 2)).all()
+
+
+@pytest.mark.parametrize("samples", [3, 12])
+def test_a_flight_that_is_too_short_has_none(rng, samples):
+    torque, rates = in_loop(rng, pilot=1.0)
+    assert not input_innovations(torque[:samples], rates[:samples], np.zeros(samples, int), DT).any()
+
+
+def standard(rng, *, passed):
+    """The standard flight with noise, and input innovations of `passed` feedthroughs."""
+    model = jaxos4.PublishedOS4()
+    omega = jaxos4.multisine(model.airframe, duration=3.0, dt=DT)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=DT)
+    noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
+    problem = jaxos4.ShootingProblem(model, noisy, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
+    innovations = rng.normal(size=(len(omega), passed, 3))
+    return InnovationsProblem(problem, segments=2, settling=50, input_innovations=innovations)
+
+
+def test_the_likelihood_compares_innovations_less_the_feedthrough(rng):
+    """The cost is quadratic in the feedthrough, and its derivatives are those of finite differences."""
+    problem = standard(rng, passed=2)
+    # Without gyroscopic torques a channel's noise changes no other channel.
+    names, parameters = problem.unknowns.names, jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
+    assert names[8:13] == ("log_p_strength", "log_p_time", "log_p_sensor", "p_feedthrough_1", "p_feedthrough_2")
+    own = jnp.concatenate([jnp.stack(NOISE, axis=1), 0.01 * jnp.arange(6.0).reshape(3, 2)], axis=1)
+    values, nothing = jnp.concatenate([parameters, own.ravel()]), jnp.zeros(0)
+
+    @eqx.filter_jit
+    def at(values):
+        return problem.curvatures(values, nothing)
+
+    found, step = at(values), 1e-4
+    for name in ("p_feedthrough_2", "r_feedthrough_1", "alpha3", "log_q_sensor"):
+        place = names.index(name)
+        change = step * (abs(float(values[place])) + 0.01)
+        up, down = (at(values.at[place].add(sign * change)) for sign in (1, -1))
+        slope = (up.shot.cost - down.shot.cost) / (2 * change)
+        np.testing.assert_allclose(found.gradient[0, place], slope[0], rtol=1e-5, atol=1e-6)
+        if "feedthrough" in name:
+            second = (up.shot.cost - 2 * found.shot.cost + down.shot.cost) / change**2
+            np.testing.assert_allclose(found.information[0, place, place], second[0], rtol=1e-3)
+
+
+def test_the_filter_does_not_depend_on_the_feedthrough(rng):
+    """Only what is compared does: innovations are e - k v, with e those without feedthrough."""
+    problem, k = standard(rng, passed=1), jnp.array([[0.01], [0.02], [-0.03]])
+    parameters = problem.model.alpha
+    one, none, other = (problem.innovations(parameters, NOISE, x) for x in (k, 0 * k, -k))
+    # The squares of e - k v and e + k v have the same mean as those of e, and of k v, which add up.
+    alone = (one.cost + other.cost - 2 * none.cost).sum()
+    by_size = (
+        problem.innovations(parameters, NOISE, 2 * k).cost
+        + problem.innovations(parameters, NOISE, -2 * k).cost
+        - 2 * none.cost
+    ).sum()
+    np.testing.assert_allclose(by_size, 4 * alone, rtol=1e-9)
+
+
+def test_input_innovations_must_fit_the_flight(rng):
+    problem = standard(rng, passed=1).problem
+    with pytest.raises(ValueError, match=r"`input_innovations` must have shape \(301, feedthroughs, 3\)"):
+        InnovationsProblem(problem, input_innovations=rng.normal(size=(10, 1, 3)))
+
+
+def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias():
+    """Commands every 4 ms, samples of 8 ms, a gyro with a noise of 0.05 rad/s.
+
+    Without input innovations the delay was 5.5 standard deviations too large, and the lag 3.7 too small.
+    """
+    first, second = jax.random.split(jax.random.key(0))
+    loop = jaxos4.ClosedLoop(CINERAT, rotor_lag=0.025, rotor_delay=0.0, gust=2.0, gyro_noise=0.05, logged="commands")
+    references = jaxos4.random_references(duration=20.0, dt=0.004, key=first)
+    flight = jaxos4.fly_closed_loop(loop, references, dt=0.004, key=second, substeps=4)
+    nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
+    settings = jaxos4.VehicleSettings(sample_time=0.008, holdout=0.0)
+    case = prepare_vehicle(as_recordings(flight), CINERAT, settings, **nothing)[0]
+    answer = case.estimator(case.problem)
+    found = dict(zip(case.problem.unknowns.names, zip(answer.parameters, answer.std, strict=True), strict=True))
+    truth = dict(zip(("alpha3", "alpha6"), 1 / np.asarray(CINERAT.inertia)[:2], strict=True))
+    for name, value in (truth | {"rotor_lag": 0.025, "rotor_delay": 0.0}).items():
+        estimate, std = found[name]
+        assert abs(estimate - value) < 2 * std, name
