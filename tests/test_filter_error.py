@@ -225,8 +225,9 @@ def test_a_known_start_is_used_in_flights_of_several_segments():
 def test_each_sample_counts_once(samples, number):
     """Also if the flight is padded: then its length is data."""
     room = samples + 100
-    padded = jax.jit(lambda length: Segments.of(number, room, length, SETTLING))(samples)
-    for index, owned, rows in (Segments.of(number, samples, samples, SETTLING), map(np.asarray, padded)):
+    padded = jax.jit(lambda edges: Segments.of(number, room, edges, SETTLING))(jnp.array([0, samples]))
+    alone = Segments.of(number, samples, np.array([0, samples]), SETTLING)
+    for index, owned, rows, _ in (alone, map(np.asarray, padded)):
         assert index.shape == owned.shape
         assert index.shape[1] % BLOCK == 0
         assert (index >= 0).all()

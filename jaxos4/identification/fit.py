@@ -277,7 +277,7 @@ def _widening(
     problem: InnovationsProblem, found: Estimate, fitted: np.ndarray, recording: np.ndarray
 ) -> Float[np.ndarray, " fitted"]:
     """The factor by which the intervals of the parameters in the places `fitted` widen. `recording`: of each sample."""
-    index, owned, _ = map(np.asarray, problem.cut)
+    index, owned = map(np.asarray, problem.cut[:2])
     middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
     parts = _parts(found)
     # In a segment of padding nothing was measured.

@@ -146,7 +146,7 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) 
     # Segments are as many for all sample times, and last a while at the longest.
     seconds = float(room.fitted.dt) * room.fitted.time.shape[0]
     most = _SEGMENTS * max(recordings // _FEW_RECORDINGS, 1)
-    segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 1, most))
+    segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     padded = with_room(shooting, capacity_of(room.fitted.time.shape[0]))
     passed = _input_innovations(shooting, capacity_of(room.fitted.time.shape[0]))

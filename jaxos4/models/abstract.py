@@ -52,6 +52,19 @@ class Parameter(NamedTuple):
     contradiction: Contradiction | None = None
 
 
+class ByRecording(NamedTuple):
+    """The parameters of each of several recordings.
+
+    - `model`: of any one of them.
+    - `places`: of the parameters of `model` among those of all recordings.
+    - `number`: of the recording of each sample, counted from 0 in order.
+    """
+
+    model: "AbstractModel"
+    places: Int[np.ndarray, "recordings parameters"]
+    number: Int[Numeric, " samples"]
+
+
 class AbstractModel(eqx.Module):
     """A quadrotor: a table of unknown parameters, a forcing, equations of motion and sensors.
 
@@ -109,6 +122,10 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
         """The output of noise-free sensors: the states in cascade order, then the specific force along `force_axes`."""
+
+    def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> "ByRecording | None":
+        """The model of one recording, if several have parameters of their own. `stretch`: see `Flight`."""
+        del stretch
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

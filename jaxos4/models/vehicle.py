@@ -1,5 +1,6 @@
 """The model of a real vehicle: the corrected OS4 and the chosen terms."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -12,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from .._custom_types import Count, Numeric, Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
-from .abstract import PARAMETER_NAMES, AbstractModel, Constant, Parameter
+from .abstract import PARAMETER_NAMES, AbstractModel, ByRecording, Constant, Parameter
 from .os4 import CorrectedOS4
 from .rotors import Grid, Part, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
@@ -104,6 +105,19 @@ class FlightModel(AbstractModel):
     def half_width(self) -> Parameters:
         """Half the width of a bracket for each parameter: our choice, for small and large quadrotors."""
         return jnp.concatenate([self._rigid_body.half_width, self._of_terms(lambda parameter: parameter.half_width)])
+
+    def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> ByRecording | None:
+        """See `AbstractModel`."""
+        if stretch is None or max(self.recordings) == 0:
+            return None
+        one, names = dataclasses.replace(self, recordings=(0,)), self.parameter_names
+        places = [
+            [names.index(name if name in names else f"{name}_{i + 1}") for name in one.parameter_names]
+            for i in range(max(self.recordings) + 1)
+        ]
+        known = isinstance(stretch, np.ndarray)  # what is known needs no compiled program
+        numbers = np.asarray(self.recordings) if known else jnp.asarray(self.recordings)
+        return ByRecording(one, np.array(places), numbers[stretch])
 
     @property
     def gyroscopic_factor(self) -> Scalar:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Count, Parameters, Scalar
+from .._custom_types import Count, Scalar
 from ..models.state import Forcing, Rates, State
 from .batching import with_batch
 from .gains import (
@@ -139,9 +139,9 @@ def innovate(
     observed: Observed,
     input_innovations: Float[Array, "time feedthroughs channels segments"],
     forcing: Forcing,
-    parameters: Parameters,
+    parameters: Float[Array, "parameters *segments"],
     noise: LogNoise,
-    feedthrough: Float[Array, "channels feedthroughs"],
+    feedthrough: tuple[Float[Array, " channels"], ...],
     *,
     dt: Scalar,
     window: Window,
@@ -160,6 +160,7 @@ def innovate(
     - `observed`: its number of rows is a multiple of `BLOCK`.
     - `input_innovations`, `feedthrough`: what they explain of the innovations of the same samples, see
       `jaxos4.shooting.feedthrough`.
+    - `parameters`: of all segments, or of each.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters at the positions `forcing_parameters`.
     - `window`: what a measurement averages.
@@ -189,9 +190,10 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         return jnp.repeat(leaf, segments, axis=0)
 
     def in_each_segment(one: Any, same: Any) -> Any:
-        one = jax.tree.map(lambda leaf: jnp.moveaxis(repeated(leaf), 0, -1), one)
-        same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, lanes * segments)), same)
-        return eqx.combine(one, same)
+        """Values of all segments of a lane, or of each segment."""
+        one = jax.tree.map(lambda leaf: leaf if leaf.ndim > 2 else jnp.repeat(leaf[..., None], segments, 2), one)
+        same = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else jnp.repeat(leaf[:, None], segments, 1), same)
+        return lanes_before_last(one, same)
 
     *series, rows, dt, window = flight
     own = jax.tree.map(repeated, moving)
@@ -214,17 +216,18 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
 
 def _innovate(functions: Functions, positions: tuple[int, ...], flight: tuple, at: Any) -> Innovations:
     """The innovations of one flight."""
-    move, average, observe = (jax.vmap(function, in_axes=(0, 0, None)) for function in functions)
+    own = None if at[0].ndim == 1 else 0
+    move, average, observe = (jax.vmap(function, in_axes=(0, 0, own)) for function in functions)
     return _filter((move, average, observe), positions, flight, at)
 
 
 def _filter(
-    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise, Array]
+    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise, tuple]
 ) -> Innovations:
     """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
     (observed, passed, forcing, forcing_tangents, rows, dt, window), (parameters, noise, feedthrough) = flight, at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
-    unknowns = count + len(LogNoise._fields) + feedthrough.shape[1]
+    unknowns = count + len(LogNoise._fields) + len(feedthrough)
     step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
     steps = step, jax.vmap(push)(basis(noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
@@ -249,11 +252,11 @@ def _filter(
     )
     advance = functools.partial(_advance, functions)
     filtered = functools.partial(_filter_rows, advance, parameters, steps, np.asarray(positions, int))
-    wide = feedthrough if feedthrough.ndim > 2 else feedthrough[..., None]
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
     row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, observed.restart, following)
     # By how much each innovation differs from what the controller let through, and its derivatives.
-    left = jnp.einsum("tfcl,cfl->tcl", passed, jnp.broadcast_to(wide, (*wide.shape[:2], segments)))
+    each = (v * (k if k.ndim > 1 else k[:, None]) for v, k in zip(jnp.moveaxis(passed, 1, 0), feedthrough, strict=True))
+    left = sum(each, jnp.zeros(observed.measured.shape, dtype=float))
     data = row, observed.counts, (left, jnp.moveaxis(passed, 2, 1)), forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
 from ..bracket import PROPER_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, Flight
-from ..models.abstract import AbstractModel
+from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing
 from .abstract import AbstractProblem, Stages, Unknowns, Values, WindowUnknowns
 from .filters import Innovations, innovate
@@ -94,6 +94,9 @@ class InnovationsProblem(AbstractProblem):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
         self.problem, self.segments, self.settling = problem.restrict("rates"), segments, settling
+        each = self._by_recording
+        if each is not None and segments <= len(each.places):
+            raise ValueError(f"`segments` must be more than the {len(each.places)} recordings, got {segments}.")
         # An array in any case, so that all starts share one program.
         channels, samples = self.problem.columns.size, problem.flight.time.shape[-1]
         self.input_innovations = as_float(np.zeros((samples, 0, 3)) if input_innovations is None else input_innovations)
@@ -135,10 +138,22 @@ class InnovationsProblem(AbstractProblem):
     @property
     def cut(self) -> Segments:
         """The samples of each segment."""
-        room, length = self.flight.time.shape[0], self.problem.length
-        # A length that is known needs no compiled program.
-        samples = room if length is None else length if isinstance(length, Tracer) else int(length)
-        return Segments.of(self.segments, room, samples, self.settling)
+        room, length, each = self.flight.time.shape[0], self.problem.length, self._by_recording
+        begins = np.zeros(1, int)
+        if each is not None:
+            numpy = np if isinstance(each.number, np.ndarray) else jnp
+            begins = numpy.searchsorted(each.number, np.arange(len(each.places)))
+        if isinstance(length, Tracer) or isinstance(begins, jax.Array):
+            edges = jnp.append(jnp.asarray(begins), room if length is None else length)
+        else:  # what is known needs no compiled program
+            edges = np.append(begins, room if length is None else int(length))
+        return Segments.of(self.segments, room, edges, self.settling)
+
+    @property
+    def _by_recording(self) -> ByRecording | None:
+        stretch = self.flight.stretch
+        is_known = stretch is not None and not isinstance(stretch, Tracer)
+        return self.model.by_recording(np.asarray(stretch) if is_known else stretch)
 
     @property
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -219,12 +234,21 @@ class InnovationsProblem(AbstractProblem):
         """See `AbstractProblem`. `parts` are the segments."""
         unknowns, innovations = self.unknowns.usable, self._innovations()
         count, free = self.problem.unknowns.count, unknowns.free
-        both = free & free[:, None]
+        both, places = free & free[:, None], None
+        if (each := self._by_recording) is not None:  # of the unknowns of each segment
+            others = np.broadcast_to(np.arange(count, free.size), (self.segments, free.size - count))
+            places = jnp.concatenate([jnp.asarray(each.places)[self.cut.recording], others], axis=1)
 
         def evaluate(values: Values, initial_state: InitialStates) -> Curvature:
             del initial_state
             found = innovations(values[:count], self.noise(values), self._of_channels(values)[:, 3:])
-            gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, count)
+            own = found.gradient.shape[1] - len(self._own)
+            gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, own)
+            if places is not None:
+                segment = np.arange(self.segments)
+                gradient = jnp.zeros((self.segments, free.size)).at[segment[:, None], places].add(gradient)
+                pairs = segment[:, None, None], places[:, :, None], places[:, None, :]
+                information = jnp.zeros((self.segments, *both.shape)).at[pairs].add(information)
             off = values - unknowns.center
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
             slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
@@ -267,13 +291,21 @@ class InnovationsProblem(AbstractProblem):
     def innovations(
         self, parameters: Parameters, noise: LogNoise, feedthrough: Float[Array, "channels feedthroughs"] | None = None
     ) -> Innovations:
-        """The innovations of all segments. `feedthrough`: by default 0."""
+        """The innovations of all segments. `feedthrough`: by default 0.
+
+        The derivatives in each segment are those in the parameters of its recording, see `AbstractModel.by_recording`.
+        """
         nothing = jnp.zeros((self.problem.columns.size, self.input_innovations.shape[-2]))
         return self._innovations()(parameters, noise, nothing if feedthrough is None else feedthrough)
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array], Innovations]:
         """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
-        problem, model, observed, forced = self.problem, self.model, self.observed(), self._forced()
+        problem, observed, forced, each = self.problem, self.observed(), self._forced(), self._by_recording
+        places = None
+        if each is not None:
+            problem = dataclasses.replace(problem, model=each.model)
+            places = jnp.asarray(each.places)[self.cut.recording].T
+        model = problem.model
         passed = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
         passed = jnp.pad(passed, ((0, 0), (0, 0), (0, problem.columns.size - passed.shape[2]), (0, 0)))
         settings = {"dt": self.flight.dt, "window": self.window, "rows": self.cut.rows}
@@ -281,7 +313,8 @@ class InnovationsProblem(AbstractProblem):
 
         def at(parameters: Parameters, noise: LogNoise, feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
-            data = observed, passed, forcing, parameters, noise, feedthrough
+            own = parameters if places is None else parameters[places]
+            data = observed, passed, forcing, own, noise, tuple(feedthrough.T)
             functions = problem.advance, problem.average, model.observe
             return innovate(functions, *data, forcing_tangents=tangents, **settings)
 
@@ -293,6 +326,7 @@ class InnovationsProblem(AbstractProblem):
         samples = self._place
 
         def segments_last(forcing: Forcing) -> Forcing:
+            forcing = forcing._replace(recording=())  # each segment belongs to one
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
 
         def of(parameters: Parameters) -> Forcing:

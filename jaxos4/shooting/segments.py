@@ -23,29 +23,43 @@ _GAP = 0.1
 
 
 class Segments(NamedTuple):
-    """How a flight is cut.
+    """How recordings are cut.
 
-    A segment begins with the end of the segment before it, which its filter needs to settle. The first begins with the
-    flight. Samples beyond the last do not exist.
+    A segment begins with the end of the segment before it, which its filter needs to settle. The first begins with its
+    recording. Segments are equally long, but for the last of each recording.
 
-    - `place`: the samples of each segment, in a multiple of `BLOCK` rows.
+    - `place`: the samples of each segment, in a multiple of `BLOCK` rows. Those beyond the last do not exist.
     - `owned`: whether a sample belongs to a segment. Each belongs to one; in other segments it settles the filter.
     - `rows`: the number of rows that are used; the others are padding.
+    - `recording`: the number of the recording of each segment.
     """
 
     place: Int[Numeric, "segments time"]
     owned: Bool[Numeric, "segments time"]
     rows: Count | int
+    recording: Int[Numeric, " segments"]
 
     @classmethod
-    def of(cls, number: int, capacity: int, samples: Count | int, settling: int) -> "Segments":
-        """So many segments of a flight with room for `capacity` samples, of which some exist."""
-        settling = settling if number > 1 else 0
-        length, most = -(-(samples - settling) // number), -(-(capacity - settling) // number)
-        row, segment = np.arange(-(-(settling + most) // BLOCK) * BLOCK), np.arange(number)[:, None]
-        samples_of = length * segment + row
-        owned = (row < settling + length) & ((row >= settling) | (segment == 0)) & (samples_of < samples)
-        return cls(samples_of, owned, settling + length)
+    def of(cls, number: int, capacity: int, edges: Int[Numeric, " edges"], settling: int) -> "Segments":
+        """At most so many segments, more than there are recordings if these are several.
+
+        `capacity`: the room for samples. `edges`: the first sample of each recording, and the end of the last.
+        """
+        numpy = jnp if isinstance(edges, jax.Array) else np  # what is known needs no compiled program
+        recordings, settling = edges.shape[0] - 1, settling if number > 1 else 0
+        # A recording whose length is no multiple of a segment's has one more.
+        whole = number - (recordings if recordings > 1 else 0)
+        begin, end, own = edges[:-1], edges[1:], numpy.maximum(numpy.diff(edges) - settling, 0)
+        length, most = numpy.maximum(-(-own.sum() // whole), 1), -(-(capacity - settling) // whole)
+        last = numpy.cumsum(numpy.maximum(-(-own // length), 1))
+        recording = numpy.minimum(numpy.searchsorted(last, np.arange(number), side="right"), recordings - 1)
+        first = numpy.concatenate([last[:1] * 0, last[:-1]])
+        segment = (np.arange(number) - first[recording])[:, None]
+        row = np.arange(-(-(settling + most) // BLOCK) * BLOCK)
+        place = begin[recording][:, None] + length * segment + row
+        owned = (row < settling + length) & ((row >= settling) | (segment == 0)) & (place < end[recording][:, None])
+        rows = settling + length
+        return cls(place, owned, rows if isinstance(rows, jax.Array) else int(rows), recording)
 
 
 def observe_in_segments(problem: ShootingProblem, segments: Segments, settling: int) -> Observed:
