@@ -29,7 +29,7 @@ def load(name, script="run"):
 @pytest.fixture
 def report_of(tmp_path, monkeypatch):
     """Runs an experiment with these options and small networks, and returns the JSON that it writes."""
-    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, batch=64, held_out=4000)
+    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, tilings=4, cells=8, batch=64, held_out=4000)
     small.steps = jaxos4.NetworkEstimator.steps
     monkeypatch.setattr(jaxos4, "NetworkEstimator", small)
 
@@ -217,6 +217,7 @@ def test_precision(report_of):
         double, single = (rows[name, precision] for precision in ("float64", "float32"))
         assert double["largest_difference"] == 0 < single["largest_difference"] < 0.2
         assert double["results"] == single["results"] == {"successful": 64}
+        assert near(single["covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 64))
     assert near(rows["kalman", "float32"]["efficiency"], 1, 5 * np.sqrt(1 / 128))
 
 
