@@ -11,6 +11,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import CRAZYFLIE
 from small_network import BRACKET, OMEGA, PUBLISHED, problem_of, trained
 
 import jaxos4
@@ -67,6 +68,15 @@ def test_a_batch_of_simulated_flights(foreign, method):
         return jax.vmap(lambda one: jaxos4.simulate(PUBLISHED(), one, OMEGA, dt=0.01, method=method))(alpha)
 
     assert not foreign(fly, np.ones((LANES, 8)))
+
+
+def test_a_batch_of_flights_in_closed_loop(foreign):
+    loop = jaxos4.ClosedLoop(CRAZYFLIE)
+
+    def fly(keys):
+        return jax.vmap(lambda key: jaxos4.fly_closed_loop(loop, jnp.zeros((21, 4)), key=key))(keys)
+
+    assert not foreign(fly, jax.random.split(jax.random.key(0), LANES))
 
 
 @pytest.mark.parametrize("free", [False, True])
