@@ -75,16 +75,16 @@ class NetworkEstimator(eqx.Module):
     features: str = eqx.field(static=True, default="score")
     channels: str = eqx.field(static=True, default="rates")
     noise: tuple[float, float] = eqx.field(static=True, default=(0.1, 10.0))
-    architecture: str = eqx.field(static=True, default="mlp")
     width: int = eqx.field(static=True, converter=integer("width", 1, static=True), default=128)
     depth: int = eqx.field(static=True, converter=integer("depth", 1, static=True), default=3)
-    tilings: int = eqx.field(static=True, converter=integer("tilings", 1, static=True), default=16)
-    cells: int = eqx.field(static=True, converter=integer("cells", 2, static=True), default=12)
     steps: int = eqx.field(static=True, converter=integer("steps", 1, static=True), default=4000)
     batch: int = eqx.field(static=True, converter=integer("batch", 1, static=True), default=256)
     learning_rate: float = eqx.field(static=True, default=0.01)
     patience: int = eqx.field(static=True, converter=integer("patience", 1, static=True), default=10)
     held_out: int = eqx.field(static=True, converter=integer("held_out", 1000, static=True), default=20_000)
+    architecture: str = eqx.field(static=True, default="mlp")
+    tilings: int = eqx.field(static=True, converter=integer("tilings", 1, static=True), default=16)
+    cells: int = eqx.field(static=True, converter=integer("cells", 2, static=True), default=12)
 
     def __check_init__(self):
         for name, choices in (("features", FEATURES), ("channels", CHANNELS), ("architecture", ARCHITECTURES)):
