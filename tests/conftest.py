@@ -50,7 +50,7 @@ hypothesis.settings.load_profile("ci")
 # Modules that share programs, networks and estimates: one worker runs them, one after another.
 TOGETHER = (
     ("estimators", "errors", "searches", "recursive", "multiple_shooting", "diagnostics", "identifiability"),
-    ("network", "hybrid"),
+    ("network", "hybrid", "accelerators"),
     ("vehicle", "vehicle_likelihood"),
 )
 # The slowest modules start first, so that the workers end together.

@@ -14,6 +14,7 @@ import jaxos4
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 DURATION = 3.0
 SMALL = {"width": 32, "depth": 2, "steps": 1000, "batch": 64, "held_out": 4000}
+CMAC = {"architecture": "cmac", "tilings": 4, "cells": 8, "steps": 250}
 SHORT = SMALL | {"steps": 5, "held_out": 1000}
 BRACKET = jaxos4.Bracket.default(PUBLISHED())
 OMEGA = standard_flight(duration=DURATION).omega

@@ -207,6 +207,7 @@ REFUSED = {
     "simulate --out new.csv --seed 1" + "0" * 30: ["seed"],
     "train flight.csv --out a.net --steps 0": ["`steps` must be", "at least 1"],
     "train flight.csv --out a.net --seed -1": ["--seed"],
+    "train flight.csv --out a.net --features raw --architecture cmac": ["`architecture`", '`features` "score"'],
     "train flight.csv --out flight.csv": ["would overwrite an input"],
     "train flight.csv --out missing/a.net": ["no such folder"],
     "estimate x.csv --model none": ["'published', 'corrected'"],
@@ -331,6 +332,15 @@ def test_a_trained_network_identifies_other_flights_of_its_inputs(run, network_f
     for name, row in report["parameters"].items():
         assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4.5 * row["std"]
         assert row["std"] >= 0.7 * row["bound"]
+
+
+def test_the_architecture_of_a_network_can_be_chosen(run, network_file, monkeypatch):
+    small = functools.partial(NetworkEstimator, tilings=2, cells=4, batch=64, held_out=1000)
+    monkeypatch.setattr("jaxos4.networks.NetworkEstimator", small)
+    flight, options = str(network_file[1]), ["--architecture", "cmac", "--steps", "5", "--initial-state", "known"]
+    code, out, err = run("train", flight, *options, "--out", "flight.net")
+    assert (code, "flight.net: cmac, score features of the rates" in out) == (0, True), err
+    assert jaxos4.load_network("flight.net").settings.architecture == "cmac"
 
 
 def test_networks_of_another_problem_are_refused(run, tmp_path, network_file):

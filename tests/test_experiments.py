@@ -29,7 +29,7 @@ def load(name, script="run"):
 @pytest.fixture
 def report_of(tmp_path, monkeypatch):
     """Runs an experiment with these options and small networks, and returns the JSON that it writes."""
-    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, batch=64, held_out=4000)
+    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, tilings=4, cells=8, batch=64, held_out=4000)
     small.steps = jaxos4.NetworkEstimator.steps
     monkeypatch.setattr(jaxos4, "NetworkEstimator", small)
 
@@ -196,15 +196,29 @@ def test_speed(report_of):
 
 
 def test_networks(report_of):
-    cases = {"cases": ["standard"], "networks": ["score, mlp"], "noises": [1.0], "channels": "rates", "separate": False}
+    trained = {"networks": ["score, mlp", "score, cmac"], "channels": "rates", "separate": False}
+    cases = {"cases": ["standard"], "noises": [1.0], **trained}
     report = report_of("networks", flights=128, seed=7, steps=100, many=128, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
     assert report["one_call"]["flights"] == 128
-    assert list(rows) == ["score, mlp", "hybrid", "ibss"]
+    hybrids = [f"hybrid from {label}" for label in trained["networks"]]
+    assert list(rows) == ["score, mlp", hybrids[0], "ibss", "score, cmac", hybrids[1]]
     # Each of eight parameters within five Monte-Carlo errors of the bound.
-    assert all(near(rows[n]["efficiency"], 1, 5 * rows[n]["monte_carlo_error"]) for n in ("hybrid", "ibss"))
-    assert rows["hybrid"]["rollouts"] < rows["ibss"]["rollouts"]
-    assert rows["hybrid"]["hit_rate"] > 0.9
+    assert all(near(rows[n]["efficiency"], 1, 5 * rows[n]["monte_carlo_error"]) for n in (*hybrids, "ibss"))
+    assert all(rows[n]["rollouts"] < rows["ibss"]["rollouts"] and rows[n]["hit_rate"] > 0.9 for n in hybrids)
+
+
+def test_precision(report_of):
+    names = ["kalman", "network"]
+    report = report_of("precision", flights=64, seed=0, estimators=names, known=True, steps=100)
+    rows = {(row["estimator"], row["precision"]): row for row in report["rows"]}
+    assert len(rows) == 4
+    for name in names:
+        double, single = (rows[name, precision] for precision in ("float64", "float32"))
+        assert double["largest_difference"] == 0 < single["largest_difference"] < 0.2
+        assert double["results"] == single["results"] == {"successful": 64}
+        assert near(single["covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 64))
+    assert near(rows["kalman", "float32"]["efficiency"], 1, 5 * np.sqrt(1 / 128))
 
 
 def test_baselines(report_of):

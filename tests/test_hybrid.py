@@ -10,7 +10,7 @@ import pytest
 from helpers import DT, same
 from hypothesis import given, settings, strategies as st
 from lanes import LANES
-from small_network import BRACKET, OMEGA, PUBLISHED, SMALL, flights, identify, names, problem_of, trained
+from small_network import BRACKET, CMAC, OMEGA, PUBLISHED, SMALL, flights, identify, names, problem_of, trained
 
 import jaxos4
 from jaxos4.estimators.hybrid import search_from_seed
@@ -88,7 +88,8 @@ def test_half_widths_are_gaussian_unless_calibrated():
 
 
 def test_a_file_gives_back_the_same_network(tmp_path):
-    for number, network in enumerate((trained(), trained(free=True), trained(features="raw", steps=1))):
+    others = trained(features="raw", steps=1), trained(**CMAC)
+    for number, network in enumerate((trained(), trained(free=True), *others)):
         path = tmp_path / f"{number}.net"
         jaxos4.save_network(network, path)
         loaded, problem = jaxos4.load_network(path), problem_of(free=number == 1)
@@ -125,6 +126,16 @@ def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(network_file, dat
     except jaxos4.InputError as error:
         message = str(error)
     assert "\n" not in message
+
+
+def test_a_file_from_before_there_were_architectures_opens(tmp_path, network_file):
+    with np.load(network_file) as file:
+        arrays = {name.replace("correction", "perceptron"): array for name, array in file.items()}
+    header = json.loads(str(arrays["header"])) | {"format": 4}
+    for name in ("architecture", "tilings", "cells"):
+        del header["settings"][name]
+    np.savez(tmp_path / "old.npz", **(arrays | {"header": np.asarray(json.dumps(header))}))
+    assert same(jaxos4.load_network(tmp_path / "old.npz"), trained())
 
 
 class Trap:

@@ -224,6 +224,8 @@ SETTINGS = [
     (jaxos4.AntColony, "ants", [0], "must be an integer of at least 1"),
     (jaxos4.AntColony, "q", [0.0, np.nan], "must be positive and finite"),
     (jaxos4.NetworkEstimator, "learning_rate", [0.0, np.inf], "must be positive and finite"),
+    (jaxos4.NetworkEstimator, "architecture", ["rbf"], "must be one of mlp, cmac"),
+    (jaxos4.NetworkEstimator, "cells", [1], "must be an integer of at least 2"),
 ]
 
 

@@ -9,6 +9,7 @@ from helpers import DT, compiled_programs, same, standard_flight
 from lanes import LANES, lost
 from small_network import (
     BRACKET,
+    CMAC,
     CORRECTED,
     DURATION,
     LEVELS,
@@ -92,11 +93,23 @@ def test_training_learns_and_comes_near_the_bound():
     assert abs(squares.mean() - 1) < 0.1  # errors have the size of the covariance
 
 
+def test_cmac_corrects_the_linear_map():
+    alpha, states = many(1.0)
+
+    def rmse(**changes):
+        return np.sqrt(np.mean(np.square(identify(trained(**changes), states).parameters - alpha), axis=0))
+
+    assert (rmse(**CMAC) < 0.8 * rmse(**(CMAC | {"steps": 1}))).all()
+    with pytest.raises(ValueError, match='`architecture` "cmac" needs `features` "score", got \'raw\''):
+        jaxos4.NetworkEstimator(architecture="cmac", features="raw")
+
+
 OTHER_NETWORKS = [
     {},
     {"features": "raw", "steps": 1},
     {"noise": (1.0, 1.0), "steps": 50},
     {"channels": "attitude", "steps": 1},
+    CMAC,
 ]
 
 

@@ -25,7 +25,7 @@ from jaxos4.excitation import EXCITATIONS
 from jaxos4.export import TARGETS
 from jaxos4.models import MODELS
 from jaxos4.models.state import CHANNELS
-from jaxos4.networks import FEATURES, NetworkEstimator
+from jaxos4.networks import ARCHITECTURES, FEATURES, NetworkEstimator
 from jaxos4.simulation import METHODS
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -150,12 +150,18 @@ import diffrax
 
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_command_keeps_settings(run):
     tables = {"Estimator": ESTIMATORS, "Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
-    tables |= {"Channels": CHANNELS, "Features": FEATURES, "Simulator": TARGETS, "Criterion": CRITERIA}
+    tables |= {
+        "Channels": CHANNELS,
+        "Features": FEATURES,
+        "Architecture": ARCHITECTURES,
+        "Simulator": TARGETS,
+        "Criterion": CRITERIA,
+    }
     for name, table in tables.items():
         kind = getattr(_options, name)
         assert list(map(str, get_args(kind) or kind)) == list(table)
     defaults = {name: argument.default for name, argument in inspect.signature(estimate.train).parameters.items()}
-    for name in ("noise", "steps", "features"):
+    for name in ("noise", "steps", "features", "architecture"):
         assert defaults[name] == getattr(NetworkEstimator, name)
     before = json.dumps(jax.config.values, default=str, sort_keys=True)
     assert run(*SIMULATE)[0] == 0

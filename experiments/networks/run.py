@@ -1,4 +1,4 @@
-"""Networks, the hybrid and IBSS on new flights with random parameters: RMSE / bound, coverage, rollouts, time.
+"""Networks, hybrids from them and IBSS on new flights with random parameters: RMSE / bound, coverage, rollouts, time.
 
 Each error is in units of the Cramer-Rao bound at that flight's own truth.
 """
@@ -74,6 +74,8 @@ CASES = {
 NETWORKS = {
     "score, mlp": {},
     "raw, mlp": {"features": "raw", "steps": 3000},
+    "score, cmac": {"architecture": "cmac"},
+    "score, cmac, 10000 steps": {"architecture": "cmac", "steps": 10_000},
 }
 
 
@@ -229,16 +231,18 @@ def main(
             report["training_seconds"][f"{name}: {label}"] = seconds
             for noise, row in unseen(case, trained, channels, "rates", noises, flights, seed):
                 add(name, label, noise, row)
-            if label != networks[0]:
+            if "features" in NETWORKS[label]:
                 continue
-            if name == "standard":
+            if name == "standard" and label == networks[0]:
                 report["one_call"] = amortised(case, trained, channels, many)
                 console.print(f"one call: {report['one_call']}", highlight=False)
             seeds = trained
             if channels != trained.channels:
                 seeds, seconds = fit(case, {**NETWORKS[label], "channels": channels})
                 report["training_seconds"][f"{name}: {label} of {channels} channels, for the hybrid"] = seconds
-            for other, estimator in (("hybrid", jaxos4.Hybrid(seeds)), ("ibss", jaxos4.IBSS())):
+            searches = {f"hybrid from {label}": jaxos4.Hybrid(seeds)}
+            searches |= {"ibss": jaxos4.IBSS()} if label == networks[0] else {}
+            for other, estimator in searches.items():
                 for noise, row in unseen(case, estimator, channels, channels, noises, flights, seed):
                     add(name, other, noise, row)
         for noise in noises if name == "standard" and separate else ():

@@ -20,6 +20,7 @@ Channels = Literal["rates", "attitude", "all"]
 InitialState = Literal["free", "known"]
 Simulator = Literal["mujoco", "rotorpy", "sdf"]
 Features = Literal["score", "raw"]
+Architecture = Literal["mlp", "cmac"]
 Criterion = Literal["D", "A", "worst"]
 Estimator = StrEnum("Estimator", list(ESTIMATORS))
 

@@ -152,6 +152,9 @@ def train(
     bracket: options.BracketOption = None,
     initial_state: options.InitialStateOption = "free",
     features: Annotated[options.Features, Option(help="What the network sees.")] = "score",
+    architecture: Annotated[
+        options.Architecture, Option(help="A multilayer perceptron, or CMAC: tables of weights.")
+    ] = "mlp",
     noise: Annotated[
         tuple[float, float],
         Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
@@ -174,7 +177,7 @@ def train(
         from ..recording import read_recording
 
         with named("options"):
-            settings = NetworkEstimator(features=features, noise=noise, steps=steps)
+            settings = NetworkEstimator(features=features, architecture=architecture, noise=noise, steps=steps)
         check_outputs(flight, airframe, bracket, out=out)
         progress("reading")
         subject = MODELS[model](load_airframe(airframe))
@@ -195,7 +198,7 @@ def train(
     save_network(network, out)
     low, high = noise
     typer.echo(
-        f"{out}: {features} features of the {network.channels}, noise {low:g} to {high:g} times the standard "
-        f"one, {model} model, {recording.flight.time.shape[0]} samples, loss "
+        f"{out}: {architecture}, {features} features of the {network.channels}, noise {low:g} to {high:g} times the "
+        f"standard one, {model} model, {recording.flight.time.shape[0]} samples, loss "
         f"{network.history[:, 1].min():.4g}, {time.perf_counter() - begin:.0f} s"
     )

@@ -13,6 +13,7 @@ from .._custom_types import Key, Numeric, Scalar, as_float, integer, setting
 from .._xla import quick_jit
 from ..airframe import alpha_scalars
 from ..flight import Flight
+from ..linalg import invert
 from ..models.os4 import CorrectedOS4
 from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
@@ -213,6 +214,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     sense_key, log_key = jax.random.split(jax.random.fold_in(key, 1))
     sense = loop.sensors and Sense.of(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
     mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
+    allocation = mixer.T @ invert(mixer @ mixer.T)  # the mixer's inverse, without a call of LAPACK
     # A command acts `late` runs after its own, and in the first `part` of a run the one before it still acts.
     late = jnp.floor(loop.rotor_delay / period).astype(int)
     part = loop.rotor_delay / period - late
@@ -233,7 +235,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         if sense is not None and signals is not None:
             signals, seen = sense(signals, speeds, gyro, rates + drawn.own, specific)
             gyro, specific = signals.filtered[:3], signals.filtered[6:]
-        command, integral = _control(loop, mixer, reference, seen, attitude, integral, period)
+        command, integral = _control(loop, allocation, reference, seen, attitude, integral, period)
         commands = commands.at[k + 1].set(command)
         before, now = (commands[jnp.maximum(k + 1 - late - i, 0)] for i in (1, 0))
 
@@ -256,7 +258,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         return _State(later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
 
     weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())
-    hover, _ = _speeds(mixer, jnp.zeros(3), weight, airframe.max_rotor_speed)
+    hover, _ = _speeds(allocation, jnp.zeros(3), weight, airframe.max_rotor_speed)
     velocity = None if loop.air is None else (zero, zero, zero)
     motion = Motion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
     still = jnp.zeros(9).at[8].set(vehicle.gravity)
@@ -268,7 +270,13 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
 
 
 def _control(
-    loop: ClosedLoop, mixer: Array, reference: Array, seen: PerAxis, attitude: PerAxis, integral: PerAxis, dt: Scalar
+    loop: ClosedLoop,
+    allocation: Array,
+    reference: Array,
+    seen: PerAxis,
+    attitude: PerAxis,
+    integral: PerAxis,
+    dt: Scalar,
 ) -> tuple[Float[Array, "4"], PerAxis]:
     """The commands [rad/s] of one run, and the integrators after it. `seen`: the body rates that it answers."""
     airframe = loop.airframe
@@ -277,12 +285,12 @@ def _control(
     upright = jnp.maximum(jnp.cos(attitude[0]) * jnp.cos(attitude[1]), _STEEPEST)
     thrust = as_float(airframe.mass * (reference[3] + airframe.gravity) / upright)
     inertia = as_float(airframe.inertia) if loop.controller_inertia is None else loop.controller_inertia
-    speeds, saturated = _speeds(mixer, inertia * demand, thrust, airframe.max_rotor_speed)
+    speeds, saturated = _speeds(allocation, inertia * demand, thrust, airframe.max_rotor_speed)
     return loop.motor.command(speeds), jnp.where(saturated, integral, integral + dt * loop.integral_gain * error)
 
 
-def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> tuple[Float[Array, "4"], Array]:
+def _speeds(allocation: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> tuple[Float[Array, "4"], Array]:
     """The rotor speeds [rad/s] that make torque [N m] and thrust [N], and whether one of them saturates."""
-    wanted = jnp.linalg.solve(mixer, jnp.append(torque, thrust))
+    wanted = allocation @ jnp.append(torque, thrust)
     squares = jnp.clip(wanted, 0.0, jnp.asarray(fastest) ** 2)
     return jnp.sqrt(squares), jnp.any(squares != wanted)

@@ -34,8 +34,10 @@ class JointEKF(AbstractRecursion):
     - `passes`: the most passes over the flight. The first pass linearises the model around its own running estimate:
       the textbook filter. Each later pass starts from the same prior and linearises around the trajectory of the
       previous answer: a Gauss-Newton step on prior and flight together. The passes end once a pass changes no
-      parameter by more than a tenth of its standard deviation; otherwise the result is `max_sweeps`. With `passes=1`
-      the first answer is accepted as it is. On more channels than the rates its covariance can then be far too small.
+      parameter by more than a tenth of its standard deviation; otherwise the result is `max_sweeps`. In single
+      precision, rounding errors can be as large if the noise is a tenth of the standard sensors' (6 of 256 flights).
+      With `passes=1` the first answer is accepted as it is. On more channels than the rates its covariance can then be
+      far too small.
 
     The bracket is a Gaussian prior: its center is the mean, its half-width the standard deviation. If the center is off
     by half of the half-width, the answer is off by half of std^2 / half_width. A free initial state has the first

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Key, Scalar, as_float
+from .cmac import CMAC
 
 # Features grow linearly up to this size and logarithmically beyond: flights that nearly diverge have huge features.
 _LINEAR = 4.0
@@ -31,7 +32,7 @@ class Scaling(eqx.Module):
 
     - `width`: the typical size of each feature.
     - `unit`: the Cramer-Rao bound of each unknown at the bracket's center, in bracket coordinates.
-    - `gain`: the correction of each unknown when the perceptron returns 1, in bracket coordinates.
+    - `gain`: the correction of each unknown when the architecture returns 1, in bracket coordinates.
     - `span`: the largest logarithm of a noise scale.
     """
 
@@ -68,17 +69,24 @@ class GatedPerceptron(eqx.Module):
         return self.last(self.hidden(x) * self.gate(x))
 
 
+ARCHITECTURES = {
+    "mlp": (GatedPerceptron, ("width", "depth")),
+    "cmac": (CMAC, ("tilings", "cells")),
+}
+"""What corrects the linear map, by name: the class, and the settings that are its arguments."""
+
+
 class Regressor(eqx.Module):
-    """The trained part of a network: a linear map `skip`, a perceptron that corrects it, and the error's spread."""
+    """The trained part of a network: a linear map `skip`, its `correction`, and the error's spread."""
 
     skip: Float[Array, "unknowns features"]
-    perceptron: GatedPerceptron
+    correction: GatedPerceptron | CMAC
     spread: eqx.nn.MLP
 
-    def __init__(self, skip: Float[Array, "unknowns features"], *, width: int, depth: int, key: Key):
+    def __init__(self, skip: Float[Array, "unknowns features"], architecture: str, shape: dict[str, Any], *, key: Key):
         self.skip, sizes = skip, (skip.shape[1] + 1, skip.shape[0])
         first, second = jax.random.split(key)
-        self.perceptron = GatedPerceptron(*sizes, width, depth, key=first)
+        self.correction = ARCHITECTURES[architecture][0](*sizes, **shape, key=first)
         self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=second)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> tuple[Array, Array]:
@@ -88,11 +96,13 @@ class Regressor(eqx.Module):
         """
         compressed = compress(features / scaling.width)
         inputs = jnp.concatenate([compressed, (jnp.log(scale) / scaling.span)[None]])
-        u = self.skip @ compressed + scaling.gain * self.perceptron(inputs)
+        u = self.skip @ compressed + scaling.gain * self.correction(inputs)
         return u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM)
 
 
-def first_regressor(linear_map: Float[Array, "unknowns features"], key: Key, shape: dict[str, Any]) -> Regressor:
+def first_regressor(
+    linear_map: Float[Array, "unknowns features"], key: Key, architecture: str, shape: dict[str, Any]
+) -> Regressor:
     """A `Regressor` with the distribution of Equinox's first weights: uniform within 1 / sqrt(inputs).
 
     All random numbers come from one draw: a draw for each array would take XLA five seconds to compile. All arrays
@@ -103,7 +113,7 @@ def first_regressor(linear_map: Float[Array, "unknowns features"], key: Key, sha
         nodes = jax.tree.leaves(regressor, is_leaf=lambda x: isinstance(x, eqx.nn.Linear))
         return [x for node in nodes if isinstance(node, eqx.nn.Linear) for x in (node.weight, node.bias)]
 
-    abstract = eqx.filter_eval_shape(functools.partial(Regressor, linear_map, **shape), key=key)
+    abstract = eqx.filter_eval_shape(functools.partial(Regressor, linear_map, architecture, shape), key=key)
     blank = jax.tree.map(lambda x: jnp.zeros_like(x) if isinstance(x, jax.ShapeDtypeStruct) else x, abstract)
     shapes = [array.shape for array in arrays(blank)]
     limits = np.repeat([1 / math.sqrt(weight[1]) for weight in shapes[::2]], 2).tolist()

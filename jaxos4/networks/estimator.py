@@ -22,7 +22,7 @@ from ..linalg import invert
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem, Unknowns, in_blocks
-from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
+from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
 from .features import FEATURES, Coordinates, Features
 from .training import calibrate, train, untrained
 
@@ -60,7 +60,10 @@ class NetworkEstimator(eqx.Module):
       bracket; attitude and position hold more information, but are far from linear.
     - `noise`: the lowest and highest noise scale of training, in multiples of the problem's sigma. Scales are drawn
       log-uniformly, and the scale is an input of the network.
-    - `width`, `depth`: of the perceptron that corrects a linear map.
+    - `architecture`: what corrects a linear map: `"mlp"`, a multilayer perceptron, or `"cmac"`, a table of weights.
+    - `width`, `depth`: of the perceptron.
+    - `tilings`, `cells`: of CMAC, for each pair of score features: the number of tilings, and of cells along each side.
+      Finer cells represent more, and learn more slowly.
     - `steps`, `batch`, `learning_rate`: of the training, by Muon with a cosine schedule; a step uses `batch` flights,
       and each flight is used about four times, with new noise.
     - `patience`: training stops early after this many checks, of 250 steps each, without a better validation loss.
@@ -79,16 +82,26 @@ class NetworkEstimator(eqx.Module):
     learning_rate: float = eqx.field(static=True, default=0.01)
     patience: int = eqx.field(static=True, converter=integer("patience", 1, static=True), default=10)
     held_out: int = eqx.field(static=True, converter=integer("held_out", 1000, static=True), default=20_000)
+    architecture: str = eqx.field(static=True, default="mlp")
+    tilings: int = eqx.field(static=True, converter=integer("tilings", 1, static=True), default=16)
+    cells: int = eqx.field(static=True, converter=integer("cells", 2, static=True), default=12)
 
     def __check_init__(self):
-        for name, choices in (("features", FEATURES), ("channels", CHANNELS)):
+        for name, choices in (("features", FEATURES), ("channels", CHANNELS), ("architecture", ARCHITECTURES)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
         if self.steps > _MOST_STEPS:
             raise ValueError(f"`steps` must be at most {_MOST_STEPS}, got {self.steps}.")
         setting("learning_rate", positive=True)(self.learning_rate)
+        if self.architecture == "cmac" and self.features != "score":
+            raise ValueError(f'`architecture` "cmac" needs `features` "score", got {self.features!r}.')
         if not (len(self.noise) == 2 and 0 < self.noise[0] <= self.noise[1] < np.inf):
             raise ValueError(f"`noise` must be (lowest, highest), positive and finite, got {self.noise}.")
+
+    @property
+    def shape(self) -> dict[str, Any]:
+        """The settings of the architecture."""
+        return {name: getattr(self, name) for name in ARCHITECTURES[self.architecture][1]}
 
     def fit(self, problem: ShootingProblem, bracket: Bracket, *, key: Key) -> "TrainedNetwork":
         """Trains a network for the inputs, sampling, start and missing samples of a problem, and calibrates it.

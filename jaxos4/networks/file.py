@@ -26,7 +26,8 @@ from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_sca
 from .estimator import NetworkEstimator, TrainedNetwork
 from .features import Coordinates, Features
 
-_FORMAT = 4
+_FORMAT = 5
+_BEFORE = 4  # without architectures: all networks are perceptrons
 
 
 def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
@@ -86,13 +87,16 @@ def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
 
 def _restore(place: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     header = json.loads(str(arrays["header"]))
-    if header["format"] != _FORMAT:
+    if header["format"] == _BEFORE:
+        arrays = {name.replace(".perceptron", ".correction"): array for name, array in arrays.items()}
+    elif header["format"] != _FORMAT:
         raise InputError(f"{place}: trained by another version of jaxos4; train it again with `jaxos4 train`.")
     check_plain(place, header, "train it again with `jaxos4 train`")
     settings = NetworkEstimator(**header["settings"] | {"noise": tuple(header["settings"]["noise"])})
     if any(array.dtype.kind not in "fiu" for name, array in arrays.items() if name != "header"):
         raise ValueError("an array holds no numbers")
-    if settings.depth > len(arrays) or settings.width > max(map(np.size, arrays.values())):
+    largest = max(settings.shape.values())
+    if settings.depth > len(arrays) or largest > max(map(np.size, arrays.values())):
         raise ValueError("its layers are not those of its settings")
     with named(place):
         airframe = airframe_from_table({f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
@@ -127,7 +131,7 @@ def _blank(settings: NetworkEstimator, problem: ShootingProblem, checks: int) ->
     features = Features.blank(settings.features, problem, coordinates)
     key, unknowns = jax.random.key(0), coordinates.center
     linear_map = jnp.zeros((unknowns.size, features.size))
-    regressor = Regressor(linear_map, width=settings.width, depth=settings.depth, key=key)
+    regressor = Regressor(linear_map, settings.architecture, settings.shape, key=key)
     shapes = ((parameters,), (parameters, parameters), (len(LEVELS), parameters), (len(LEVELS),))
     errors = ErrorTable(scales, *(jnp.zeros((scales.size, *shape)) for shape in shapes))
     scaling = Scaling(linear_map[0], unknowns, unknowns, scales[0])

@@ -39,15 +39,20 @@ _PER_FEATURE, _RIDGE = 4, 1e-6
 
 def untrained(features: Features, settings: "NetworkEstimator", key: Key) -> tuple[Scaling, Regressor]:
     """Scaling and regressor before training, with a linear map that is fitted to simulated flights."""
-    scales, shape = np.asarray(settings.noise, float), {"width": settings.width, "depth": settings.depth}
+    scales = np.asarray(settings.noise, float)
     count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
     chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)
-    return _untrained(features, chunks, scales, key, shape)
+    return _untrained(features, chunks, scales, key, settings.architecture, settings.shape)
 
 
 @quick_jit
 def _untrained(
-    features: Features, chunks: list[Flights], scales: Float[Numeric, "2"], key: Key, shape: dict[str, Any]
+    features: Features,
+    chunks: list[Flights],
+    scales: Float[Numeric, "2"],
+    key: Key,
+    architecture: str,
+    shape: dict[str, Any],
 ) -> tuple[Scaling, Regressor]:
     samples = _joined(chunks)
     # The score's own derivatives give the bound.
@@ -66,7 +71,7 @@ def _untrained(
     linear_map = jnp.linalg.solve(inputs.T @ inputs + ridge * jnp.eye(features.size), inputs.T @ targets).T
     scaling = Scaling(sizes, unit, jnp.minimum(10 * unit, 1.0), jnp.maximum(jnp.abs(jnp.log(scales)).max(), 1.0))
     key = jax.random.fold_in(key, place_of(Purpose.WEIGHTS, 0))
-    return scaling, first_regressor(linear_map, key, shape)
+    return scaling, first_regressor(linear_map, key, architecture, shape)
 
 
 def train(
