@@ -271,6 +271,13 @@ def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarra
     return np.stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
 
 
+def attitude(quaternion: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "samples 3"]:
+    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z) of any length, without unwrapping; of zeros, NaN."""
+    with np.errstate(all="ignore"):
+        unit = quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
+    return euler_angles(unit)
+
+
 def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:
     """Which samples are later than all samples before them. None if more than 1 % are not: the log is corrupt."""
     if not np.isfinite(t).all():
