@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 import test_flight_csv as flight_csv
+import test_logs_ardupilot as ardupilot
 import test_logs_blackbox as blackbox
 import test_logs_columns as columns
 import test_logs_crazyflie as crazyflie
@@ -28,6 +29,7 @@ from jaxos4.logs.table import opened, refuse
 # Each reader: a good log, the bytes at its beginning that are its header, and bad logs with words of their messages.
 SUBJECTS = {
     "ULog": (ulog.SMALL, 16, ulog.BAD),
+    "ArduPilot": (ardupilot.SMALL, 300, ardupilot.BAD),
     "Crazyflie": (crazyflie.SMALL, 60, crazyflie.BAD),
     "blackbox": (blackbox.SMALL, 400, blackbox.BAD),
     "blackbox, not decoded": (blackbox.SMALL_RAW, 400, {}),

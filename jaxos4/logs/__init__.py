@@ -10,6 +10,7 @@ from typing import Any
 from ..airframe import Airframe
 from ..errors import printable
 from ..flight import Flight
+from .ardupilot import ARDUPILOT
 from .assemble import recording_of
 from .blackbox import BLACKBOX
 from .columns import ColumnsGiven, array_table, column_map
@@ -28,7 +29,7 @@ from .table import (
 )
 from .ulog import ULOG
 
-FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
+FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
 
 _FIRST_BYTES = 1 << 18
