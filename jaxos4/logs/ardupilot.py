@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .sampling import Series, gyro_rows, in_order, logged_rate, unwrapped
+from .sampling import HALF_TURN, Series, gyro_rows, in_order, logged_rate, unwrapped
 from .table import (
     LogFacts,
     LogFormat,
@@ -25,7 +25,6 @@ from .table import (
     read_bytes,
     refuse,
 )
-from .ulog_file import HALF_TURN
 
 _HEAD, _FMT, _FMT_LENGTH = b"\xa3\x95", 0x80, 89
 _LARGEST = 1 << 30  # bytes of a file

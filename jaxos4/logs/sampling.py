@@ -19,6 +19,8 @@ _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no
 _PAUSE = 0.9  # [s]; a longer time between samples is a pause of the log, and not its rate
 _FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up to this share, are a rate
 
+HALF_TURN = np.array([1.0, -1.0, -1.0])
+"""About x: from x forward, y right, z down to x forward, y left, z up."""
 Times = Float[np.ndarray, " samples"]
 Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .sampling import Series, attitude, gyro_rows, logged_rate, unwrapped
+from .sampling import HALF_TURN, Series, attitude, gyro_rows, logged_rate, unwrapped
 from .table import LIMITS, LogFacts, LogFormat, Path, Sampling, Table, fast_enough, needed, order_note, refuse
-from .ulog_file import HALF_TURN, MAGIC, Topics, decoded
+from .ulog_file import MAGIC, Topics, decoded
 
 _RATES = {"vehicle_angular_velocity": "xyz", "sensor_combined": "gyro_rad"}
 _FORCES = {"sensor_combined": "accelerometer_m_s2", "vehicle_acceleration": "xyz"}
