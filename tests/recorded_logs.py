@@ -211,6 +211,25 @@ def crazyflie(events, *, version=2, checksum=True):
     return bytes(out)
 
 
+def crazyflie_2019(variables, times, columns, *, block=8):
+    """The format of 2019: data sets in blocks, each with the inverse of its checksum."""
+
+    def checked(content):
+        return content + struct.pack("<I", zlib.crc32(content) ^ 0xFFFFFFFF)
+
+    names = ["tick(I)", *variables]
+    code = "<" + "".join(name[-2] for name in names)
+    out = checked(bytes([len(names)]) + "".join(f"{name}," for name in names).encode())
+    table = np.column_stack([np.rint(1e3 * np.asarray(times)), columns]).tolist()
+    for begin in range(0, len(table), block):
+        rows = (
+            [x if k in "fde" else round(x) for k, x in zip(code[1:], row, strict=True)] for row in table[begin:][:block]
+        )
+        sets = [struct.pack(code, *row) for row in rows]
+        out += checked(bytes([len(sets)]) + b"".join(sets))
+    return out
+
+
 # ArduPilot
 
 

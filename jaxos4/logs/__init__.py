@@ -28,6 +28,7 @@ from .table import (
     refuse,
 )
 from .ulog import ULOG
+from .unread import unread_kind
 
 FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
@@ -100,9 +101,12 @@ def log_format(path: Path) -> LogFormat:
 
     A pipe can be read only once, so it always counts as the last.
 
-    **Raises:** `InputError` if the file cannot be opened.
+    **Raises:** `InputError` if the file cannot be opened, or is evidently of another kind.
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
         begin = file.read(_FIRST_BYTES) if file.seekable() else b""
-    return next((each for each in FORMATS[:-1] if each.recognises(begin)), FORMATS[-1])
+    kind = next((each for each in FORMATS[:-1] if each.recognises(begin)), FORMATS[-1])
+    if kind is FORMATS[-1] and (unread := unread_kind(begin)):
+        refuse(path, f"{unread}. Logs that are read: {', '.join(each.label for each in FORMATS)}")
+    return kind
