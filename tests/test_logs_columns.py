@@ -29,7 +29,7 @@ frame = "FRD"
 t = {source = "time", unit = "ms"}
 omega1 = {source = "rpm 1", unit = "rpm"}
 omega2 = {source = "rpm 2", unit = "rpm"}
-omega3 = {source = "rpm 3", unit = "rpm", sign = -1}
+omega3 = {source = "rpm 3", unit = "rpm"}
 omega4 = {source = "rpm 4", unit = "rpm"}
 p = {source = ["missing", "gyro x"], unit = "deg/s"}
 q = {source = "gyro y", unit = "deg/s"}
@@ -101,6 +101,9 @@ def test_a_csv_of_neurobem_is_recognised(save):
     assert any("'vel x'" in note for note in notes)
     mine, _ = read_log(path, columns={"preset": "neurobem", "columns": {"p": {"source": "ang vel x", "sign": -1}}})
     np.testing.assert_array_equal(np.asarray(mine.states)[:, 7], -np.asarray(flight.states)[:, 7])
+    turned = {"preset": "neurobem", "frame": "FRD", "columns": {"q": "ang vel y"}}  # the frame of what is named here
+    mine, _ = read_log(path, columns=turned)
+    np.testing.assert_array_equal(np.asarray(mine.states)[:, [9, 11]], np.asarray(flight.states)[:, [9, 11]] * [-1, 1])
 
 
 def arrays():

@@ -63,7 +63,8 @@ def test_a_bag_is_the_same_flight_as_the_csv(kind, bagged, tmp_path, save):
     angles = Rotation.from_matrix(attitude(T)).as_euler("ZYX")[:, ::-1]
     csv = read_recording(save(table_csv(names, T, speeds(T), rates(T), force(T), angles)))
     other = shutil.copy(bagged[kind], tmp_path / "flight.log")  # its name says nothing
-    for place in {bagged[kind].parent if kind != "bag" else bagged[kind], bagged[kind], Path(other)}:
+    folder = bagged[kind].parent
+    for place in {bagged[kind], Path(other)} | ({folder, folder / "metadata.yaml"} if kind != "bag" else set()):
         read = read_recording(place, columns={"columns": MAP})
         np.testing.assert_allclose(read.time, csv.time, atol=2e-7)  # the format counts in ns
         np.testing.assert_allclose(read.states, csv.states, atol=1e-9)
@@ -100,6 +101,25 @@ def test_times_are_stamps_if_all_topics_have_some_of_one_clock(tmp_path, bagged)
     flight, notes = read_log(path, columns={"columns": MAP | own})
     check(flight, names=ATTITUDE)
     assert any("times are those of the recorder" in note for note in notes)
+    definitions = {"other/msg/All": "float64[4] speeds\nfloat64[3] gyro"}
+    gyro, turning = rates(T), speeds(T)
+    alone = {"/s": ("other/msg/All", T, lambda row: {"speeds": turning[row], "gyro": gyro[row]})}
+    own |= {name: f"/s.gyro[{i}]" for i, name in enumerate("pqr")}
+    flight, notes = read_log(bag(tmp_path / "alone", "mcap", alone, definitions), columns={"columns": own})
+    check(flight, names=ATTITUDE[:3], forces=False)
+    assert any("times are those of the recorder" in note for note in notes)
+
+
+def test_each_rotor_may_have_a_topic_of_its_own(tmp_path):
+    """At times of its own, which are brought to those of the first."""
+    late = [T[::2] + 0.001 * i for i in range(4)]
+    messages = {"/imu": bags.imu(T, quaternions(T))}
+    for i, t in enumerate(late):
+        messages[f"/motor_speed/{i}"] = ("other/msg/One", t, lambda k, i=i: {"data": speeds(late[i])[k, i]})
+    path = bag(tmp_path / "four.bag", "bag", messages, {"other/msg/One": "std_msgs/Header header\nfloat64 data"})
+    flight, _ = read_log(path, columns={"columns": MAP | {f"omega{i + 1}": f"/motor_speed/{i}.data" for i in range(4)}})
+    t = np.asarray(flight.time)[2:-4] + 0.002
+    np.testing.assert_allclose(flight.omega[2:-4], speeds(t), atol=0.1)
 
 
 # Presets

@@ -122,34 +122,26 @@ def column_map(given: ColumnsGiven) -> ColumnMap:
 
 def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
     """The map in the table of a file; its presets are not `needed`."""
-    preset, frame, time = (
-        table.pop(key, default) for key, default in (("preset", ""), ("frame", "FLU"), ("time", "stamp"))
-    )
     columns = table.pop("columns", {})
-    allowed = (
-        ("preset", preset, ("", *PRESETS)),
-        ("frame", frame, ("FLU", "FRD")),
-        ("time", time, ("stamp", "recorded")),
-    )
-    for key, value, values in allowed:
+    settings = {"preset": ("", *PRESETS), "frame": ("FLU", "FRD"), "time": ("stamp", "recorded")}
+    preset, frame, time = given = [table.pop(key, values[0]) for key, values in settings.items()]
+    for (key, values), value in zip(settings.items(), given, strict=True):
         if value not in values:
             refuse(name, f"{key} is {quoted(str(value))}; give one of {', '.join(filter(None, values))}")
     if table or not isinstance(columns, dict):
-        given = quoted(next(iter(table), "columns"))
-        refuse(name, f"{given} cannot be used; a column map has preset, frame, time, and a table [columns]")
+        wrong = quoted(str(next(iter(table), "columns")))
+        refuse(name, f"{wrong} cannot be used; a column map has preset, frame, time, and a table [columns]")
     begin = column_map(preset or None)
     sources = begin.sources | {column: _source(name, column, value) for column, value in columns.items()}
-    if frame == "FRD":
-        sources |= {
-            c: s._replace(factor=-s.factor) for c, s in sources.items() if c in _TURNED and (not preset or c in columns)
-        }
+    for column in _TURNED & (columns.keys() if preset else _TURNED) if frame == "FRD" else ():
+        sources[column] = sources[column]._replace(factor=-sources[column].factor)
     return ColumnMap(quoted(name), sources, frozenset(columns) if needed else frozenset(), time == "recorded")
 
 
 def _source(name: str, column: str, value: Any) -> Source:
     """The source of one column, as it stands in the map. Raises `InputError`."""
     if column not in _COLUMNS:
-        refuse(name, f"there is no column {quoted(column)}; the columns are {', '.join(_COLUMNS)}")
+        refuse(name, f"there is no column {quoted(str(column))}; the columns are {', '.join(_COLUMNS)}")
     entry = value if isinstance(value, dict) else {"source": value}
     names, unit, sign = entry.get("source", column), entry.get("unit"), entry.get("sign", 1)
     names = [names] if isinstance(names, str) else names
