@@ -1,11 +1,14 @@
 """Column maps: names, units, signs and frames of any CSV, presets, arrays in Python; and what a map may not hold."""
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, CRAZYFLIE_TOML
 from recorded_logs import FRD, GRAVITY, RPM, attitude, check, force, position, rates, speeds, table_csv, velocity
 from scipy.spatial.transform import Rotation
+from synthetic_results import held, provenance, vehicle_result
 
 import jaxos4
 from jaxos4.errors import InputError
@@ -206,6 +209,28 @@ def test_the_commands_take_a_map_or_the_name_of_a_preset(save, run):
     code, _, err = run("estimate", "flight.csv", "--columns", "nothing.toml")
     assert code == 2
     assert "neither a file nor a preset; give a TOML file or one of agilicious" in err
+
+
+def test_every_log_of_a_command_is_read_by_the_map(save, run):
+    """Each of these lacks a column of the map, which is said before anything is fitted."""
+    parameters = {f"alpha{i}": value for i, value in ((3, 6e4), (6, 5.9e4), (8, 3.5e4))}
+    held_ones = {f"alpha{i}": held(0.1) for i in (1, 2, 4, 5, 7)}
+    level = {"strength": 1.0, "unit": "", "time_constant": 0.2, "sensor": 0.01, "correlation": 0.0}
+    about = {"provenance": provenance(terms=[]), "held": held_ones, "disturbances": dict.fromkeys("pqr", level)}
+    save(json.dumps(vehicle_result(parameters, **about)), "found.json")
+    save(odd_csv(), "flight.csv")
+    save(neurobem_csv(), "bem.csv")
+    save(CRAZYFLIE_TOML, "mine.toml")
+    save(ODD, "map.toml")
+    estimate = ("estimate", "--airframe", "mine.toml")
+    for command in (
+        (*estimate, "bem.csv"),
+        (*estimate, "flight.csv", "--validate", "bem.csv"),
+        ("predict", "found.json", "bem.csv"),
+    ):
+        code, _, err = run(*command, "--columns", "map.toml")
+        assert code == 2
+        assert "bem.csv: there is no 'time', which 'map.toml' names for t" in err
 
 
 def test_a_format_with_columns_of_its_own_takes_no_map(save):
