@@ -209,3 +209,53 @@ def crazyflie(events, *, version=2, checksum=True):
     if checksum:
         out += struct.pack("<I", zlib.crc32(out))
     return bytes(out)
+
+
+def crazyflie_2019(variables, times, columns, *, block=8):
+    """The format of 2019: data sets in blocks, each with the inverse of its checksum."""
+
+    def checked(content):
+        return content + struct.pack("<I", zlib.crc32(content) ^ 0xFFFFFFFF)
+
+    names = ["tick(I)", *variables]
+    code = "<" + "".join(name[-2] for name in names)
+    out = checked(bytes([len(names)]) + "".join(f"{name}," for name in names).encode())
+    table = np.column_stack([np.rint(1e3 * np.asarray(times)), columns]).tolist()
+    for begin in range(0, len(table), block):
+        rows = (
+            [x if k in "fde" else round(x) for k, x in zip(code[1:], row, strict=True)] for row in table[begin:][:block]
+        )
+        sets = [struct.pack(code, *row) for row in rows]
+        out += checked(bytes([len(sets)]) + b"".join(sets))
+    return out
+
+
+# ArduPilot
+
+
+def dataflash(messages, parameters=None):
+    """A DataFlash log. `messages`: for each its name, letters of its format, fields after `TimeUS`, times [s], rows."""
+    codes = dict(zip("BHIfcQ", "BHIfhQ", strict=True))
+    described = [
+        ("FMT", "BBnNZ", "Type,Length,Name,Format,Columns", "BB4s16s64s"),
+        ("PARM", "QNf", "TimeUS,Name,Value", "Q16sf"),
+    ]
+    described += [(n, "Q" + c, f"TimeUS,{f}", "Q" + "".join(codes[letter] for letter in c)) for n, c, f, *_ in messages]
+    out, numbers = bytearray(), {}
+    for number, (name, letters, fields, code) in enumerate(described, start=0x80):
+        numbers[name] = number, code
+        body = (number, struct.calcsize(f"<{code}") + 3, name.encode(), letters.encode(), fields.encode())
+        out += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", *body)
+    number, code = numbers["PARM"]
+    for name, value in (parameters or {}).items():
+        out += b"\xa3\x95" + bytes([number]) + struct.pack(f"<{code}", 1, name.encode(), value)
+    rows = []
+    for name, letters, _, times, columns in messages:
+        number, code = numbers[name]
+        for t, row in zip(times, np.column_stack(columns).tolist(), strict=True):
+            stamp = round(1e6 * t) + 5_000_000
+            values = [
+                round(100 * x) if k == "c" else x if k == "f" else round(x) for k, x in zip(letters, row, strict=True)
+            ]
+            rows.append((stamp, b"\xa3\x95" + bytes([number]) + struct.pack(f"<{code}", stamp, *values)))
+    return bytes(out) + b"".join(row for _, row in sorted(rows, key=lambda each: each[0]))

@@ -326,7 +326,8 @@ def test_python_runs_the_package():
 
 def test_the_columns_that_are_there_are_named_if_time_is_not(tmp_path):
     path = write_log(tmp_path / "log.csv", "time,omega1,omega2,omega3,omega4,p,q,r")
-    with pytest.raises(InputError, match=r"there is no time; .* There are 'omega1', .*, 'time': rename one\.$"):
+    words = r"there is no time; .* There are 'omega1', .*, 'time': rename one, or give a column map\.$"
+    with pytest.raises(InputError, match=words):
         read_log(path)
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, usable_stretches
-from recorded_logs import GRAVITY, RPM, blackbox_csv, check, force, rates, speeds
+from recorded_logs import FRD, GRAVITY, RPM, attitude, blackbox_csv, check, force, rates, speeds
+from scipy.spatial.transform import Rotation
 
 from jaxos4.logs import read_log, read_recording
 from jaxos4.logs.blackbox_frames import Numbers
@@ -11,6 +12,7 @@ from jaxos4.recording import cut
 from jaxos4.recording.motion import rotor_signs
 
 RATES = ("p", "q", "r")
+ATTITUDE = (*RATES, "phi", "theta", "psi")
 SETTINGS = {"Product": "Blackbox flight data recorder by Nicholas Sherlock", "acc_1G": "2048", "motor_poles": "12"}
 
 
@@ -71,6 +73,57 @@ def test_commands_are_fractions_of_their_protocol(low, high, settings, save):
     flight, notes = read_log(save(blackbox_csv(columns, settings=settings)), CRAZYFLIE)
     np.testing.assert_allclose(np.asarray(flight.omega)[:, 2], 2500 * command, atol=2)
     assert any(f"from {low} to {high}" in note for note in notes)
+
+
+# Attitude, and the fields of Indiflight
+
+
+def quaternions(scale, turned=False):
+    """w, x, y, z as whole numbers, from the body to the earth."""
+    rotation = FRD @ attitude(T) @ FRD if turned else attitude(T)
+    found = Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
+    return np.rint(scale * found * np.sign(found[:, :1])).astype(int)
+
+
+def fields(name, values):
+    return {f"{name}[{i}]": column for i, column in enumerate(values.T)}
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_the_attitude_of_betaflight_is_a_quaternion_without_its_first_number(raw, save):
+    columns = recorded(T) | fields("imuQuaternion", quaternions(0x7FFF)[:, 1:])
+    content = bbl(columns) if raw else blackbox_csv(columns, settings=SETTINGS | {"motor_poles": "14"})
+    check(read_log(save(content))[0], names=ATTITUDE, atol=2e-2)  # the first number is near 0 at half a turn
+
+
+def test_the_attitude_of_inav_is_angles_with_yaw_to_the_right(save):
+    nose, left = attitude(T)[:, :, 0], attitude(T)[:, :, 1]
+    down, right = np.arcsin(-nose[:, 2]), np.arctan2(left[:, 2], attitude(T)[:, 2, 2])
+    angles = np.column_stack([right, down, -np.arctan2(nose[:, 1], nose[:, 0]) % (2 * np.pi)])
+    columns = recorded(T) | fields("attitude", np.rint(10 * np.rad2deg(angles)).astype(int))
+    check(read_log(save(blackbox_csv(columns, settings=SETTINGS)))[0], names=ATTITUDE, atol=5e-3)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_measured_speeds_and_the_attitude_of_indiflight_are_read(turned, save):
+    """Its gyro and accelerometer were forward, left, up, as Betaflight's; now they are forward, right, down."""
+    signs = FRD if turned else np.eye(3)
+    columns = without(recorded(T, gyro=lambda t: rates(t) @ signs, accelerometer=lambda t: force(t) @ signs), "eRPM")
+    columns |= fields("quat", quaternions(8127, turned=True)) | fields("omega", np.rint(0.9 * speeds(T)).astype(int))
+    columns |= fields("omegaUnfiltered", np.rint(speeds(T)).astype(int))
+    flight, notes = read_log(save(blackbox_csv(columns, settings=SETTINGS)))
+    check(flight, names=ATTITUDE, atol=5e-3)
+    np.testing.assert_allclose(flight.omega, speeds(T), atol=0.51)
+    assert any("omegaUnfiltered[0] is rotor 1" in note for note in notes)
+    assert any("count as forward, right, down" in note for note in notes) == turned
+    filtered = without(columns, "omegaUnfiltered")
+    flight, _ = read_log(save(blackbox_csv(filtered, settings=SETTINGS)))
+    np.testing.assert_allclose(flight.omega, 0.9 * speeds(T), atol=0.51)
+
+
+def test_an_attitude_that_never_changes_is_none(save):
+    columns = recorded(T) | fields("imuQuaternion", np.zeros((T.size, 3), int))
+    check(read_log(save(blackbox_csv(columns, settings=SETTINGS)))[0], names=RATES, atol=5e-3)
 
 
 # Logs that are not decoded

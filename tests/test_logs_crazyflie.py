@@ -5,10 +5,22 @@ import struct
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from recorded_logs import GRAVITY, RPM, attitude, check, crazyflie, force, position, rates, speeds, velocity
+from recorded_logs import (
+    GRAVITY,
+    RPM,
+    attitude,
+    check,
+    crazyflie,
+    crazyflie_2019,
+    force,
+    position,
+    rates,
+    speeds,
+    velocity,
+)
 
 from jaxos4.errors import InputError
-from jaxos4.logs import read_log
+from jaxos4.logs import log_format, read_log
 
 GYRO = ["gyro.x(f)", "gyro.y(f)", "gyro.z(f)", "acc.x(f)", "acc.y(f)", "acc.z(f)"]
 STATE = [f"stateEstimate.{name}(f)" for name in ("roll", "pitch", "yaw", "x", "y", "z", "vx", "vy", "vz")]
@@ -110,5 +122,35 @@ def backward():
 
 
 BAD["backward"] = (backward(), "time runs backward")
+
+
+# The format of 2019
+
+T_2019 = 0.004 * np.arange(750)
+VARIABLES = GYRO + STATE + RPMS
+
+
+def log_2019(t=T_2019, **options):
+    return crazyflie_2019(VARIABLES, t, np.column_stack([sensors(t), state(t), speeds(t) / RPM]), **options)
+
+
+def test_blocks_with_a_wrong_checksum_are_ignored(save):
+    content = bytearray(log_2019())
+    content[len(content) // 2] ^= 1
+    flight, notes = read_log(save(bytes(content)))
+    check(flight)
+    assert any("1 block of the log with a wrong checksum" in note for note in notes)
+    assert 0 < np.isnan(np.asarray(flight.states)[:, 7]).sum() <= 8
+    assert log_format(save(bytes(content))).name == "Crazyflie"
+    flight, notes = read_log(save(bytes(content[: len(content) // 3])))
+    check(flight, seconds=0.9)
+    assert any("with a wrong checksum" in note for note in notes)
+
+
+BAD["2019, other width"] = (b"\x07" + log_2019()[1:], "does not describe its variables")
+BAD["2019, nothing"] = (log_2019(T_2019[:0]), "holds no events")
+BAD["2019, backward"] = (log_2019(T_2019[::-1]), "time runs backward")
+SMALL_2019 = log_2019(T_2019[:40])
+
 EMPTY_EVENTS = HEADER + b"\0\0" + bytes(10) * 200_000
 SMALL = one_event(T[:25])

@@ -12,7 +12,9 @@ import equinox as eqx
 import numpy as np
 import pytest
 import test_flight_csv as flight_csv
+import test_logs_ardupilot as ardupilot
 import test_logs_blackbox as blackbox
+import test_logs_columns as columns
 import test_logs_crazyflie as crazyflie
 import test_logs_ulog as ulog
 from helpers import CRAZYFLIE
@@ -27,9 +29,12 @@ from jaxos4.logs.table import opened, refuse
 # Each reader: a good log, the bytes at its beginning that are its header, and bad logs with words of their messages.
 SUBJECTS = {
     "ULog": (ulog.SMALL, 16, ulog.BAD),
+    "ArduPilot": (ardupilot.SMALL, 300, ardupilot.BAD),
     "Crazyflie": (crazyflie.SMALL, 60, crazyflie.BAD),
+    "Crazyflie, 2019": (crazyflie.SMALL_2019, 100, {}),
     "blackbox": (blackbox.SMALL, 400, blackbox.BAD),
     "blackbox, not decoded": (blackbox.SMALL_RAW, 400, {}),
+    "NeuroBEM": (columns.neurobem_csv(50), 300, {}),
     "CSV": (flight_csv.csv().encode(), 38, flight_csv.BAD),
 }
 BAD = {(name, case): bad[case] for name, (_, _, bad) in SUBJECTS.items() for case in bad}
@@ -82,6 +87,30 @@ def test_a_damaged_log_and_any_bytes_after_a_part_of_the_header(name, path):
     law_of_junk()
 
 
+UNREAD = {
+    "zip": (b"PK\x03\x04" + bytes(60), "is an archive (zip, or .xlsx, .npz); unpack it"),
+    "gzip": (b"\x1f\x8b\x08" + bytes(60), "is a compressed file; unpack it"),
+    "HDF5": (b"\x89HDF\r\n\x1a\n" + bytes(60), "is an HDF5 file (netCDF, MATLAB 7.3); read it in Python"),
+    "MATLAB": (b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "is a MATLAB file"),
+    "NumPy": (b"\x93NUMPY\x01\0", "is a NumPy file"),
+    "Parquet": (b"PAR1\x15\x04", "is a Parquet or Arrow file"),
+    "Excel": (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "is an Excel file"),
+    "UTF-16": ("t,p\n".encode("utf-16"), "is text in UTF-16; save it as CSV in UTF-8"),
+    "ArduPilot text": (b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n", "give the .BIN file"),
+    "telemetry": (b"\0\x05\xa1\xb2\xc3\xd4\xe5\xf6\xfd\x09", "is a telemetry log of MAVLink (.tlog)"),
+    "DJI": (b"\x55\xaa".ljust(16, b".") + b"BUILD 2016", "is a log of DJI; decode it by DatCon"),
+    "other": (b"abc\x01\x02\x03", "is of a kind that is not known; export it as CSV"),
+}
+
+
+@pytest.mark.parametrize("case", UNREAD)
+def test_a_file_that_is_not_read_is_named_with_what_to_do(case, save):
+    content, words = UNREAD[case]
+    message = outcome(read, save(content))
+    assert words in message
+    assert message.endswith("Logs that are read: " + ", ".join(each.label for each in FORMATS) + ".")
+
+
 # The flight CSV
 
 
@@ -130,6 +159,7 @@ def test_good_flights_after_accidents(lines, data, end, path):
 WHOLE = {
     "ULog": (ulog.everything(), STATE_NAMES, 0.0, 2e-3, 0.5),
     "Crazyflie, version 1": (crazyflie.one_event(crazyflie.T, version=1), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
+    "Crazyflie, 2019": (crazyflie.log_2019(), STATE_NAMES, 0.0, 2e-3, 0.6 * RPM),
     "Crazyflie": (crazyflie.one_event(crazyflie.T), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
     "blackbox": (blackbox_csv(blackbox.recorded(blackbox.T)), blackbox.RATES, 0.0, 5e-3, 100 / 7 * RPM),
 }
@@ -205,7 +235,8 @@ def log(save, monkeypatch):
 
 
 def test_a_new_format_is_read_and_inspected(log, save, run):
-    assert {name.partition(",")[0] for name in SUBJECTS} == {each.name for each in FORMATS}
+    elsewhere = {"ROS"}  # test_logs_ros, because its bags need rosbags
+    assert {name.partition(",")[0] for name in SUBJECTS} | elsewhere == {each.name for each in FORMATS}
     flight, notes = read_log(log)
     assert notes == ("times are those of the logger",)
     np.testing.assert_array_equal(np.asarray(flight.states)[:, 7], np.sin(0.01 * np.arange(300)))

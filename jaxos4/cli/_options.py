@@ -44,6 +44,13 @@ WindowOption = Annotated[
     float | None, Option(help="Multiple shooting: windows of this length [s], each with its own initial state.")
 ]
 SeedOption = Annotated[int, Option(help="Random seed.", callback=check_seed)]
+ColumnsOption = Annotated[
+    str | None,
+    Option(
+        metavar="MAP.toml",
+        help="Which columns or topics of the logs hold what: a column map (docs/logs.md), or mavros, px4-ros2, ...",
+    ),
+]
 OutOption = Annotated[Path | None, Option(help="JSON file to write.")]
 
 

@@ -39,6 +39,7 @@ def estimate(
         str | None,
         Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Default: os4; a vehicle needs one."),
     ] = None,
+    columns: options.ColumnsOption = None,
     bracket: options.BracketOption = None,
     channels: options.ChannelsOption = None,
     initial_state: options.InitialStateOption = "free",
@@ -56,7 +57,7 @@ def estimate(
     out: options.OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
-    check_outputs(*flights, airframe, bracket, network, validate, out=out, report=report)
+    check_outputs(*flights, airframe, columns, bracket, network, validate, out=out, report=report)
     listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
     asked = {"channels": channels, "initial_state": initial_state, "window": window}
     asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
@@ -69,7 +70,7 @@ def estimate(
         vehicle = load_airframe(airframe or _OS4)
         # Without an airframe, commands are read only to find out that one is needed.
         full_scale = 1.0 if airframe is None and model in (None, "flight") else None
-        recordings = [read_recording(path, vehicle, full_scale=full_scale) for path in flights]
+        recordings = [read_recording(path, vehicle, full_scale=full_scale, columns=columns) for path in flights]
         subject, evidence = _subject(recordings, model, vehicle, given=airframe is not None)
         if report is not None and not isinstance(subject, Airframe):
             sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
@@ -83,7 +84,7 @@ def estimate(
             estimator=None if estimator is None else str(estimator),
             bracket=options.read_bracket(bracket),
             network=network,
-            validate=None if validate is None else read_recording(validate, vehicle),
+            validate=None if validate is None else read_recording(validate, vehicle, columns=columns),
             progress=progress,
         )
     notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []

@@ -62,6 +62,7 @@ def export(
 def predict(
     result: Annotated[Path, Argument(metavar="RESULT.json", help="A vehicle: a file of `jaxos4 estimate --out`.")],
     flight: Annotated[Path, Argument(metavar="LOG", help="The flight to predict.")],
+    columns: options.ColumnsOption = None,
     horizon: Annotated[float, Option(help="How far ahead to predict [s].")] = 0.5,
     sample_time: Annotated[
         float | None, Option(help="The sample time to average to [s]. Default: that of the estimate.")
@@ -73,7 +74,7 @@ def predict(
     figure: Annotated[Path | None, Option(help="A figure of the predictions (.svg).")] = None,
 ) -> None:
     """Predict a flight with an identified vehicle, and compare with constant rates and a regression."""
-    check_outputs(result, flight, out=out, json=json, figure=figure)
+    check_outputs(result, flight, columns, out=out, json=json, figure=figure)
     with stages("loading the library") as progress, option_names():
         from ..forecast import check_suffix, predict as predict_flight, vehicle_of
         from ..recording import read_recording
@@ -82,7 +83,7 @@ def predict(
             check_suffix(out, ".nc", ".csv")
         progress("reading")
         vehicle = vehicle_of(result)
-        recording = read_recording(flight, vehicle.model.airframe)
+        recording = read_recording(flight, vehicle.model.airframe, columns=columns)
         progress("predicting")
         if out is not None and out.suffix == ".nc":  # slow to import: while the program runs
             threading.Thread(target=load_netcdf, daemon=True).start()

@@ -27,6 +27,7 @@ def inspect(
         str | None,
         Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Needed to compare torques and motion."),
     ] = None,
+    columns: options.ColumnsOption = None,
     airframe_out: Annotated[
         Path | None,
         Option(metavar="FILE.toml", help="An airframe to write: what the log knows, and what must be measured."),
@@ -34,7 +35,7 @@ def inspect(
     out: options.OutOption = None,
 ) -> None:
     """Show what a log contains, whether it agrees with itself, which parts can be used, and how much they excite."""
-    check_outputs(log, airframe, out=out, airframe_out=airframe_out)
+    check_outputs(log, airframe, columns, out=out, airframe_out=airframe_out)
     if airframe_out is not None and airframe_out.exists():
         raise InputError(f"{airframe_out}: exists, and may hold what you measured; give another name.")
     if airframe is not None and airframe_out is not None:
@@ -48,7 +49,7 @@ def inspect(
 
         progress("reading")
         vehicle = None if airframe is None else load_airframe(airframe)
-        recording = read_recording(log, vehicle, full_scale=1.0)
+        recording = read_recording(log, vehicle, full_scale=1.0, columns=columns)
         found = inspect_log(recording, vehicle)
         text, missing = ("", ()) if airframe_out is None else airframe_draft(recording)
     console = Console(highlight=False, markup=False)

@@ -5,14 +5,18 @@ Each log format is one file and one line in `FORMATS`.
 
 import os
 import warnings
+from typing import Any
 
 from ..airframe import Airframe
 from ..errors import printable
 from ..flight import Flight
+from .ardupilot import ARDUPILOT
 from .assemble import recording_of
 from .blackbox import BLACKBOX
+from .columns import ColumnsGiven, array_table, column_map
 from .crazyflie import CRAZYFLIE
-from .csv import CSV, write_flight as write_flight
+from .csv import CSV, NEUROBEM, write_flight as write_flight
+from .ros import ROS
 from .table import (
     LogFacts as LogFacts,
     LogFormat as LogFormat,
@@ -21,41 +25,63 @@ from .table import (
     Sampling as Sampling,
     Table as Table,
     opened,
+    refuse,
 )
 from .ulog import ULOG
+from .unread import unread_kind
 
-FORMATS: tuple[LogFormat, ...] = (ULOG, CRAZYFLIE, BLACKBOX, CSV)
+FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
 
 _FIRST_BYTES = 1 << 18
 
 
 def read_log(
-    path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
+    log: Path | Any,
+    airframe: Airframe | None = None,
+    *,
+    full_scale: float | None = None,
+    columns: ColumnsGiven = None,
 ) -> tuple[Flight, tuple[str, ...]]:
     """Read a log of any known format, recognised from the first bytes of the file. Its columns: docs/logs.md.
 
     **Arguments:**
 
+    - `log`: a path; or a mapping of arrays, pandas DataFrame or xarray Dataset, with the columns of the flight CSV.
     - `airframe`: its `max_rotor_speed` turns commands into rotor speeds. A log with rotor speeds needs no airframe.
     - `full_scale`: rotor speed of command 1 [rad/s] if the airframe gives none. With 1, commands stay as they are.
+    - `columns`: which columns or topics hold what: the path of a column map, the name of a preset, or a table.
 
     **Returns:** the flight, and notes on what the reader changed or assumed: one line each, without the file's name.
 
     **Raises:** `InputError`, one line: the file, the place in it, what is wrong and what to do.
     """
-    found = read_recording(path, airframe, full_scale=full_scale)
+    found = read_recording(log, airframe, full_scale=full_scale, columns=columns)
     return found.flight, (*found.notes, *([found.facts.too_slow] if found.facts.too_slow else []))
 
 
-def read_recording(path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None) -> Recording:
+def read_recording(
+    log: Path | Any,
+    airframe: Airframe | None = None,
+    *,
+    full_scale: float | None = None,
+    columns: ColumnsGiven = None,
+) -> Recording:
     """Read a log in any format that `jaxos4.read_log` knows, named by its path. Arguments and errors are the same.
 
     If the log was written too rarely, its facts say so, and not its notes.
     """
-    kind = log_format(path)
-    found = recording_of(*kind.read(path), airframe, full_scale=full_scale)
-    return found._replace(facts=found.facts._replace(format=kind))
+    if not isinstance(log, str | os.PathLike):
+        return recording_of(array_table(log, column_map(columns)), (), airframe, full_scale=full_scale)
+    kind = log_format(log)
+    if columns is None:
+        found = kind.read(log)
+    elif kind.mapped is None:
+        refuse(log, f"has the columns of its format ({kind.label}), and takes no column map; leave it out")
+    else:
+        found = kind.mapped(log, column_map(columns))
+    recording = recording_of(*found, airframe, full_scale=full_scale)
+    return recording._replace(facts=recording.facts._replace(format=kind))
 
 
 def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
@@ -75,8 +101,12 @@ def log_format(path: Path) -> LogFormat:
 
     A pipe can be read only once, so it always counts as the last.
 
-    **Raises:** `InputError` if the file cannot be opened.
+    **Raises:** `InputError` if the file cannot be opened, or is evidently of another kind.
     """
-    with opened(path, "rb") as file:
+    inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
+    with opened(inside if os.path.isfile(inside) else path, "rb") as file:
         begin = file.read(_FIRST_BYTES) if file.seekable() else b""
-    return next((each for each in FORMATS[:-1] if each.recognises(begin)), FORMATS[-1])
+    kind = next((each for each in FORMATS[:-1] if each.recognises(begin)), FORMATS[-1])
+    if kind is FORMATS[-1] and (unread := unread_kind(begin)):
+        refuse(path, f"{unread}. Logs that are read: {', '.join(each.label for each in FORMATS)}")
+    return kind

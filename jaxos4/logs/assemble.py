@@ -28,7 +28,10 @@ def recording_of(
     table = table._replace(columns={n: column for n, column in table.columns.items() if not np.isnan(column).all()})
     if not table.holds("t"):
         names = ", ".join(map(quoted, [*(table.names.get(each, each) for each in table.columns), *table.unknown][:20]))
-        table.refuse(f"there is no time; each row needs its time [s]. There are {names}: rename one", column="t")
+        table.refuse(
+            f"there is no time; each row needs its time [s]. There are {names}: rename one, or give a column map",
+            column="t",
+        )
     if not any(map(table.holds, STATE_NAMES)):
         table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
     # Cells that hold no value were not logged, also those of a rotor.

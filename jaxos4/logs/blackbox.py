@@ -1,4 +1,4 @@
-"""Blackbox logs of Betaflight and INAV: `.bbl` and `.BFL` files, or CSV of `blackbox_decode` or Blackbox Explorer.
+"""Blackbox logs of Betaflight, INAV and Indiflight: `.bbl`, `.BFL`, or CSV of `blackbox_decode` or Blackbox Explorer.
 
 Columns, settings and frames: docs/logs.md. Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight
 and INAV.
@@ -16,7 +16,7 @@ import numpy as np
 from ..airframe import STANDARD_GRAVITY
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
-from .sampling import in_order
+from .sampling import HALF_TURN, attitude, in_order
 from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, opened, order_note, read_bytes, refuse
 
 _MAGIC = b"H Product:Blackbox"
@@ -26,10 +26,14 @@ _LONGEST_LINE = 1 << 16
 _LARGEST = 1 << 29  # bytes of a file: more than an hour of flight
 _BETWEEN = 1.0  # [s], put between sessions
 _DEGREE = math.pi / 180
+_NONE = np.zeros(0)
 _POLES = 14
 _COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
 _TIMES = ("time (us)", "time")
-_RATES = ("gyroUnfilt", "gyroADC")
+_RATES = ("gyroUnfilt", "gyroADCafterRpm", "gyroADC")
+_SPEEDS = ("omegaUnfiltered", "omega", "eRPM")  # of Indiflight in rad/s
+_ATTITUDES = {"quat": 4, "imuQuaternion": 3, "attitude": 3}  # of Indiflight, Betaflight, INAV: so many numbers
+_UNIT_QUATERNION = 0x7FFF
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
 _VOLTAGE, _KNOWN_UNIT = "vbatLatest", re.compile(r"Betaflight ([4-9]|\d{2,})\.")
 _EXPORT = "export it as CSV by Blackbox Explorer"
@@ -38,8 +42,9 @@ _REMEDY = f"its unit is not the one that this reader assumes, or the log is corr
 _KNOWN = (
     *_TIMES,
     *(f"{name}[{i}]" for name in (*_RATES, "accSmooth") for i in range(3)),
+    *(f"{name}[{i}]" for name, count in _ATTITUDES.items() for i in range(count)),
     _VOLTAGE,
-    *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
+    *(f"{name}[{i}]" for name in (*_SPEEDS, "motor") for i in range(8)),
 )
 # Sessions are joined to the longest one if these settings are equal.
 _USED = ("acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
@@ -67,6 +72,13 @@ class _Log(NamedTuple):
         self.names.update(names)
         self.columns.update((column, self.raw[name] * factor) for column, name in names.items())
 
+    def vector(self, name: str, count: int) -> np.ndarray | None:
+        """The fields `name[0]`, ..., shape (rows, count), if all were logged and they change."""
+        names = [f"{name}[{i}]" for i in range(count)]
+        if not self.raw.keys() >= set(names) or not any(np.ptp(_finite(self.raw[each])) for each in names):
+            return None
+        return np.column_stack([self.raw[each] for each in names])
+
     def setting(self, name: str, least: float, most: float) -> float | None:
         """A setting, or the last of several, if it is a number within these limits."""
         try:
@@ -89,6 +101,8 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
+    _add_attitude(log)
+    _turn(log)
     if _VOLTAGE in raw and _KNOWN_UNIT.match(log.settings.get("Firmware revision", "")):
         log.add({"voltage": _VOLTAGE}, 1.0)
         log.columns["voltage"] /= 100
@@ -211,14 +225,18 @@ def _add_rates(log: _Log) -> None:
 
 def _add_rotors(log: _Log) -> None:
     raw = log.raw
-    speeds, commands, *others = [[f"{f}[{i}]" for i in r] for r in (range(4), range(4, 8)) for f in ("eRPM", "motor")]
-    if any(np.ptp(_finite(raw[name])) > 0 for name in itertools.chain(*others) if name in raw):
+    more = (f"{name}[{i}]" for name in (*_SPEEDS, "motor") for i in range(4, 8))
+    if any(np.ptp(_finite(raw[name])) > 0 for name in more if name in raw):
         refuse(log.path, "has more than four motors; give the log of a quadrotor", row=log.header)
-    if raw.keys() >= set(speeds) and all((_finite(raw[name]) > 0).any() for name in speeds):
+    every = {field: [f"{field}[{i}]" for i in range(4)] for field in (*_SPEEDS, "motor")}
+    commands = every.pop("motor")
+    turning = (f for f, names in every.items() if all((_finite(raw.get(name, _NONE)) > 0).any() for name in names))
+    if (field := next(turning, None)) is not None:
         poles = log.setting("motor_poles", 2, 100)
-        if poles is None:
+        if field == "eRPM" and poles is None:
             log.notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle")
-        log.add(dict(zip(SPEED_NAMES, speeds, strict=True)), 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60)
+        unit = 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60 if field == "eRPM" else 1.0
+        log.add(dict(zip(SPEED_NAMES, every[field], strict=True)), unit)
         return
     for name in commands:
         if name not in raw:
@@ -248,6 +266,32 @@ def _add_force(log: _Log) -> None:
         one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
         log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
     log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), STANDARD_GRAVITY / one)
+
+
+def _add_attitude(log: _Log) -> None:
+    """Roll, pitch and yaw, if the log holds an attitude. That of Indiflight has y to the right and z down."""
+    field, values = next(((f, v) for f, n in _ATTITUDES.items() if (v := log.vector(f, n)) is not None), ("", _NONE))
+    if field == "quat":
+        angles = attitude(values) * HALF_TURN
+    elif field == "imuQuaternion":
+        vector = values / _UNIT_QUATERNION
+        angles = attitude(np.column_stack([np.sqrt(np.maximum(1 - (vector**2).sum(axis=1), 0.0)), vector]))
+    elif field == "attitude":
+        angles = values * _DEGREE / 10 * [1, 1, -1]
+    else:
+        return
+    log.names.update(dict.fromkeys(("phi", "theta", "psi"), field))
+    log.columns.update(zip(("phi", "theta", "psi"), angles.T, strict=True))
+
+
+def _turn(log: _Log) -> None:
+    """Turn gyro and accelerometer of a newer Indiflight, whose axes point forward, right and down."""
+    indiflight = any(log.names.get(name, "").startswith(("omega", "quat")) for name in ("omega1", "phi"))
+    if indiflight and np.median(_finite(log.columns.get("az", _NONE))) < 0:
+        log.columns.update((name, -log.columns[name]) for name in ("q", "r", "ay", "az"))
+        log.notes.append(
+            "the specific force in flight points down: gyro and accelerometer count as forward, right, down"
+        )
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Logs of the Crazyflie's micro-SD card, versions 1 and 2. Variables, frames and the file: docs/logs.md.
+"""Logs of the Crazyflie's micro-SD card: versions 1 and 2, and that of 2019. Variables, frames, file: docs/logs.md.
 
 Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
 from .sampling import Series, gyro_rows, in_order, logged_rate, unwrapped
-from .table import LogFacts, LogFormat, Path, Sampling, Table, needed, quoted, read_bytes, refuse
+from .table import LogFacts, LogFormat, Path, Sampling, Table, counted, needed, quoted, read_bytes, refuse
 
 _MAGIC = b"\xbc"
 _MOST_TYPES, _MOST_VARIABLES = 64, 256
@@ -21,6 +21,7 @@ _PAIR = re.compile(rb"(..)(..)", re.DOTALL)
 _TYPE = re.compile(rb"(..)[^\0]{0,255}\0(..)", re.DOTALL)
 _NAME = re.compile(rb"([^\0]{0,255})\0")
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
+_SETS = re.compile(rb"(.)(tick\(I\),(?:[\x20-\x27\x2a\x2b\x2d-\x7e]{1,80}\([bBhHiIqQefd]\),){1,255})", re.DOTALL)
 _DEGREE, _RPM, _FULL = math.pi / 180, 2 * math.pi / 60, 65535.0
 _RATES = {"p": ("gyro.x", _DEGREE), "q": ("gyro.y", _DEGREE), "r": ("gyro.z", _DEGREE)}
 _OTHERS = {  # each is read by itself
@@ -37,10 +38,12 @@ _ROTORS = (("omega", "rpm.m{}", _RPM), ("command", "motor.m{}", 1 / _FULL), ("co
 _AGAIN = "copy it again from the card"
 _REMEDY = f"the log is corrupt there: {_AGAIN}, or choose another"
 _OFTEN = "raise the frequency of these variables in the deck's config.txt, and fly again"
+_NO_VARIABLES = (" number", " t", "tick")
 _DAMAGED = f"it is corrupt; {_AGAIN}"
 
 Variables = dict[str, tuple[np.ndarray, np.ndarray]]
 Types = dict[int, np.dtype]
+Samples = tuple[str, np.ndarray, np.ndarray]
 
 
 def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
@@ -62,12 +65,25 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     return gyro_rows(table, rates, rotors, measured=first == "omega1", others=others)[1], tuple(notes)
 
 
-CRAZYFLIE = LogFormat("Crazyflie", "Crazyflie micro-SD log", lambda begin: begin.startswith(_MAGIC), read_crazyflie)
+CRAZYFLIE = LogFormat(
+    "Crazyflie",
+    "Crazyflie micro-SD log",
+    lambda begin: begin.startswith(_MAGIC) or _SETS.match(begin) is not None,
+    read_crazyflie,
+)
 
 
 def _variables(path: Path, notes: list[str]) -> Variables:
     """Times [s] and values of each variable, from the event that holds the most of its samples."""
     content = read_bytes(path, _LARGEST)
+    found = _sets(path, content, notes) if content[:1] != _MAGIC else _events(path, content, notes)
+    if not found:
+        refuse(path, "holds no events; a flight needs at least two")
+    return {name: (t, values) for name, t, values in sorted(found, key=lambda each: each[1].size)}
+
+
+def _events(path: Path, content: bytes, notes: list[str]) -> list[Samples]:
+    """The variables of the events of versions 1 and 2."""
     types, version, at = _types(path, content)
     valid = len(content) >= at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
     places, ignored = _places(path, content[: -4 if valid else None], types, at, valid=valid)
@@ -80,20 +96,43 @@ def _variables(path: Path, notes: list[str]) -> Variables:
         if at.size < 2:
             continue
         records = data[at[:, None] + np.arange(layout.itemsize)].reshape(-1).view(layout)
-        t = records[" t"].astype(float) * (1e-3 if version == 1 else 1e-6)
-        kept = in_order(t)
-        if kept is None:
-            refuse(path, f"time runs backward from one event to the next: {_DAMAGED}")
-        if not kept.all():
-            notes.append(f"{np.count_nonzero(~kept)} late events are ignored")
-        t = t[kept]
-        for name in (layout.names or ())[2:]:
-            with np.errstate(all="ignore"):
-                values = records[name][kept].astype(float)
-            found.append((name, t, np.where(np.isfinite(values), values, np.nan)))
-    if not found:
-        refuse(path, "holds no events; a flight needs at least two")
-    return {name: (t, values) for name, t, values in sorted(found, key=lambda each: each[1].size)}
+        found += _samples(path, records, records[" t"] * (1e-3 if version == 1 else 1e-6), notes)
+    return found
+
+
+def _samples(path: Path, records: np.ndarray, t: np.ndarray, notes: list[str]) -> list[Samples]:
+    """The variables of records at the times `t` [s]. Raises `InputError`."""
+    kept = in_order(t)
+    if kept is None:
+        refuse(path, f"time runs backward from one event to the next: {_DAMAGED}")
+    if not kept.all():
+        notes.append(f"{np.count_nonzero(~kept)} late events are ignored")
+    t, found = t[kept], []
+    for name in (name for name in records.dtype.names or () if name not in _NO_VARIABLES):
+        with np.errstate(all="ignore"):
+            values = records[name][kept].astype(float)
+        found.append((name, t, np.where(np.isfinite(values), values, np.nan)))
+    return found
+
+
+def _sets(path: Path, content: bytes, notes: list[str]) -> list[Samples]:
+    """The variables of the format of 2019: names, then blocks of data sets, each with the inverse of its CRC-32."""
+    match = _SETS.match(content)
+    parts = [] if match is None else [_VARIABLE.fullmatch(text.strip()) for text in match[2].split(b",")[:-1]]
+    fields = [(part[1].decode(), "<f2" if part[2] == b"e" else f"<{part[2].decode()}") for part in parts if part]
+    if match is None or not len(parts) == len(fields) == len(dict(fields)) == match[1][0]:
+        refuse(path, f"does not describe its variables: {_DAMAGED}")
+    layout, at, good, bad = np.dtype(fields), match.end() + 4, [], 0
+    while at < len(content):
+        end = at + 1 + content[at] * layout.itemsize
+        whole = zlib.crc32(content[at:end]) ^ 0xFFFFFFFF == int.from_bytes(content[end : end + 4], "little")
+        good += [content[at + 1 : end]] * whole
+        bad += not whole
+        at = end + 4
+    if bad:
+        notes.append(f"{counted(bad, 'block')} of the log with a wrong checksum are ignored: they are cut or corrupt")
+    records = np.frombuffer(b"".join(good), layout)
+    return _samples(path, records, records["tick"] * 1e-3, notes) if records.size > 1 else []
 
 
 def _types(path: Path, content: bytes) -> tuple[Types, int, int]:

@@ -13,6 +13,7 @@ from .._files import write_atomically
 from ..airframe import Airframe
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
 from .assemble import COLUMN_NAMES as COLUMN_NAMES
+from .columns import ColumnMap, column_map, mapped_rows
 from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFormat, Path, Table, counted, opened, quoted, refuse
 
 _LONGEST_LINE = 1 << 20
@@ -24,7 +25,26 @@ _BLOCK = 10_000  # lines that are read at once
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
-CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()))
+_NEUROBEM = ("ang vel x", "mot 1")
+
+
+def read_mapped(path: Path, columns: ColumnMap) -> tuple[Table, tuple[str, ...]]:
+    """Read a CSV file by a column map. Raises `InputError`."""
+    known = {name for source in columns.sources.values() for name in source.names}
+    return mapped_rows(read_table(path, known, missing=("NaN", "nan")), columns), ()
+
+
+def _is_neurobem(begin: bytes) -> bool:
+    header = begin.partition(b"\n")[0].decode(errors="replace")
+    return {name.strip() for name in header.split(",")}.issuperset(_NEUROBEM)
+
+
+def _read_neurobem(path: Path) -> tuple[Table, tuple[str, ...]]:
+    return read_mapped(path, column_map("neurobem"))
+
+
+NEUROBEM = LogFormat("NeuroBEM", "NeuroBEM CSV", _is_neurobem, _read_neurobem, read_mapped)
+CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()), read_mapped)
 
 
 def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = ()) -> Table:

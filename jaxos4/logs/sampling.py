@@ -19,6 +19,8 @@ _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no
 _PAUSE = 0.9  # [s]; a longer time between samples is a pause of the log, and not its rate
 _FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up to this share, are a rate
 
+HALF_TURN = np.array([1.0, -1.0, -1.0])
+"""About x: from x forward, y right, z down to x forward, y left, z up."""
 Times = Float[np.ndarray, " samples"]
 Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]
@@ -269,6 +271,13 @@ def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarra
     phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     return np.stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
+
+
+def attitude(quaternion: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "samples 3"]:
+    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z) of any length, without unwrapping; of zeros, NaN."""
+    with np.errstate(all="ignore"):
+        unit = quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
+    return euler_angles(unit)
 
 
 def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:

@@ -195,12 +195,14 @@ class LogFormat(NamedTuple):
     - `recognises`: takes the first bytes of a file; returns whether the file has this format.
     - `read`: takes a path; returns the columns and the notes on what the reader assumed, one line each. Raises
       `InputError` (by `refuse`) for a file that cannot be used.
+    - `mapped`: takes a path and a column map, and returns the same; `None` if the format has columns of its own.
     """
 
     name: str
     label: str
     recognises: Callable[[bytes], bool]
     read: Callable[[Path], tuple[Table, tuple[str, ...]]]
+    mapped: Callable[[Path, Any], tuple[Table, tuple[str, ...]]] | None = None
 
 
 _ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocity", "stretch", "within")

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .sampling import Series, euler_angles, gyro_rows, logged_rate, unwrapped
+from .sampling import HALF_TURN, Series, attitude, gyro_rows, logged_rate, unwrapped
 from .table import LIMITS, LogFacts, LogFormat, Path, Sampling, Table, fast_enough, needed, order_note, refuse
-from .ulog_file import HALF_TURN, MAGIC, Topics, decoded
+from .ulog_file import MAGIC, Topics, decoded
 
 _RATES = {"vehicle_angular_velocity": "xyz", "sensor_combined": "gyro_rad"}
 _FORCES = {"sensor_combined": "accelerometer_m_s2", "vehicle_acceleration": "xyz"}
@@ -91,9 +91,7 @@ def _attitude(log: Topics) -> Series | None:
     if series is None:
         return None
     log.names.update(dict.fromkeys(_ANGLES, "vehicle_attitude.q"))
-    with np.errstate(all="ignore"):  # NaN for a quaternion of zeros
-        unit = series.values / np.sqrt((series.values**2).sum(axis=1, keepdims=True))
-    return Series(series.t, unwrapped(series.t, euler_angles(unit)).values * HALF_TURN)
+    return Series(series.t, unwrapped(series.t, attitude(series.values)).values * HALF_TURN)
 
 
 def _position(log: Topics) -> Series | None:

@@ -10,12 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import BROKEN
-from .sampling import Series, in_order, logged_rate
+from .sampling import HALF_TURN, Series, in_order, logged_rate
 from .table import Path, read_bytes, refuse
 
 MAGIC = b"ULog\x01\x12\x35"
-HALF_TURN = np.array([1.0, -1.0, -1.0])  # about x: from forward, right, down to forward, left, up
-
 _FASTER = 1.1  # a topic that is this much faster than another is preferred to it
 _MOST_FIELDS = 1024  # of one message, with those of arrays and nested messages; the largest of PX4 have about 200
 _DEEPEST = 3  # levels of messages inside messages

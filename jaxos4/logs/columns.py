@@ -1,0 +1,259 @@
+"""Column maps: which column or topic of a log holds which quantity, and its unit, sign and frame. See docs/logs.md."""
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._files import check_plain, read_toml
+from ..airframe import STANDARD_GRAVITY
+from ..flight import CHANNEL_NAMES, FORCE_NAMES
+from .sampling import Series, attitude, gyro_rows, logged_rate, unwrapped
+from .table import COMMAND_NAMES, SPEED_NAMES, LogFacts, Path, Sampling, Table, needed, quoted, refuse
+
+ColumnsGiven = Path | Mapping[str, Any] | None
+"""A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
+
+PRESETS = {path.stem: path for path in sorted(FilePath(__file__).with_name("presets").glob("*.toml"))}
+QUATERNION, ANGLES = ("qw", "qx", "qy", "qz"), ("phi", "theta", "psi")
+_COLUMNS = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, *QUATERNION, "voltage")
+_DEGREE, _PWM = math.pi / 180, "PWM"
+_UNITS = {  # by the unit of a column: other units, in the column's
+    "s": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "rad/s": {"deg/s": _DEGREE, "rpm": 2 * math.pi / 60},
+    "of full scale": {"%": 0.01, _PWM: 1e-3},
+    "rad": {"deg": _DEGREE},
+    "m": {"cm": 0.01, "mm": 1e-3},
+    "m/s": {"cm/s": 0.01, "mm/s": 1e-3},
+    "m/s^2": {"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY},
+    "V": {"mV": 1e-3},
+    "of a quaternion": {},
+}
+_UNIT_OF = {
+    **{"t": "s", "voltage": "V"},
+    **dict.fromkeys((*SPEED_NAMES, "p", "q", "r"), "rad/s"),
+    **dict.fromkeys(COMMAND_NAMES, "of full scale"),
+    **dict.fromkeys(ANGLES, "rad"),
+    **dict.fromkeys("xyz", "m"),
+    **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
+    **dict.fromkeys(FORCE_NAMES, "m/s^2"),
+    **dict.fromkeys(QUATERNION, "of a quaternion"),
+}
+_TURNED = {"q", "r", "theta", "psi", "y", "z", "vy", "vz", "ay", "az", "qy", "qz"}  # by half a turn about x
+_PWM_LEAST = 1000.0  # [us]
+_MOST_SHOWN = 20
+_REMEDY = "correct its unit or sign in the column map"
+
+
+class Source(NamedTuple):
+    """Where a column comes from: the first of `names` that a log holds. Its values: (value - `zero`) * `factor`."""
+
+    names: tuple[str, ...]
+    factor: float = 1.0
+    zero: float = 0.0
+
+
+class ColumnMap(NamedTuple):
+    """A column map.
+
+    - `name`: in messages.
+    - `sources`: by column of the flight CSV, or `qw, qx, qy, qz`, the attitude from the body to the earth.
+    - `needed`: the columns that a log must hold.
+    - `recorded`: whether messages have the time at which they were recorded, and not that of their own stamp.
+    """
+
+    name: str
+    sources: dict[str, Source]
+    needed: frozenset[str] = frozenset()
+    recorded: bool = False
+
+    def chosen(self, path: Path, held: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
+        """By column, its place in a log.
+
+        **Arguments:**
+
+        - `held`: takes a source; returns its name in the log, or `None` if the log does not hold it.
+        - `names`: of all that the log holds, for the message.
+
+        **Raises:** `InputError` if the log does not hold a column that is needed.
+        """
+        found = {}
+        for column, source in self.sources.items():
+            place = next(filter(None, map(held, source.names)), None)
+            if place is not None:
+                found[column] = place
+            elif column in self.needed:
+                shown = ", ".join(map(quoted, names[:_MOST_SHOWN])) + ", ..." * (len(names) > _MOST_SHOWN)
+                what = f"there is no {quoted(source.names[0])}, which {self.name} names for {column}"
+                refuse(path, f"{what}. There are {shown}: name one of them")
+        return found
+
+    def converted(self, column: str, values: np.ndarray) -> np.ndarray:
+        """Values of a column in our unit and frame. The sign of a rotor speed is dropped."""
+        source = self.sources[column]
+        values = (values - source.zero) * source.factor
+        if column in SPEED_NAMES:
+            return np.abs(values)
+        return np.clip(values, 0.0, 1.0) if source.zero else values
+
+
+def column_map(given: ColumnsGiven) -> ColumnMap:
+    """A checked column map; `None`: the columns of the flight CSV.
+
+    **Raises:** `InputError`, one line, for a map that cannot be used; `OSError` if its file cannot be read.
+    """
+    if given is None:
+        return ColumnMap("flight CSV", {name: Source((name,)) for name in _COLUMNS})
+    if isinstance(given, Mapping):
+        name, table = "columns", dict(given)
+        check_plain(name, table, "correct it")
+    else:
+        preset = PRESETS.get(os.fspath(given))
+        name = os.fspath(given)
+        try:
+            table = read_toml(preset or given)
+        except FileNotFoundError:
+            refuse(name, f"neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}")
+    return _checked(name, table, needed=name not in PRESETS)
+
+
+def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
+    """The map in the table of a file; its presets are not `needed`."""
+    columns = table.pop("columns", {})
+    settings = {"preset": ("", *PRESETS), "frame": ("FLU", "FRD"), "time": ("stamp", "recorded")}
+    preset, frame, time = given = [table.pop(key, values[0]) for key, values in settings.items()]
+    for (key, values), value in zip(settings.items(), given, strict=True):
+        if value not in values:
+            refuse(name, f"{key} is {quoted(str(value))}; give one of {', '.join(filter(None, values))}")
+    if table or not isinstance(columns, dict):
+        wrong = quoted(str(next(iter(table), "columns")))
+        refuse(name, f"{wrong} cannot be used; a column map has preset, frame, time, and a table [columns]")
+    begin = column_map(preset or None)
+    sources = begin.sources | {column: _source(name, column, value) for column, value in columns.items()}
+    for column in _TURNED & (columns.keys() if preset else _TURNED) if frame == "FRD" else ():
+        sources[column] = sources[column]._replace(factor=-sources[column].factor)
+    return ColumnMap(quoted(name), sources, frozenset(columns) if needed else frozenset(), time == "recorded")
+
+
+def _source(name: str, column: str, value: Any) -> Source:
+    """The source of one column, as it stands in the map. Raises `InputError`."""
+    if column not in _COLUMNS:
+        refuse(name, f"there is no column {quoted(str(column))}; the columns are {', '.join(_COLUMNS)}")
+    entry = value if isinstance(value, dict) else {"source": value}
+    names, unit, sign = entry.get("source", column), entry.get("unit"), entry.get("sign", 1)
+    names = [names] if isinstance(names, str) else names
+    if not isinstance(names, list) or not names or not all(isinstance(each, str) and each for each in names):
+        refuse(name, 'has no source; give a name, as in p = "gyro x"', column=column)
+    own, factor = _UNIT_OF[column], 1.0 if unit is None else unit
+    if isinstance(factor, str):
+        factor = 1.0 if factor == own else _UNITS[own].get(factor, math.nan)
+    usable = isinstance(factor, int | float) and math.isfinite(factor) and factor != 0
+    if not usable or sign not in (1, -1) or not entry.keys() <= {"source", "unit", "sign"}:
+        units = ", ".join([own, *_UNITS[own]])
+        refuse(
+            name, f"may have a source, a unit ({units}, or a factor) and a sign (1 or -1); correct it", column=column
+        )
+    return Source(tuple(names), float(factor) * sign, _PWM_LEAST if unit == _PWM else 0.0)
+
+
+def mapped_rows(table: Table, columns: ColumnMap) -> Table:
+    """A table whose columns are named by its log, with our columns. Raises `InputError` if one is missing."""
+    raw, names = table.columns, [*table.columns, *table.unknown]
+    chosen = columns.chosen(table.path, lambda name: name if name in raw else None, names)
+    found = {column: columns.converted(column, raw[place]) for column, place in chosen.items()}
+    if found.keys() >= set(QUATERNION):
+        angles = attitude(np.column_stack([found[name] for name in QUATERNION]))
+        found |= {name: x for name, x in zip(ANGLES, angles.T, strict=True) if name not in found}
+        chosen |= dict.fromkeys(ANGLES, chosen["qw"])
+    found = {name: values for name, values in found.items() if name not in QUATERNION}
+    unknown = tuple(name for name in names if name not in chosen.values())
+    return table._replace(columns=found, names=chosen, unknown=unknown, remedy=_REMEDY)
+
+
+def mapped_series(
+    path: Path, columns: ColumnMap, found: dict[str, Series], names: dict[str, str], notes: list[str]
+) -> Table:
+    """The table of columns that have times of their own.
+
+    **Arguments:**
+
+    - `found`: by column, its samples as the log holds them, in increasing time.
+    - `names`: the log's names of the columns.
+    - `notes`: to which this function adds.
+
+    **Raises:** `InputError` if body rates or rotors are missing, or do not overlap.
+    """
+    found = {name: Series(s.t, columns.converted(name, s.values)) for name, s in found.items()}
+
+    def together(*names: str) -> Series | None:
+        """Several columns at the times of the first."""
+        if not found.keys() >= set(names):
+            return None
+        t = found[names[0]].t
+        same = (found[name] for name in names)
+        values = [s.values[:, 0] if s.t is t else np.interp(t, s.t, s.values[:, 0]) for s in same]
+        return Series(t, np.column_stack(values))
+
+    rates = needed(path, together("p", "q", "r"), "body rates", f"name p, q and r in {columns.name}")
+    motors = [(kind, s) for kind in (SPEED_NAMES, COMMAND_NAMES) if (s := _turning(together(*kind))) is not None]
+    remedy = f"name omega1..4 or command1..4 in {columns.name}"
+    kind, rotors = needed(path, motors[0] if motors else None, "rotor speeds or commands", remedy)
+    quaternion, angles = together(*QUATERNION), together(*ANGLES)
+    if angles is None and quaternion is not None:
+        angles = Series(quaternion.t, attitude(quaternion.values))
+        names |= dict.fromkeys(ANGLES, names["qw"])
+    single = [n for n in found if n not in (*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, "p", "q", "r", "t")]
+    others = {
+        ANGLES: None if angles is None else unwrapped(angles.t, angles.values),
+        **{(n,): found[n] for n in single},
+    }
+    if kind is COMMAND_NAMES:
+        notes.append(f"commands are {names[kind[0]]}.., taken as fractions of full-scale rotor speed")
+    facts = LogFacts(Sampling(names[kind[0]], logged_rate(rotors.t)), Sampling(names["p"], logged_rate(rates.t)))
+    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=facts)
+    return gyro_rows(table, rates, rotors, measured=kind is SPEED_NAMES, others=others)[1]
+
+
+def _turning(rotors: Series | None) -> Series | None:
+    """The samples with all four rotors; `None` if one of them never turns."""
+    if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
+        return None
+    whole = np.isfinite(rotors.values).all(axis=1)
+    return Series(rotors.t[whole], rotors.values[whole]) if np.count_nonzero(whole) > 1 else None
+
+
+def array_table(data: Any, columns: ColumnMap) -> Table:
+    """The table of a mapping of arrays, or of an object like one: a DataFrame, a Dataset.
+
+    Arrays have one row for each time. Column i of an array `name` with two dimensions is named `name[i]`. Times may be
+    dates.
+
+    **Raises:** `InputError` if a column is missing, or lengths differ.
+    """
+    names = getattr(data, "columns", None)
+    if names is None and not hasattr(data, "keys"):
+        refuse("data", f"is of type {type(data).__name__}; give the path of a log, or a mapping of arrays")
+    names = [*data.keys(), *getattr(data, "coords", ())] if names is None else [*names]
+    raw: dict[str, np.ndarray] = {}
+    for name in dict.fromkeys(names):
+        values = np.asarray(data[name])
+        if values.dtype.kind == "M":
+            values = (values - values.flat[0]) / np.timedelta64(1, "s") if values.size else np.empty(0)
+        if values.dtype.kind in "fiu" and values.ndim in (1, 2):
+            parts = values.T.astype(float) if values.ndim == 2 else [values.astype(float)]
+            raw |= {f"{name}[{i}]" if values.ndim == 2 else str(name): part for i, part in enumerate(parts)}
+    unread = tuple(str(name) for name in names if not any(key.partition("[")[0] == str(name) for key in raw))
+    table = mapped_rows(Table("data", raw, unread, first_row=None), columns)
+    sizes = {name: values.size for name, values in table.columns.items()}
+    if len({*sizes.values()}) > 1 or min(sizes.values(), default=0) < 2:
+        shown = ", ".join(f"{name} has {size}" for name, size in sizes.items())
+        refuse(
+            "data", f"needs two rows or more, and as many in each column ({shown or 'there are none'}); correct them"
+        )
+    for name, values in table.columns.items():
+        if np.isinf(values).any():
+            refuse("data", "holds an infinity; write NaN if it was not measured", column=name, kind="array")
+    return table

@@ -1,0 +1,222 @@
+"""Bags of ROS 1 and ROS 2, and MCAP files of ROS 2, decoded by rosbags. Topics, times and presets: docs/logs.md.
+
+A column's source is `/topic.field.field[0]`. A topic may have a namespace before the name in the column map.
+"""
+
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+
+from ..errors import InputError
+from .columns import PRESETS, ColumnMap, column_map, mapped_series
+from .sampling import Series, in_order
+from .table import MAX_ROWS, LogFormat, Path, Table, opened, quoted, refuse
+
+_ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"rosbag2_bagfile_information:"
+_TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it
+_FIELD = re.compile(r"[^.\[\]]+")
+_SAME_CLOCK = 0.5  # [s]: topics whose stamps are so far apart from when they were recorded have clocks of their own
+_STAMPS = (("timestamp_sample", 1000), ("timestamp", 1000))  # of PX4, and their unit [ns]
+_REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
+_NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag record -s mcap`), or convert it"
+
+
+class _Topic(NamedTuple):
+    """The messages of a topic: when they were recorded and their own stamps [ns], and the fields of columns."""
+
+    recorded: list[int]
+    stamps: list[int]
+    fields: dict[str, list[float]]
+
+
+def read_ros(path: Path, columns: ColumnMap | None = None) -> tuple[Table, tuple[str, ...]]:
+    """Read columns of a bag by a column map, or by the first preset that fits. Raises `InputError`."""
+    try:
+        import rosbags  # noqa: F401
+    except ImportError:
+        refuse(path, "reading a ROS bag needs rosbags; install jaxos4[ros]")
+    try:
+        reader = _reader(path)
+        reader.open()
+    except Exception as error:  # noqa: BLE001 - of a damaged file, rosbags raises any
+        _refuse_damage(path, error)
+    try:
+        return _read(path, reader, columns)
+    finally:
+        reader.close()
+
+
+ROS = LogFormat(
+    "ROS", "ROS bag or MCAP", lambda begin: begin.startswith((_ROS1, _MCAP, _SQLITE, _FOLDER)), read_ros, read_ros
+)
+
+
+def _reader(path: Path) -> Any:
+    """The reader of rosbags for the bytes with which a file begins, or for a folder. It is not open yet."""
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+    from rosbags.rosbag2.storage_mcap import McapReader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    place = FilePath(path)
+    if place.is_dir():
+        return Reader2(place)
+    with opened(path, "rb") as file:
+        begin = file.read(len(_FOLDER))
+    if begin.startswith(_FOLDER):
+        return Reader2(place.parent)
+    kinds = {_ROS1: Reader1, _MCAP: McapReader, _SQLITE: Sqlite3Reader}
+    return next(reader for magic, reader in kinds.items() if begin.startswith(magic))(place)
+
+
+def _refuse_damage(path: Path, error: Exception) -> NoReturn:
+    what = " ".join(str(error).split())[:120] or type(error).__name__
+    refuse(path, f"cannot be decoded ({what}); {_REPAIR}")
+
+
+def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
+    topics = sorted({each.topic for each in reader.connections})
+
+    def held(source: str) -> str | None:
+        """The source with the whole name of its topic: the only one that ends like that of the source."""
+        name, _, field = source.partition(".")
+        found = [name] if name in topics else [topic for topic in topics if topic.endswith(name)]
+        return f"{found[0]}.{field}" if len(found) == 1 and name.startswith("/") and field else None
+
+    notes: list[str] = []
+    if columns is None:
+        fitting = (each for each in map(column_map, PRESETS) if _fits(each.chosen(path, held, topics)))
+        columns = next(fitting, None)
+        if columns is None:
+            shown = ", ".join(map(quoted, topics[:20])) + ", ..." * (len(topics) > 20)
+            what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {shown or 'none'}"
+            refuse(path, f"{what}: say in a column map which hold rates and motors, and give --columns map.toml")
+        notes.append(f"columns are those of the preset {columns.name}")
+    chosen = columns.chosen(path, held, topics)
+    found = _messages(path, reader, {*chosen.values()})
+    series = _series(path, found, notes, recorded=columns.recorded)
+    return mapped_series(
+        path, columns, {c: series[place] for c, place in chosen.items() if place in series}, chosen, notes
+    ), tuple(notes)
+
+
+def _fits(chosen: dict[str, str]) -> bool:
+    return chosen.keys() >= {"p", "q", "r"} and bool(chosen.keys() & {"omega1", "command1"})
+
+
+def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
+    """The fields at these places, by topic. Raises `InputError`."""
+    found: dict[str, _Topic] = {}
+    for topic, field in sorted(each.split(".", 1) for each in places):
+        found.setdefault(topic, _Topic([], [], {})).fields[field] = []
+    wanted = [each for each in reader.connections if each.topic in found]
+    getters = {
+        topic: [(values.append, _getter(path, topic, f)) for f, values in t.fields.items()]
+        for topic, t in found.items()
+    }
+    try:
+        decode = _decoder(path, wanted, ros1=type(reader).__module__.startswith("rosbags.rosbag1"))
+        for number, (connection, recorded, content) in enumerate(reader.messages(connections=wanted)):
+            if number > MAX_ROWS:
+                refuse(path, f"has more than {MAX_ROWS:,} messages of these topics; cut it into flights")
+            message, topic = decode(content, connection.msgtype), found[connection.topic]
+            topic.recorded.append(recorded)
+            topic.stamps.append(_stamp(message))
+            for append, get in getters[connection.topic]:
+                append(get(message))
+    except InputError:
+        raise
+    except Exception as error:  # noqa: BLE001 - of a damaged file, rosbags raises any
+        _refuse_damage(path, error)
+    return found
+
+
+def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
+    """A function that decodes messages of these connections, by their definitions in the file, or by ROS 2's own."""
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = dict(get_typestore(Stores.LATEST).fielddefs)
+    for each in connections:
+        if not _TYPE.fullmatch(each.msgtype):
+            refuse(path, f"has a type of messages {quoted(each.msgtype)}; {_REPAIR}")
+        if each.msgdef.format == MessageDefinitionFormat.MSG:
+            types |= get_types_from_msg(each.msgdef.data, each.msgtype)
+        elif each.msgtype not in types:
+            refuse(path, f"{_NO_TYPES}", column=each.topic, kind="topic")
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store.deserialize_ros1 if ros1 else store.deserialize_cdr
+
+
+def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
+    """A function that takes a number out of a message; NaN if an array is shorter. It raises `InputError`."""
+    steps = [int(each) if each.isdecimal() else each for each in _FIELD.findall(field)]
+
+    def get(message: Any) -> float:
+        value = message
+        for step in steps:
+            try:
+                value = value[step] if isinstance(step, int) else getattr(value, step)
+            except IndexError:
+                return math.nan
+            except (AttributeError, TypeError):
+                fields = [name for name in getattr(value, "__dataclass_fields__", ()) if name[:2] != "__"]
+                names = ", ".join(fields) or "a number"
+                refuse(
+                    path,
+                    f"has no {step} there, but {names}; correct the column map",
+                    column=f"{topic}.{field}",
+                    kind="field",
+                )
+        try:
+            return float(value)
+        except (TypeError, ValueError):
+            refuse(
+                path,
+                "is not a number; name one of its fields in the column map",
+                column=f"{topic}.{field}",
+                kind="field",
+            )
+
+    return get
+
+
+def _stamp(message: Any) -> int:
+    """The time of a message in its own words [ns]; 0 if it has none."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is not None:
+        return stamp.sec * 10**9 + stamp.nanosec
+    return next((t * unit for name, unit in _STAMPS if (t := getattr(message, name, 0))), 0)
+
+
+def _series(path: Path, found: dict[str, _Topic], notes: list[str], *, recorded: bool) -> dict[str, Series]:
+    """By place, its samples. Times are stamps if all topics have some, of one clock; else those of the recorder."""
+    times = {
+        topic: (np.array(t.recorded, float), np.array(t.stamps, float)) for topic, t in found.items() if t.recorded
+    }
+    apart = [float(np.median(stamps - at)) for at, stamps in times.values()]
+    stamped = all((stamps > 0).all() for _, stamps in times.values())
+    if not recorded and not (stamped and np.ptp(apart or [0.0]) < _SAME_CLOCK * 1e9):
+        notes.append("times are those of the recorder, because not all topics have stamps of one clock")
+        recorded = True
+    series: dict[str, Series] = {}
+    begin = min((min(t.recorded if recorded else t.stamps) for t in found.values() if t.recorded), default=0)
+    for topic, each in found.items():
+        if len(each.recorded) < 2:
+            continue
+        t = 1e-9 * np.array([at - begin for at in (each.recorded if recorded else each.stamps)], float)
+        kept = in_order(t)
+        if kept is None:
+            refuse(path, f'time runs backward in {topic}; give time = "recorded" in a column map, or record again')
+        if not kept.all():
+            notes.append(f"{topic}: {np.count_nonzero(~kept)} late messages are ignored")
+        same = t[kept]
+        for field, values in each.fields.items():
+            column = np.array(values, float)[kept]
+            series[f"{topic}.{field}"] = Series(same, np.where(np.isfinite(column), column, np.nan)[:, None])
+    return series

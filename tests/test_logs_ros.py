@@ -1,0 +1,261 @@
+"""Bags of ROS 1 and 2 and MCAP, written by rosbags: the same flight as a CSV, presets, clocks, and damage."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import CRAZYFLIE
+from hypothesis import given, settings
+from recorded_logs import (
+    FRD,
+    RPM,
+    attitude,
+    check,
+    damaged,
+    force,
+    outcome,
+    position,
+    rates,
+    speeds,
+    table_csv,
+    velocity,
+)
+from scipy.spatial.transform import Rotation
+from test_logs_readers import ACCIDENTS
+
+from jaxos4.errors import InputError
+from jaxos4.flight import Flight
+from jaxos4.logs import log_format, read_log, read_recording
+
+pytest.importorskip("rosbags", reason="reading a ROS bag needs rosbags")
+import recorded_bags as bags  # noqa: E402
+from recorded_bags import KINDS, T, bag  # noqa: E402
+
+ATTITUDE = ("p", "q", "r", "phi", "theta", "psi")
+MAP = {
+    **{f"omega{i + 1}": f"/motor_speed.angular_velocities[{i}]" for i in range(4)},
+    **{name: f"/imu.angular_velocity.{axis}" for name, axis in zip("pqr", "xyz", strict=True)},
+    **{f"a{axis}": f"/imu.linear_acceleration.{axis}" for axis in "xyz"},
+    **{f"q{axis}": f"/imu.orientation.{axis}" for axis in "wxyz"},
+}
+
+
+def quaternions(t, turned=False):
+    rotation = FRD @ attitude(t) @ FRD if turned else attitude(t)
+    return Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
+
+
+def topics(t=T, motors=T, prefix=""):
+    return {f"{prefix}/imu": bags.imu(t, quaternions(t)), f"{prefix}/motor_speed": bags.motors(motors)}
+
+
+@pytest.fixture(scope="module")
+def bagged(tmp_path_factory):
+    """A bag of each kind, as its path."""
+    folder = tmp_path_factory.mktemp("bags")
+    return {kind: bag(folder / f"flight.{kind}", kind, topics()) for kind in KINDS}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_bag_is_the_same_flight_as_the_csv(kind, bagged, tmp_path, save):
+    names = ["t", *(f"omega{i}" for i in range(1, 5)), "p", "q", "r", "ax", "ay", "az", "phi", "theta", "psi"]
+    angles = Rotation.from_matrix(attitude(T)).as_euler("ZYX")[:, ::-1]
+    csv = read_recording(save(table_csv(names, T, speeds(T), rates(T), force(T), angles)))
+    other = shutil.copy(bagged[kind], tmp_path / "flight.log")  # its name says nothing
+    folder = bagged[kind].parent
+    for place in {bagged[kind], Path(other)} | ({folder, folder / "metadata.yaml"} if kind != "bag" else set()):
+        read = read_recording(place, columns={"columns": MAP})
+        np.testing.assert_allclose(read.time, csv.time, atol=2e-7)  # the format counts in ns
+        np.testing.assert_allclose(read.states, csv.states, atol=1e-9)
+        np.testing.assert_allclose(read.specific_force, csv.specific_force, atol=1e-9)
+        np.testing.assert_allclose(read.omega[:-1], np.sqrt((csv.omega[1:] ** 2 + csv.omega[:-1] ** 2) / 2), atol=1e-6)
+        check(read.flight, names=ATTITUDE)
+        assert log_format(place).name == "ROS"
+
+
+def test_topics_have_rates_and_names_of_their_own(tmp_path):
+    slow = T[::4] + 0.001
+    path = bag(tmp_path / "slow.bag", "bag", topics(motors=slow, prefix="/hummingbird"))
+    flight, notes = read_log(path, columns={"columns": MAP})
+    check(flight, names=ATTITUDE, start=0.004)
+    np.testing.assert_allclose(flight.omega[:-1], speeds(np.asarray(flight.time)[:-1] + 0.006), atol=0.5)
+    assert not any("recorder" in note for note in notes)
+    path = bag(tmp_path / "twice.bag", "bag", topics(T[:9], T[:9], "/bee") | topics(T[:9], T[:9], "/other"))
+    with pytest.raises(InputError, match=r"there is no '/motor_speed\..*' names for omega1\. There are '/bee/imu', "):
+        read_log(path, columns={"columns": MAP})
+
+
+def test_times_are_stamps_if_all_topics_have_some_of_one_clock(tmp_path, bagged):
+    """The recorder adds 3 ms to each: nothing changes but the first time, which is 0."""
+    stamped = read_recording(bagged["mcap"], columns={"columns": MAP})
+    recorded = read_recording(bagged["mcap"], columns={"columns": MAP, "time": "recorded"})
+    np.testing.assert_allclose(stamped.states, recorded.states, atol=1e-9)
+    definitions = {"other/msg/Speeds": "float64[4] speeds"}
+    without = {
+        "/imu": bags.imu(T, quaternions(T)),
+        "/s": ("other/msg/Speeds", T, lambda row: {"speeds": speeds(T)[row]}),
+    }
+    path = bag(tmp_path / "without", "mcap", without, definitions)
+    own = {f"omega{i + 1}": f"/s.speeds[{i}]" for i in range(4)}
+    flight, notes = read_log(path, columns={"columns": MAP | own})
+    check(flight, names=ATTITUDE)
+    assert any("times are those of the recorder" in note for note in notes)
+    definitions = {"other/msg/All": "float64[4] speeds\nfloat64[3] gyro"}
+    gyro, turning = rates(T), speeds(T)
+    alone = {"/s": ("other/msg/All", T, lambda row: {"speeds": turning[row], "gyro": gyro[row]})}
+    own |= {name: f"/s.gyro[{i}]" for i, name in enumerate("pqr")}
+    flight, notes = read_log(bag(tmp_path / "alone", "mcap", alone, definitions), columns={"columns": own})
+    check(flight, names=ATTITUDE[:3], forces=False)
+    assert any("times are those of the recorder" in note for note in notes)
+
+
+def test_each_rotor_may_have_a_topic_of_its_own(tmp_path):
+    """At times of its own, which are brought to those of the first."""
+    late = [T[::2] + 0.001 * i for i in range(4)]
+    messages = {"/imu": bags.imu(T, quaternions(T))}
+    for i, t in enumerate(late):
+        messages[f"/motor_speed/{i}"] = ("other/msg/One", t, lambda k, i=i: {"data": speeds(late[i])[k, i]})
+    path = bag(tmp_path / "four.bag", "bag", messages, {"other/msg/One": "std_msgs/Header header\nfloat64 data"})
+    flight, _ = read_log(path, columns={"columns": MAP | {f"omega{i + 1}": f"/motor_speed/{i}.data" for i in range(4)}})
+    t = np.asarray(flight.time)[2:-4] + 0.002
+    np.testing.assert_allclose(flight.omega[2:-4], speeds(t), atol=0.1)
+
+
+# Presets
+
+PX4 = {
+    "px4_msgs/msg/SensorCombined": "uint64 timestamp\nfloat32[3] gyro_rad\nfloat32[3] accelerometer_m_s2",
+    "px4_msgs/msg/VehicleAttitude": "uint64 timestamp\nuint64 timestamp_sample\nfloat32[4] q",
+    "px4_msgs/msg/ActuatorMotors": "uint64 timestamp\nuint64 timestamp_sample\nfloat32[12] control",
+    "px4_msgs/msg/VehicleLocalPosition": "uint64 timestamp\n"
+    + "".join(f"float32 {n}\n" for n in "x y z vx vy vz".split()),
+    "px4_msgs/msg/BatteryStatus": "uint64 timestamp\nfloat32 voltage_v",
+}
+COMMANDS = 0.3 + 0.1 * np.arange(4) + 0.05 * np.sin(2 * T)[:, None]
+
+
+def px4():
+    """Topics of PX4: forward, right, down; commands are not a number before the vehicle is armed."""
+    gyro, specific, turn = rates(T) @ FRD, force(T) @ FRD, quaternions(T, turned=True)
+    place = np.column_stack([position(T) @ FRD, velocity(T) @ FRD])
+    names = ("x", "y", "z", "vx", "vy", "vz")
+    messages = {
+        "sensor_combined": ("SensorCombined", lambda k: {"gyro_rad": gyro[k], "accelerometer_m_s2": specific[k]}),
+        "vehicle_attitude": ("VehicleAttitude", lambda k: {"q": turn[k]}),
+        "actuator_motors": ("ActuatorMotors", lambda k: {"control": [*COMMANDS[k], *[np.nan] * 8]}),
+        "vehicle_local_position_v1": ("VehicleLocalPosition", lambda k: dict(zip(names, place[k], strict=True))),
+        "battery_status": ("BatteryStatus", lambda k: {"voltage_v": 16.0}),
+    }
+
+    def stamped(values):
+        return lambda k: values(k) | {"timestamp": int(round(1e6 * T[k])) + 5_000_000}
+
+    return {f"/fmu/out/{name}": (f"px4_msgs/msg/{what}", T, stamped(v)) for name, (what, v) in messages.items()}
+
+
+def test_topics_of_px4_are_recognised(tmp_path):
+    flight, notes = read_log(bag(tmp_path / "px4", "mcap", px4(), PX4), CRAZYFLIE)
+    check(flight)
+    np.testing.assert_allclose(flight.omega[:-1], 2500 * COMMANDS[:-1], rtol=1e-5)
+    np.testing.assert_allclose(flight.voltage, 16.0)
+    text = " ".join(notes)
+    assert "the preset 'px4-ros2'" in text
+    assert "commands are /fmu/out/actuator_motors.control[0].." in text
+
+
+MAVROS = {
+    "mavros_msgs/msg/ESCStatusItem": "std_msgs/Header header\nint32 rpm",
+    "mavros_msgs/msg/ESCStatus": "std_msgs/Header header\nmavros_msgs/ESCStatusItem[] esc_status",
+}
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_topics_of_mavros_are_recognised(kind, tmp_path):
+    pose, twist = bags.moving(T)
+    definitions = {"mavros_msgs/msg/RCOut": "std_msgs/Header header\nuint16[] channels"} | MAVROS
+    messages = {
+        "/mavros/imu/data": bags.imu(T, quaternions(T)),
+        "/mavros/local_position/pose": pose,
+        "/mavros/local_position/velocity_local": twist,
+        "/mavros/battery": ("sensor_msgs/msg/BatteryState", T[::50], lambda row: {"voltage": 15.5}),
+        "/mavros/rc/out": ("mavros_msgs/msg/RCOut", T, lambda k: {"channels": 1000 + 1000 * COMMANDS[k]}),
+    }
+    flight, _ = read_log(bag(tmp_path / "commands", kind, messages, definitions), CRAZYFLIE)
+    check(flight)
+    assert flight.commanded
+    np.testing.assert_allclose(flight.omega[:-1], 2500 * COMMANDS[:-1], atol=2.5)
+    rpm = np.rint(speeds(T) / RPM).astype(int)
+    messages["/mavros/esc_status"] = (
+        "mavros_msgs/msg/ESCStatus", T, lambda k: {"esc_status": [{"rpm": each} for each in rpm[k]]}
+    )  # fmt: skip
+    flight, notes = read_log(bag(tmp_path / "measured", kind, messages, definitions))
+    assert not flight.commanded
+    np.testing.assert_allclose(flight.omega[:-1], speeds(np.asarray(flight.time)[:-1] + 0.002), atol=0.2)
+    assert any("the preset 'mavros'" in note for note in notes)
+
+
+def test_the_state_of_agilicious_is_recognised(tmp_path):
+    gyro, place, moving, turn = rates(T), position(T), velocity(T), quaternions(T)
+
+    def values(k):
+        pose = {"position": bags.vector(place[k]), "orientation": dict(zip("wxyz", turn[k], strict=True))}
+        return {
+            "pose": pose,
+            "velocity": {"linear": bags.vector(moving[k]), "angular": bags.vector(gyro[k])},
+            "motors": speeds(T)[k],
+        }
+
+    text = "std_msgs/Header header\nfloat64 t\ngeometry_msgs/Pose pose\ngeometry_msgs/Twist velocity\nfloat64[] motors"
+    messages = {"/kingfisher/agiros_pilot/state": ("agiros_msgs/msg/QuadState", T, values)}
+    flight, _ = read_log(bag(tmp_path / "a.bag", "bag", messages, {"agiros_msgs/msg/QuadState": text}))
+    check(flight, forces=False)
+    assert flight.specific_force is None
+
+
+# What is refused
+
+
+def test_what_a_bag_lacks_is_said(bagged, tmp_path, save):
+    path = bagged["mcap"]
+    with pytest.raises(InputError, match=r"none of its presets \(agil.*\)\. Its topics are '/imu', '/motor_speed'"):
+        read_log(path)
+    wrong = {
+        "/motor_speed.speeds[0]": "has no speeds there, but header, angular_velocities; correct the column map",
+        "/motor_speed.angular_velocities": "is not a number; name one of its fields",
+        "/imu.orientation.x.y": "has no y there, but a number",
+        "/motor.x": r"there is no '/motor\.x'",
+    }
+    for source, words in wrong.items():
+        with pytest.raises(InputError, match=words):
+            read_log(path, columns={"columns": MAP | {"omega1": source}})
+    short = {"columns": MAP | {"omega4": "/motor_speed.angular_velocities[4]"}}
+    with pytest.raises(InputError, match="holds no rotor speeds or commands; name omega1..4"):
+        read_log(path, columns=short)
+    with pytest.raises(InputError, match="holds no body rates; name p, q and r"):
+        read_log(path, columns={"columns": {n: s for n, s in MAP.items() if n != "q"}})
+    with pytest.raises(InputError, match="is a folder, not a file"):
+        read_log(tmp_path)
+    with pytest.raises(InputError, match="metadata"):
+        read_log(save("rosbag2_bagfile_information: 3", "metadata.yaml").parent)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_bag(kind, bagged, tmp_path):
+    """Up to four accidents in the bytes of a short bag: a flight, or one line."""
+    content = bag(tmp_path / f"short.{kind}", kind, topics(T[:25], T[:25])).read_bytes()
+    path = tmp_path / "damaged"
+
+    def read(path):
+        return read_log(path, columns={"columns": MAP})
+
+    path.write_bytes(content)
+    assert isinstance(outcome(read, path), Flight)
+
+    @given(accidents=ACCIDENTS)
+    @settings(max_examples=40)
+    def law(accidents):
+        path.write_bytes(damaged(content, accidents))
+        outcome(read, path)
+
+    law()
