@@ -124,7 +124,7 @@ class AbstractModel(eqx.Module):
         """The output of noise-free sensors: the states in cascade order, then the specific force along `force_axes`."""
 
     def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> "ByRecording | None":
-        """The model of one recording, if several have parameters of their own. `stretch`: see `Flight`."""
+        """The model of one recording, if several in a row have parameters of their own. `stretch`: see `Flight`."""
         del stretch
 
     @property

@@ -108,7 +108,7 @@ class FlightModel(AbstractModel):
 
     def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> ByRecording | None:
         """See `AbstractModel`."""
-        if stretch is None or max(self.recordings) == 0:
+        if stretch is None or max(self.recordings) == 0 or list(self.recordings) != sorted(self.recordings):
             return None
         one, names = dataclasses.replace(self, recordings=(0,)), self.parameter_names
         places = [
