@@ -34,7 +34,7 @@ _LONGEST_DELAY = 0.04  # [s], of rotors; more is an error of clocks
 
 
 Moves = dict[str, Move | None]
-Consequences = Callable[[str, float], Mapping[str, Move]]
+Consequences = Callable[[str, float], Mapping[str, Move | None]]
 """How far quantities move if a parameter has another value; see `consequences`."""
 _ALL: Moves = dict.fromkeys(INVERSE)
 _TORQUES: Moves = dict.fromkeys((*INVERSE, "thrust"))
