@@ -18,7 +18,7 @@ from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..networks.file import load_network
-from ..recording.checks import Finding, self_checks
+from ..recording.checks import KINEMATIC, Finding, self_checks
 from ..recording.pieces import Recording
 from ..shooting import InnovationsProblem, ShootingProblem
 from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, network_for, network_provenance
@@ -192,7 +192,7 @@ def prepare_flight(
         **versions(problem),
     )
     one = np.zeros(samples, int)
-    doubts = self_checks(recording, model.airframe)
+    doubts = self_checks(recording, model.airframe, checks=KINEMATIC)
     return Case(problem, problem, method, name, subject, other, one, provenance, name_of_other, doubts)
 
 
