@@ -12,7 +12,7 @@ from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification.consequences import consequences
-from jaxos4.identification.doubts import doubts_of, doubts_of_log
+from jaxos4.identification.doubts import doubts_of, doubts_of_log, few_parts
 from jaxos4.identification.fit import fit_case
 from jaxos4.identification.identify import describe
 from jaxos4.identification.judge import judge
@@ -66,6 +66,13 @@ def test_a_quantity_that_is_hardly_known_is_not_identified():
     assert verdict_of("Ix", Quantity(spread=0.1), [], strict).status == MISSING
     missing = verdict_of("Iz", Quantity(missing="it hardly yaws"), [])
     assert (missing.status, missing.reasons) == (MISSING, ("it hardly yaws",))
+
+
+def test_a_flight_with_too_few_parts_identifies_no_inertia():
+    for seconds, status in ((20.0, IDENTIFIED), (7.0, RESERVED), (4.0, MISSING)):
+        found = verdict_of("Ix", Quantity(), [*few_parts(seconds)])
+        assert found.status == status
+        assert all(f"only {seconds:.1f} s" in reason for reason in found.reasons)
 
 
 def test_the_result_is_that_of_what_was_asked():

@@ -14,7 +14,7 @@ from ..recording.checks import Finding
 from .answers import AXES, INVERSE
 from .results import Constant, Disturbance, ParameterEstimate, PredictionSkill, SampleTime
 from .sample_time import moved
-from .verdict import PREDICTIONS, Doubt, Move
+from .verdict import PREDICTIONS, TOLERANCE, Doubt, Move, Tolerance
 
 # Doubts need this many standard deviations.
 _SURE = 3.0
@@ -46,6 +46,20 @@ def doubts_of_log(findings: Sequence[Finding]) -> Iterator[Doubt]:
         result = "implausible" if finding.contradicted else "successful"
         result = "unidentifiable" if finding.name == "short_flight" else result
         yield Doubt(result, f"{finding.cause} ({finding.size})", finding.remedy, dict.fromkeys(finding.quantities))
+
+
+def few_parts(seconds: float, tolerance: Tolerance = TOLERANCE) -> Iterator[Doubt]:
+    """A flight with too few parts to compare: nothing shows whether its intervals are too narrow.
+
+    **Arguments:** `seconds`: how long the fitted measurements last [s].
+    """
+    if seconds < tolerance.seconds:
+        yield Doubt(
+            "unidentifiable" if 2 * seconds < tolerance.seconds else "successful",
+            f"only {seconds:.1f} s were fitted, too few to compare parts of the flight: intervals may be too narrow",
+            f"fly for {2 * tolerance.seconds:g} s or longer",
+            _ALL,
+        )
 
 
 def doubts_of(

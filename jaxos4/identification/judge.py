@@ -16,7 +16,16 @@ from ..results import meaning, result_names
 from ..shooting import with_room
 from .answers import AXES, INVERSE, overwhelmed, parameter_table, rigid_body, vehicle_constants
 from .consequences import consequences
-from .doubts import contradicted, doubts_of, doubts_of_log, moved_by_sample_time, moves_between, neighbours, vibration
+from .doubts import (
+    contradicted,
+    doubts_of,
+    doubts_of_log,
+    few_parts,
+    moved_by_sample_time,
+    moves_between,
+    neighbours,
+    vibration,
+)
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
@@ -88,6 +97,7 @@ def _judge_vehicle(case: Case, fit: Fit, sample_times: Sequence[SampleTime], pro
     inertias = dict(zip(AXES.values(), INVERSE, strict=True))
     doubts = [
         *doubts_of_log(case.doubts),
+        *few_parts(case.provenance.fitted_seconds or 0.0),
         *(
             Doubt("unidentifiable", why, f"fly more {axis}, or in calmer air", {inertias[axis]: None})
             for axis, why in weak.items()
