@@ -55,7 +55,8 @@ class Term:
     - `needs`: what the log or the airframe must have, by the constants at the top of this file.
     - `by_default`: takes what is available; returns whether an estimate uses the term if the user names none.
     - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
-    - `quantity`: what its parameters describe together, if that has a verdict of its own; see `jaxos4.Verdict`.
+    - `quantity`: what its parameters describe together, if that has a verdict of its own; see
+      `Identification.verdicts`.
 
     The other fields are the contributions, at least one. Each is a function of the quantity without the term, and of
     the values of the term's parameters by name. It returns the quantity with the term. They act in this order:
