@@ -41,10 +41,9 @@ _TORQUES: Moves = dict.fromkeys((*INVERSE, "thrust"))
 
 
 def doubts_of_log(findings: Sequence[Finding]) -> Iterator[Doubt]:
-    """What the logs show. A flight that is too short has wrong intervals: its moments of inertia are not identified."""
+    """What the logs show, as contradictions or as reservations."""
     for finding in findings:
         result = "implausible" if finding.contradicted else "successful"
-        result = "unidentifiable" if finding.name == "short_flight" else result
         yield Doubt(result, f"{finding.cause} ({finding.size})", finding.remedy, dict.fromkeys(finding.quantities))
 
 
