@@ -82,18 +82,14 @@ def _judge_vehicle(case: Case, fit: Fit, sample_times: Sequence[SampleTime], pro
         # Vehicles hardly yaw. The other axes do not need it.
         body = RigidBody({name: row for name, row in body.constants.items() if name != "Iz"})
         trusted = {name: row for name, row in table.items() if name not in _OF_YAW}
-        table |= {
-            name: msgspec.structs.replace(table[name], note="not identified: the disturbance is larger")
-            for name in _OF_YAW
-            if name in table
-        }
+        said = "not identified: the disturbance is larger"
+        table |= {name: msgspec.structs.replace(table[name], note=said) for name in _OF_YAW if name in table}
         still = (*still, *({"yaw"} - {*still}))
     own = fit.problem.unknowns
     widths = dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))
     # What is known of a held one is its bracket.
     held = {name: (row.value, widths[name]) for name, row in fit.held.items()} | fit.negative
-    follow = partial(consequences, fit, body.constants, model.quantities)
-    pair = neighbours(sample_times, step)
+    follow, pair = partial(consequences, fit, body.constants, model.quantities), neighbours(sample_times, step)
     inertias = dict(zip(AXES.values(), INVERSE, strict=True))
     doubts = [
         *doubts_of_log(case.doubts),

@@ -110,7 +110,7 @@ def doubts_of_flight(
         yield Doubt("implausible", cause, "check `rotor_spins`, and which rotor is which", {RIGID_BODY: None})
     if body.consistency_p is not None and body.consistency_p < _CONSISTENT:
         cause = f"the alphas are not those of one rigid body (p = {body.consistency_p:.1g})"
-        yield Doubt("implausible", cause, f"{gyro}; or use another --model", {RIGID_BODY: None})
+        yield Doubt("implausible", cause, f"{gyro}; or use another `subject`", {RIGID_BODY: None})
     elif body.is_rigid_body is False:
         cause = "one moment of inertia exceeds the sum of the other two, which no rigid body allows"
         yield Doubt("implausible", cause, "check `rotor_positions` and `drag_coefficient`", {RIGID_BODY: None})
