@@ -16,9 +16,7 @@ class RESULTS(eqx.Enumeration):
 
     successful = ""
     at_bound = "a parameter reached the limit of the search around its bracket: widen the bracket or correct the model"
-    unidentifiable = (
-        "the flight contains less information about a parameter than its bracket: fly with more excitation, or hold it"
-    )
+    unidentifiable = "the flight contains less information about a parameter than its bracket: fly with more excitation"
     nonfinite_trajectory = "the simulated trajectory or its input is not finite: check the input and the bracket"
     attitude_singularity = "the pitch angle passed +-90 degrees, where Euler angles are singular: fly no loops"
     bracket_invalid = "a bracket is not finite, or its lower end is not below its upper end: correct the bracket"
@@ -34,7 +32,10 @@ class RESULTS(eqx.Enumeration):
         "the fit predicts measurements that were not fitted no better than constant rates: fly with more excitation, "
         "or correct the airframe"
     )
-    max_sweeps = "the search did not converge within the largest number of sweeps: allow more sweeps"
+    max_sweeps = (
+        "the search did not converge within the largest number of sweeps: fly with more excitation, or use another "
+        "estimator"
+    )
 
 
 NAMES = (

@@ -20,6 +20,7 @@ from jaxos4.identification.results import (
     SampleTime,
     Validation,
 )
+from jaxos4.identification.verdict import Verdict
 
 INERTIA = "1/(kg m^2)"
 KNOWN = ParameterEstimate(57712.3, 512.0, 130.0, (56708.8, 58715.8), INERTIA, "", 431.0)
@@ -34,6 +35,10 @@ COMMON |= dict.fromkeys(("covariance", "estimate"))
 COMMON |= {"problem": SimpleNamespace(model=SimpleNamespace(airframe=CRAZYFLIE))}
 VERSIONS = {"airframe": "os4", "version": "0", "jax": "0", "device": "cpu", "precision": "float64"}
 
+VERDICTS = {
+    "Ix": Verdict("identified", "1.73e-05 +- 2.9e-07 kg m^2 (95 %), if arms and mass are right"),
+    "Iz": Verdict("not identified", "", ("the flights say less about alpha8 than its bracket; fly more yaw",)),
+}
 SAMPLE_TIMES = tuple(
     SampleTime(step, {"Ix": Constant(ix, 2e-7, "kg m^2"), "Iy": Constant(1.8e-5, 3e-7, "kg m^2")}, 0.1, samples=1000)
     for step, ix in ((0.004, 1.64e-5), (0.008, 1.78e-5), (0.016, 1.8e-5))
@@ -71,6 +76,7 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         "is_vehicle": True,
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN},
         "rigid_body": RigidBody(NOTED, 0.21, True),
+        "verdicts": VERDICTS,
         "held": {"alpha1": HeldParameter(-0.8125, "1", "not identifiable")},
         "noise": {"p": 0.41},
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),

@@ -25,7 +25,8 @@ from synthetic_identification import (
 from test_report import stands_alone, words
 
 from jaxos4.analysis.inertia import CenterOfMass
-from jaxos4.identification.results import Disturbance, Doubt, HeldParameter, ParameterEstimate, RigidBody, Validation
+from jaxos4.identification.results import Disturbance, HeldParameter, ParameterEstimate, RigidBody, Validation
+from jaxos4.identification.verdict import Verdict
 from jaxos4.report import print_identification, write_flight_page
 from jaxos4.report.identification_page import (
     frequency_responses,
@@ -60,7 +61,8 @@ def says(text, *parts):
 
 def test_the_page_says_what_was_found(tmp_path):
     text, shown = written(tmp_path / "flight.html")
-    assert text.index("Nothing speaks against this estimate") < text.index("<main>")
+    assert text.index("What was asked is identified: Ix") < text.index("<main>")
+    says(shown, "identified: Ix 1.73e-05 +- 2.9e-07 kg m^2 (95 %), if", "Iz: the flights say less about alpha8 than")
     says(
         shown,
         *("ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230", "57710 56710 to 58720 130"),
@@ -130,15 +132,15 @@ def test_the_vehicle_is_drawn_as_it_was_identified(tmp_path):
     assert [text.get_text().strip() for text in bars.texts] == ["not identified"] * 2
 
 
-DOUBTS = (Doubt("not_physical", "Ix is negative", "check the arms"),)
+WRONG = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, "Nothing speaks against this estimate: Ix 1.73e-5 ± 2.9e-7 kg m² (95 %); Iy is not identified; Iz is not"),
-        ({"result": "implausible", "doubts": DOUBTS}, "Not to be trusted: Ix is negative; check the arms."),
-        ({"result": "max_sweeps"}, "Not to be trusted: the search did not converge"),
+        ({}, "What was asked is identified: Ix."),
+        ({"result": "implausible", "verdicts": WRONG}, "Not to be trusted: Ix is contradicted."),
+        ({"result": "max_sweeps", "verdicts": {}}, "Not to be trusted: the search did not converge"),
         ({"result": "nonfinite_trajectory"}, "There is no answer: "),
     ],
 )
@@ -213,7 +215,7 @@ def test_the_text_of_a_flight_warns_and_is_short_without_an_answer(changes, said
     says(printed(identified_flight(**changes)), said)
     assert "--window" not in printed(identified_flight(**DIVERGED, estimator="rls"))
     assert printed(identified_flight(result="bracket_invalid")) == ""
-    assert printed(identified_vehicle(**DIVERGED)) == "note: t is not uniform"
+    assert printed(identified_vehicle(verdicts={}, **DIVERGED)) == "note: t is not uniform"
 
 
 def test_the_text_of_a_vehicle(tmp_path):
@@ -225,10 +227,10 @@ def test_the_text_of_a_vehicle(tmp_path):
         "flight model (offset, damping), 32 s, a sample every 4 ms: successful, 812 rollouts",
     )
     gusts = {"p": Disturbance(1.2, "rad/s^2", 0.1, 0.02, 0.01)}
-    doubtful = printed(identified_vehicle(disturbances=gusts, widened={"alpha3": 1.7}, doubts=DOUBTS, skill=None))
+    doubtful = printed(identified_vehicle(disturbances=gusts, widened={"alpha3": 1.7}, verdicts=WRONG, skill=None))
     says(
         doubtful,
-        *("not to be trusted because Ix is negative; check the arms.", "by the factor: alpha3 1.7."),
+        *("contradicted: Ix. Ix: Ix is negative; check the arms.", "by the factor: alpha3 1.7."),
         *("their correlation time: p 1.2 rad/s^2 over 0.1 s.", "white noise of the sensors [rad/s; m/s^2]: p 0.02."),
     )
     assert "Predictions" not in doubtful

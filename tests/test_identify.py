@@ -143,7 +143,7 @@ def test_no_window_reaches_from_one_stretch_into_the_next(vehicle, steps):
 
 COMMON = (
     *("estimator", "model", "result", "rollouts", "cost", "seconds", "parameters", "provenance", "covariance"),
-    *("constants", "airframe"),
+    *("constants", "airframe", "verdicts", "doubts"),
 )
 SETTINGS = ("airframe", "sample_time", "notes", "version", "jax", "device", "precision")
 # The keys of the JSON, of its provenance, and of a parameter, by the kind of identification.
@@ -154,7 +154,7 @@ KEYS = {
         {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit"},
     ),
     "vehicle": (
-        {*COMMON, "held", "noise", "doubts", "disturbances", "widened", "skill", "sample_times"},
+        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times"},
         {*SETTINGS, "flights", "validate", "terms", "fitted_seconds", "tested_seconds"},
         {"estimate", "std", "bound", "ci95", "unit", "note"},
     ),
@@ -218,7 +218,7 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     chosen = "flight1.csv has commands, not rotor speeds: taken as a real vehicle's (--model flight)"
     assert report["provenance"]["notes"][0] == chosen
     constants = jaxos4.load_airframe("airframe.toml")
-    recordings = [read_recording(vehicle / f"flight{i}.csv", constants) for i in (1, 2)]
+    recordings = [read_recording(f"flight{i}.csv", constants) for i in (1, 2)]
     settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=0.01)
     found = jaxos4.identify(recordings, constants, settings=settings)
     assert_same_as_written(found, tmp_path / "found.json")

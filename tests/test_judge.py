@@ -11,8 +11,8 @@ from scipy.special import chdtri
 import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.identification.answers import overwhelmed
+from jaxos4.identification.doubts import doubts_of, vibration
 from jaxos4.identification.fit import Fit, disagreement, parts_of
-from jaxos4.identification.judge import doubts_of, vibration
 from jaxos4.identification.results import (
     Constant,
     Disturbance,
@@ -135,15 +135,17 @@ def test_a_gyro_that_vibrates_is_named():
 
 
 @pytest.mark.parametrize(("rates", "axes"), [({"p": 0.0}, "roll"), ({"q": -1.0, "r": -0.1}, "pitch and yaw")])
-def test_a_fit_without_skill_is_not_believed(rates, axes):
+def test_predictions_of_a_fit_without_skill_are_not_believed(rates, axes):
+    """Skill 0.1 s ahead is a reservation. Without any, predictions are refused; if clearly so, inertias too."""
     (doubt,) = doubts(skill=skill(**rates))
-    assert doubt.result == "no_skill"
+    assert (doubt.result, doubt.moves) == ("successful", {"predictions": None})
     assert axes in str(doubt)
     assert doubts(skill=skill(**dict.fromkeys(rates))) == ()  # not measured
     # The held-out parts are too short for 0.25 s.
     short = RateSkill([-0.5, None, None], *[[None] * 3] * 4)
     (doubt,) = doubts(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=short, q=short, r=short))
     assert "roll and pitch and yaw no better than constant rates (skill p -0.5 at 0.1 s, " in str(doubt)
+    assert (doubt.result, set(doubt.moves)) == ("no_skill", {"predictions", "Ix", "Iy", "Iz"})
     # Each rate has its own horizon.
     (doubt,) = doubts(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=skill().p, q=short, r=skill().r))
     assert "predicts pitch no better than constant rates (skill q -0.5 at 0.1 s)" in str(doubt)
@@ -154,7 +156,7 @@ def test_a_fit_without_skill_is_not_believed(rates, axes):
     assert (doubt.result, "`validate`" in doubt.remedy) == ("no_skill", True)
     first, second = doubts({"rotor_lag": (0.002, 0.001)}, skill=skill(p=-1.0), log_step=0.01)
     assert "rotor_lag = 0.002 s is shorter than a sample of the log, 0.01 s" in first.cause
-    assert second.result == "no_skill"
+    assert "predictions" in second.moves
 
 
 def test_a_disturbance_larger_than_the_control_is_named():
@@ -241,6 +243,6 @@ def test_a_recorded_flight_does_not_end_successful_without_skill_or_against_phys
     found = jaxos4.identify(read_recording(shared_flights / "arpl_crazyflie_yaw_b.csv", vehicle), vehicle)
     # What was held out is too short for predictions of 0.25 s.
     skills = [getattr(found.skill, rate).skill[0] for rate in "pqr"] if found.skill is not None else []
-    assert not (found.successful and any(skill is not None and skill <= 0 for skill in skills))
-    assert found.result == "no_skill"
-    assert found.successful == (not found.doubts) or found.result in ("at_bound", "max_sweeps")
+    assert any(skill is not None and skill <= 0 for skill in skills)
+    assert found.result == "unidentifiable"
+    assert {found.verdicts[name].status for name in ("Ix", "Iy", "predictions")} == {"not identified"}

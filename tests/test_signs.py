@@ -72,9 +72,12 @@ def test_wrong_signs_are_found_and_right_ones_never(seed, gust, lag):
 def test_a_fit_is_refused_with_the_remedy_unless_the_vehicle_does_not_turn():
     recording = flown(CRAZYFLIE, 0)
     # Opposite yaw is only doubted.
-    ((cause, remedy),) = prepare([recording], turned(CRAZYFLIE, "rotor_spins"))[0].doubts
-    assert cause.startswith("a.bbl: yaw answers the rotors with the opposite sign (torque and angular acceleration ")
-    assert "change all four signs" in remedy
+    (found,) = prepare([recording], turned(CRAZYFLIE, "rotor_spins"))[0].doubts
+    assert str(found).startswith(
+        "a.bbl: yaw answers the rotors with the opposite sign (torque and angular acceleration "
+    )
+    assert "change all four signs" in found.remedy
+    assert (found.quantities, found.contradicted) == (("Iz",), True)
     with pytest.raises(InputError, match=r"a.bbl: roll and pitch answer .* in another order .* correct one of them"):
         prepare([recording], turned(CRAZYFLIE, "rotor_positions"))
     prepared, *_ = prepare([recording], CRAZYFLIE)

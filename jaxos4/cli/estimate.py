@@ -113,7 +113,7 @@ def _subject(
 
 
 def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "Identification":
-    """The identification with the command in its provenance, all notes and doubts in the words of the command line."""
+    """The identification with its command; notes, doubts and verdicts in the words of the command line."""
     import msgspec
 
     provenance = msgspec.structs.replace(
@@ -123,7 +123,11 @@ def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "
         command=printable(shlex.join(["jaxos4", *sys.argv[1:]])),
     )
     doubts = (msgspec.structs.replace(doubt, remedy=in_options(doubt.remedy)) for doubt in found.doubts)
-    return msgspec.structs.replace(found, doubts=tuple(doubts), provenance=provenance)
+    verdicts = {
+        name: msgspec.structs.replace(verdict, reasons=tuple(map(in_options, verdict.reasons)))
+        for name, verdict in found.verdicts.items()
+    }
+    return msgspec.structs.replace(found, doubts=tuple(doubts), verdicts=verdicts, provenance=provenance)
 
 
 def _publish(found: "Identification", out: Path | None, report: Path | None, *, title: str) -> None:

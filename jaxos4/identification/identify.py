@@ -15,7 +15,6 @@ from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
 from ..recording.pieces import Recording, as_recordings
-from ..results import result_names
 from .answers import channel_fits
 from .fit import Fit, fit_case
 from .judge import judge
@@ -27,8 +26,6 @@ from .sample_time import answer_of, fit_at_sample_times
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
 
 Flights = Flight | Recording | Sequence[Flight | Recording]
-# Results with an answer: a doubt says more than they do.
-_ANSWERS = ("successful", "at_bound", "max_sweeps")
 
 
 def identify(
@@ -117,13 +114,12 @@ def describe(
     case: Case, fit: Fit, judged: dict[str, Any], sample_times: tuple[SampleTime, ...], seconds: float
 ) -> Identification:
     """Everything about an answer, in the fields that pages and files show. `judged`: see `judge`."""
-    result, free = str(result_names(fit.estimate.result)), fit.free
+    free = fit.free
     covariance, sigma = np.asarray(fit.estimate.covariance)[np.ix_(free, free)], np.asarray(fit.problem.sigma)
-    notes, doubts = [*case.provenance.notes, *judged.pop("notes", ())], judged.get("doubts")
+    notes = [*case.provenance.notes, *judged.pop("notes", ())]
     return Identification(
         estimator=case.name,
         model=case.model,
-        result=doubts[0].result if doubts and result in _ANSWERS else result,
         rollouts=fit.rollouts,
         cost=finite_or_none(fit.estimate.cost),
         seconds=seconds,

@@ -18,6 +18,7 @@ from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..networks.file import load_network
+from ..recording.checks import KINEMATIC, Finding, self_checks
 from ..recording.pieces import Recording
 from ..shooting import InnovationsProblem, ShootingProblem
 from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, network_for, network_provenance
@@ -100,7 +101,7 @@ class Case(NamedTuple):
     - `recording`: the number of the recording of each sample.
     - `provenance`: data, settings and versions.
     - `validate`: the name of the other recording that `held_out` is; empty: it is a part of the fitted ones.
-    - `doubts`: cause and remedy of each doubt about the logs. `log_step`: the longest sample of the logs [s].
+    - `doubts`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
     """
 
     problem: ShootingProblem | InnovationsProblem
@@ -112,7 +113,7 @@ class Case(NamedTuple):
     recording: np.ndarray
     provenance: Provenance
     validate: str = ""
-    doubts: tuple[tuple[str, str], ...] = ()
+    doubts: tuple[Finding, ...] = ()
     log_step: float = 0.0
 
     @property
@@ -191,7 +192,8 @@ def prepare_flight(
         **versions(problem),
     )
     one = np.zeros(samples, int)
-    return Case(problem, problem, method, name, subject, other, one, provenance, name_of_other)
+    doubts = self_checks(recording, model.airframe, checks=KINEMATIC)
+    return Case(problem, problem, method, name, subject, other, one, provenance, name_of_other, doubts)
 
 
 def _restricted(problem: ShootingProblem, channels: str, name: str, recording: Recording) -> ShootingProblem:

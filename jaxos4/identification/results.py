@@ -13,6 +13,7 @@ from ..errors import InputError, named, shortened
 from ..estimate import Estimate
 from ..results import NAMES, result_names
 from ..shooting import ShootingProblem
+from .verdict import Doubt, Verdict
 
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
 
@@ -148,17 +149,6 @@ class SampleTime(msgspec.Struct, frozen=True):
     samples: int
 
 
-class Doubt(msgspec.Struct, frozen=True):
-    """A reason not to trust an estimate. `result`: the name of the result code that it leads to."""
-
-    result: str
-    cause: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.cause}; {self.remedy}"
-
-
 class PredictionSkill(msgspec.Struct, frozen=True):
     """Skill of `starts` predictions of measurements that were not fitted, by horizon [s]."""
 
@@ -213,6 +203,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `seconds`: computing time [s].
     - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
+    - `verdicts`: for each quantity, whether it can be trusted, and why not. Empty without an answer.
+    - `doubts`: what speaks against the estimate, and how far it would move each quantity.
     - `provenance`: inputs, settings, versions, and notes about the data.
     - `covariance`: of `parameters`; `None` without an answer.
     - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the noise levels
@@ -227,7 +219,6 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     - `held`: parameters that were not estimated.
     - `noise`: standard deviation of the sensors' noise by channel.
-    - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
     - `disturbances`: the accelerations that the model lacks, by channel.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
@@ -244,6 +235,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     seconds: float
     parameters: dict[str, ParameterEstimate]
     rigid_body: RigidBody = RigidBody()
+    verdicts: dict[str, Verdict] = {}
+    doubts: tuple[Doubt, ...] = ()
     provenance: Provenance
     covariance: list[list[float]] | None
     estimate: Estimate
@@ -253,7 +246,6 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     validation: Validation | None = None
     held: dict[str, HeldParameter] = {}
     noise: dict[str, float] = {}
-    doubts: tuple[Doubt, ...] = ()
     disturbances: dict[str, Disturbance] = {}
     widened: dict[str, float] = {}
     sample_times: tuple[SampleTime, ...] = ()
@@ -263,7 +255,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def successful(self) -> bool:
-        """Whether the estimate can be trusted."""
+        """Whether what was asked can be trusted: Ix and Iy of a vehicle; of an OS4, all that was identified."""
         return self.result == "successful"
 
     @property
@@ -294,7 +286,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 # Fields that are written of one kind of identification only.
 _OF_FLIGHTS = {"fit", "validation"}
-_OF_VEHICLES = {"held", "noise", "doubts", "disturbances", "widened", "skill", "sample_times"}
+_OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}
 
 
 class ResultFile(msgspec.Struct, frozen=True, kw_only=True):

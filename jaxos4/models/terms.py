@@ -55,6 +55,8 @@ class Term:
     - `needs`: what the log or the airframe must have, by the constants at the top of this file.
     - `by_default`: takes what is available; returns whether an estimate uses the term if the user names none.
     - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
+    - `quantity`: what its parameters describe together, if that has a verdict of its own; see
+      `Identification.verdicts`.
 
     The other fields are the contributions, at least one. Each is a function of the quantity without the term, and of
     the values of the term's parameters by name. It returns the quantity with the term. They act in this order:
@@ -76,6 +78,7 @@ class Term:
     needs: frozenset[str] = frozenset()
     by_default: Callable[[frozenset[str]], bool] = lambda available: True
     force_axes: tuple[int, ...] = ()
+    quantity: str = ""
     command: Callable[[Commands, Values, Grid], Commands] | None = None
     speed: Callable[[RotorSpeeds, Values, Part, Airframe], Speeds] | None = None
     angular_acceleration: Callable[[Rates, Values, Rates, Forcing], Rates] | None = None
@@ -209,6 +212,7 @@ TERMS: dict[str, Term] = {
         # The bracket is an offset of 10 % of the arm.
         tuple(Parameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(AXES[:2])),
         angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - GRAVITY,) * 2),
+        quantity="center of mass",
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
@@ -217,6 +221,7 @@ TERMS: dict[str, Term] = {
             for x, y in zip(AXES, _DAMPING, strict=True)
         ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
+        quantity="damping",
     ),
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
@@ -249,18 +254,21 @@ TERMS: dict[str, Term] = {
         # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),
         speed=_drive,
+        quantity="motors",
     ),
     "lag": Term(
         "rotors follow their commands as first-order systems: rotor_lag [s]; if no load can be found",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
         speed=lambda omega, values, part, airframe: driven(omega, Motor(values["rotor_lag"]), part),
+        quantity="motors",
     ),
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
         # A delay of the motors, and an offset between the clocks of motors and gyro, of either sign.
         (Parameter("rotor_delay", "s", 0.03),),
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
+        quantity="motors",
     ),
     "reaction": Term(
         "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
@@ -281,6 +289,7 @@ TERMS: dict[str, Term] = {
         force_axes=(2,),
         specific_force=lambda force, values, forcing: (force[0], force[1], values["thrust_gain"] * force[2]),
         accelerometer=_add_force_bias,
+        quantity="thrust",
     ),
     "inflow": Term(
         "thrust falls with the velocity along z, which changes the inflow of the rotors: z_drag [1/s]",
@@ -288,6 +297,7 @@ TERMS: dict[str, Term] = {
         (Parameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
         needs=frozenset({VELOCITY, VERTICAL_FORCE}),
         specific_force=_add_drag,
+        quantity="drag",
     ),
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
@@ -295,6 +305,7 @@ TERMS: dict[str, Term] = {
         needs=frozenset({VELOCITY, MEASURED_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
         force_axes=(0, 1),
         specific_force=_add_drag,
+        quantity="drag",
     ),
     "gyro_bias": Term(
         "rates are measured with an offset, of each recording: p_bias, q_bias, r_bias [rad/s]",

@@ -97,6 +97,15 @@ class FlightModel(AbstractModel):
         return (*self._rigid_body.parameters, *(parameter for *_, parameter in self._table))
 
     @property
+    def quantities(self) -> dict[str, list[str]]:
+        """What the terms describe together, each with its parameters, without biases; see `Term.quantity`."""
+        found: dict[str, list[str]] = {}
+        for term, _, parameter in self._table:
+            if term.quantity and parameter.force_axis is None:
+                found.setdefault(term.quantity, []).append(parameter.name)
+        return found
+
+    @property
     def alpha(self) -> Parameters:
         """alpha_1..8 of the airframe, then the centres of the terms' parameters."""
         return jnp.concatenate([self._rigid_body.alpha, self._of_terms(lambda parameter: parameter.center)])

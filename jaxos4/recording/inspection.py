@@ -99,7 +99,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         measured=_measured(recording),
         findings=findings,
         checks=checks,
-        notes=(*recording.notes, *filter(None, ("; ".join(doubt or ()), clock))),
+        notes=(*recording.notes, *filter(None, (doubt and "{} ({}); {}".format(*doubt), clock))),
         parts=tuple(parts),
     )
 

@@ -115,13 +115,13 @@ def refused_note(axes: Mapping[str, float]) -> str:
     )
 
 
-def yaw_doubt(axes: Mapping[str, float]) -> tuple[str, str] | None:
-    """Cause and remedy, if the vehicle seems to yaw against the torque."""
+def yaw_doubt(axes: Mapping[str, float]) -> tuple[str, str, str] | None:
+    """Cause, size and remedy, if the vehicle seems to yaw against the torque."""
     if "yaw" not in axes:
         return None
     return (
-        "yaw answers the rotors with the opposite sign (torque and angular acceleration correlate by "
-        f"{-axes['yaw']:.2f})",
+        "yaw answers the rotors with the opposite sign",
+        f"torque and angular acceleration correlate by {-axes['yaw']:.2f}",
         "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
         "all four signs",
     )

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -12,8 +13,8 @@ from ..errors import InputError, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
-from .checks import plausible, self_checks
-from .checks.finding import INERTIAS
+from .checks import different_vehicles, plausible, self_checks
+from .checks.finding import INERTIAS, Finding
 from .motion import opposite_axes, refused_note, white_noise, yaw_doubt
 from .pieces import Recording, Stretch, averaged, cut, hold_out, joined, whole_windows
 from .speed_noise import without_noise
@@ -59,7 +60,7 @@ class Prepared(NamedTuple):
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
-    - `doubts`: cause and remedy of each doubt about the logs.
+    - `doubts`: what the logs show that concerns moments of inertia.
     - `log_step`: the longest sample of the logs [s].
     """
 
@@ -73,7 +74,7 @@ class Prepared(NamedTuple):
     force_noise: Float[np.ndarray, "3"]
     seconds: tuple[float, float]
     notes: tuple[str, ...]
-    doubts: tuple[tuple[str, str], ...]
+    doubts: tuple[Finding, ...]
     log_step: float
 
     @property
@@ -110,32 +111,35 @@ def prepare(
     _check_options(begin, end, sample_time, holdout)
     notes: list[str] = []
     parts: list[tuple[int, Recording]] = []
-    doubts: list[tuple[str, str]] = []
+    doubts: list[Finding] = []
     for number, recording in enumerate(recordings):
         if any(recording.same_data(earlier) for earlier in recordings[:number]):
             raise InputError(f"{recording.name}: given twice; give each log once.")
         if np.isnan(recording.states[:, RATES]).all(axis=0).any():
             raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
         for finding in self_checks(recording, airframe):
-            about = f"{recording.name}: {finding.cause} ({finding.size})", finding.remedy
-            if finding.contradicted and {*finding.quantities} & {*INERTIAS}:
-                doubts.append(about)
+            own = msgspec.structs.replace(finding, cause=f"{recording.name}: {finding.cause}")
+            if {*own.quantities} & {*INERTIAS}:
+                doubts.append(own)
             else:
-                notes.append("; ".join(about))
+                notes.append(str(own))
         recording = plausible(recording).recording
         slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
         pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
         if slow:
             raise InputError(f"{recording.name}: {slow}.")
         if doubt := at_limit(recording, airframe):
-            doubts.append(doubt)
+            notes.append("; ".join(doubt))
         opposite = opposite_axes(pieces, airframe)
         if refused := refused_note(opposite):
             raise InputError(f"{recording.name}: {refused}.")
         if doubt := yaw_doubt(opposite):
-            doubts.append((f"{recording.name}: {doubt[0]}", doubt[1]))
+            cause, size, remedy = doubt
+            doubts.append(Finding("yaw_sign", f"{recording.name}: {cause}", size, remedy, ("Iz",), True))
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
         parts += [(number, piece) for piece in pieces]
+    if different := different_vehicles(recordings, airframe):
+        doubts.append(different)
     if len({piece.commanded for _, piece in parts}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."

@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import msgspec
@@ -18,6 +18,7 @@ from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.inertia import CenterOfMass, center_of_mass
 from ..analysis.prediction import Predictions, decisive_horizon
 from ..identification.results import Constant, Identification, SampleTime
+from ..identification.verdict import headline
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
@@ -58,6 +59,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         title=title,
         found=found,
         verdict=verdict(found),
+        headline=headline(found.verdicts, found.doubts),
         center=[f"{each.axis} {_plus_minus(1e3 * each.value, 1e3 * each.std)} mm" for each in center],
         ninety_five=NINETY_FIVE,
         rates=None if found.predictions is None else predicted_rates(found.predictions, used.sample_time, look),
@@ -75,16 +77,20 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
 
 
 def verdict(found: Identification) -> str:
-    """Whether to trust the identification, and its moments of inertia, in one sentence."""
+    """Whether to trust the identification, in one sentence. The page shows the verdicts below it."""
     if not found.has_answer:
         return f"There is no answer: {meaning(found.result)}."
-    if not found.successful:
-        return f"Not to be trusted: {found.doubts[0] if found.doubts else meaning(found.result)}."
-    every = found.rigid_body.constants
-    known = [f"{name} {_plus_minus(every[name].estimate, every[name].std)}" for name in _INERTIAS if name in every]
-    missing = [f"{name} is not identified" for name in _INERTIAS if name not in every]
-    values = [f"{', '.join(known)} kg m² (95 %)"] if known else []
-    return f"Nothing speaks against this estimate: {'; '.join(values + missing)}."
+    if found.successful:
+        return (
+            f"What was asked is identified: {_joined(name for name, each in found.verdicts.items() if each.trusted)}."
+        )
+    refused = _joined(f"{name} is {each.status}" for name, each in found.verdicts.items() if not each.trusted)
+    return f"Not to be trusted: {refused or meaning(found.result)}."
+
+
+def _joined(words: Iterable[str]) -> str:
+    *first, last = [*words] or [""]
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _plus_minus(value: float, std: float) -> str:

@@ -7,6 +7,7 @@ from rich.console import Console
 
 from ..estimators import ESTIMATORS
 from ..identification.results import COLOURED, Identification
+from ..identification.verdict import headline
 from ..results import NINETY_FIVE
 from .text import Listing
 
@@ -17,7 +18,7 @@ Section = Iterator[str | Listing]
 
 
 def print_identification(console: Console, found: Identification) -> None:
-    """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; or why there is no answer."""
+    """Prints verdicts, notes, parameters, moments of inertia and the quality of the fit; or why there is no answer."""
     of_kind = (_held, _inertias, _of_vehicle) if found.is_vehicle else (_fit, _inertias, _validation)
     for section in (_notes, _parameters, *of_kind, _summary) if found.has_answer else (_notes, _failure):
         for part in section(found):
@@ -28,7 +29,7 @@ def print_identification(console: Console, found: Identification) -> None:
 
 
 def _notes(found: Identification) -> Section:
-    yield from (f"not to be trusted because {doubt}." for doubt in found.doubts)
+    yield from headline(found.verdicts, found.doubts)
     yield from (f"note: {note}" for note in found.provenance.notes)
     if found.motor_clock:
         yield f"note: {found.motor_clock} (rotor_delay)"

@@ -1,6 +1,6 @@
 """The table of checks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -33,9 +33,16 @@ CHECKS: tuple[Check, ...] = (
 )
 """Each check looks for one fault. A new check is one function, and one line here."""
 
+KINEMATIC: tuple[Check, ...] = (wrong_scale, wrong_axes)
+"""The checks that hold for a flight without a controller too, which may turn far and drift away."""
+
 
 def self_checks(
-    recording: Recording, airframe: Airframe | None = None, *, limits: Limits = LIMITS
+    recording: Recording,
+    airframe: Airframe | None = None,
+    *,
+    limits: Limits = LIMITS,
+    checks: Sequence[Check] = CHECKS,
 ) -> tuple[Finding, ...]:
     """Check a log against itself, before anything is fitted.
 
@@ -44,10 +51,11 @@ def self_checks(
     - `recording`: as it was logged, of one vehicle.
     - `airframe`: without it, gyro and accelerometer are not compared with the rotors.
     - `limits`: what counts as a finding.
+    - `checks`: of the table.
 
     **Returns:** the findings; those that contradict quantities come first.
     """
     evidence = Evidence(recording, airframe, limits)
     with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
-        found = [finding for check in CHECKS if (finding := check(evidence)) is not None]
+        found = [finding for check in checks if (finding := check(evidence)) is not None]
     return tuple(sorted(found, key=lambda finding: not finding.contradicted))

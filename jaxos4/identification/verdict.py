@@ -1,0 +1,170 @@
+"""A verdict for each quantity: whether it can be trusted, and what speaks against it.
+
+A doubt counts against a quantity by how far the quantity would move if the doubt were true.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from ..recording.checks.finding import INERTIAS
+
+IDENTIFIED = "identified"
+RESERVED = "identified with a reservation"
+MISSING = "not identified"
+CONTRADICTED = "contradicted"
+STATUSES = (IDENTIFIED, RESERVED, MISSING, CONTRADICTED)
+"""From the best to the worst."""
+
+PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
+
+
+class Move(msgspec.Struct, frozen=True):
+    """How far a quantity would move if a doubt were true.
+
+    - `share`: of the quantity. Parameters can be 0: theirs is a share of the half-width of their bracket.
+    - `deviations`: the same in standard deviations of the estimate.
+    """
+
+    share: float
+    deviations: float
+
+
+class Doubt(msgspec.Struct, frozen=True):
+    """What speaks against an estimate.
+
+    - `result`: the name of the result code to which it leads if it refuses the moments of inertia; `"successful"`: it
+      only makes a reservation.
+    - `cause`, `remedy`: what is wrong, and what to do.
+    - `moves`: the quantities that it concerns, each with how far it would move if the doubt were true. `None`: nothing
+      says how far.
+    """
+
+    result: str
+    cause: str
+    remedy: str
+    moves: dict[str, Move | None] = {}
+
+    def __str__(self) -> str:
+        return f"{self.cause}; {self.remedy}"
+
+
+class Tolerance(msgspec.Struct, frozen=True):
+    """How far a quantity may move, and how well it must be known.
+
+    - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, by more than one of them
+      makes a reservation, by less is a note. Errors of discretisation reach 3 %, and an interval allows for one
+      standard deviation.
+    - `vague`, `unknown`: half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a
+      reservation, or is not identified. Repeated flights by radio agree with half-widths of up to a quarter.
+    - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
+      of it, these are not identified. Segments last 1.25 s, and the jackknife compares at least four parts.
+    - `prior`: the share of the information about a parameter that its bracket may give without a reservation.
+    """
+
+    share: float = 0.05
+    deviations: float = 1.0
+    vague: float = 0.2
+    unknown: float = 0.4
+    seconds: float = 10.0
+    prior: float = 0.25
+
+
+TOLERANCE = Tolerance()
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """Whether a quantity can be trusted.
+
+    - `status`: `identified`, `identified with a reservation`, `not identified` or `contradicted`.
+    - `value`: of the quantity, with its 95 % interval and its conditions, in words; empty if parameters show it.
+    - `reasons`: the reservations, or the causes with their remedies. Empty if the quantity is `identified`.
+    """
+
+    status: str
+    value: str = ""
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the quantity is identified, with or without a reservation."""
+        return self.status in (IDENTIFIED, RESERVED)
+
+
+class Quantity(NamedTuple):
+    """A quantity before it is judged.
+
+    - `value`: see `Verdict`. `spread`: half of its 95 % interval, as a share of it; 0 if it can be 0.
+    - `missing`: why there is no estimate, and what to do; empty if there is one.
+    - `reservations`: what is to be known beside the doubts.
+    """
+
+    value: str = ""
+    spread: float = 0.0
+    missing: str = ""
+    reservations: tuple[str, ...] = ()
+
+
+def weight(doubt: Doubt, name: str, tolerance: Tolerance = TOLERANCE) -> str:
+    """The status that a doubt leaves to a quantity that has this name."""
+    if name not in doubt.moves:
+        return IDENTIFIED
+    move = doubt.moves[name]
+    if move is None:
+        return {"successful": RESERVED, "implausible": CONTRADICTED}.get(doubt.result, MISSING)
+    far = (move.share > tolerance.share) + (move.deviations > tolerance.deviations)
+    return (IDENTIFIED, RESERVED, RESERVED if doubt.result == "successful" else CONTRADICTED)[far]
+
+
+def verdict_of(name: str, quantity: Quantity, doubts: Sequence[Doubt], tolerance: Tolerance = TOLERANCE) -> Verdict:
+    """The verdict for a quantity. `doubts`: all of the identification."""
+    causes: dict[str, list[str]] = {status: [] for status in STATUSES}
+    for doubt in doubts:
+        causes[weight(doubt, name, tolerance)].append(_reason(doubt, name))
+    causes[RESERVED] += quantity.reservations
+    if quantity.missing and not causes[MISSING]:
+        causes[MISSING].append(quantity.missing)
+    known = f"it is known to {quantity.spread:.0%} only; fly longer, or with more motion"
+    if quantity.spread > tolerance.unknown:
+        causes[MISSING].append(known)
+    elif quantity.spread > tolerance.vague:
+        causes[RESERVED].append(known)
+    status = next((each for each in STATUSES[:0:-1] if causes[each]), IDENTIFIED)
+    return Verdict(status, quantity.value, tuple(causes[status]) if status != IDENTIFIED else ())
+
+
+def _reason(doubt: Doubt, name: str) -> str:
+    """The doubt in words, with how far it moves this quantity, or the inertias if it is this quantity's own."""
+    if (move := doubt.moves.get(name)) is not None:
+        return f"{doubt.cause} (this would move it by {100 * move.share:.2g} %)"
+    moves = {each: doubt.moves.get(each) for each in INERTIAS}
+    sizes = [f"{each} by {100 * move.share:.2g} %" for each, move in moves.items() if move is not None]
+    return f"{doubt} (this would move {', '.join(sizes)})" if sizes else str(doubt)
+
+
+def headline(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
+    """The quantities by their status, then each reason with the quantities that it concerns, then mere notes."""
+    lines, reasons = [], {}
+    for status in STATUSES:
+        shown = {name: verdict for name, verdict in verdicts.items() if verdict.status == status}
+        said = [f"{name} {verdict.value}" if verdict.trusted else name for name, verdict in shown.items()]
+        lines += [f"{status}: {'; '.join(map(str.strip, said))}."] * bool(said)
+        for name, verdict in shown.items():
+            for reason in verdict.reasons:
+                reasons.setdefault(reason, []).append(name)
+    lines += [f"{', '.join(names)}: {reason}." for reason, names in reasons.items()]
+    notes = [doubt for doubt in doubts if all(weight(doubt, name) == IDENTIFIED for name in verdicts)]
+    return [*lines, *(f"note: {doubt}. It moves nothing." for doubt in notes if verdicts)]
+
+
+def outcome(search: str, required: Sequence[str], verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> str:
+    """The name of the result code: `"successful"` if all required quantities can be trusted.
+
+    Otherwise that of the first doubt that refuses one of them; `search`, of the search, if it has no answer.
+    """
+    refused = [name for name in required if not verdicts[name].trusted]
+    if not refused:
+        return "successful"
+    decided = (x.result for x in doubts for name in refused if weight(x, name) in (MISSING, CONTRADICTED))
+    return next(decided, search if search != "successful" else "unidentifiable")

@@ -1,0 +1,215 @@
+"""A verdict for each quantity: a doubt counts by how far it would move the quantity."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+import pytest
+from helpers import CRAZYFLIE, standard_flight
+
+import jaxos4
+from jaxos4.airframe import OS4
+from jaxos4.closed_loop import fly_standard
+from jaxos4.flight import ANGLES, RATES
+from jaxos4.identification.consequences import consequences
+from jaxos4.identification.doubts import doubts_of, doubts_of_log, few_parts
+from jaxos4.identification.fit import fit_case
+from jaxos4.identification.identify import describe
+from jaxos4.identification.judge import judge
+from jaxos4.identification.prepare import VehicleSettings
+from jaxos4.identification.results import Constant, ParameterEstimate
+from jaxos4.identification.vehicle import prepare_vehicle
+from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, headline, outcome, verdict_of
+from jaxos4.models.os4 import CorrectedOS4
+from jaxos4.recording import Recording
+from jaxos4.recording.pieces import cut
+from jaxos4.recording.preparation import prepare
+
+IDENTIFIED, RESERVED = "identified", "identified with a reservation"
+MISSING, CONTRADICTED = "not identified", "contradicted"
+
+
+def flown(airframe=CRAZYFLIE, *, duration=20.0, seed=0, name="flight.csv", **loop):
+    settings = {"gust": 2.0, "logged": "speeds"} | loop
+    return Recording.of(fly_standard(jaxos4.ClosedLoop(airframe, **settings), duration=duration, seed=seed), name)
+
+
+@pytest.mark.parametrize(
+    ("move", "result", "status"),
+    [
+        (Move(0.04, 0.9), "implausible", IDENTIFIED),
+        (Move(0.04, 3.0), "implausible", RESERVED),
+        (Move(0.3, 0.9), "implausible", RESERVED),
+        (Move(0.06, 1.1), "implausible", CONTRADICTED),
+        (None, "implausible", CONTRADICTED),
+        (None, "no_skill", MISSING),
+        (None, "successful", RESERVED),
+    ],
+)
+def test_a_doubt_counts_by_how_far_it_moves_a_quantity(move, result, status):
+    doubt = Doubt(result, "the damping is impossible", "log faster", {"Ix": move})
+    found = verdict_of("Ix", Quantity("1 kg m^2"), [doubt])
+    assert found.status == status
+    assert found.trusted == (status in (IDENTIFIED, RESERVED))
+    assert [doubt.cause in reason for reason in found.reasons] == [True] * (status != IDENTIFIED)
+    assert verdict_of("Iy", Quantity(), [doubt]).status == IDENTIFIED
+    # A note stands in the headline, and says that it is no more.
+    said = headline({"Ix": found}, [doubt])
+    assert any("moves nothing" in line for line in said) == (status == IDENTIFIED)
+    assert any("moves nothing" in line for line in said) or any(doubt.cause in line for line in said)
+
+
+def test_a_quantity_that_is_hardly_known_is_not_identified():
+    statuses = [verdict_of("Ix", Quantity(spread=spread), []).status for spread in (0.1, 0.3, 0.5)]
+    assert statuses == [IDENTIFIED, RESERVED, MISSING]
+    strict = Tolerance(unknown=0.05)
+    assert verdict_of("Ix", Quantity(spread=0.1), [], strict).status == MISSING
+    missing = verdict_of("Iz", Quantity(missing="it hardly yaws"), [])
+    assert (missing.status, missing.reasons) == (MISSING, ("it hardly yaws",))
+
+
+def test_a_flight_with_too_few_parts_identifies_no_inertia():
+    for seconds, status in ((20.0, IDENTIFIED), (7.0, RESERVED), (4.0, MISSING)):
+        found = verdict_of("Ix", Quantity(), [*few_parts(seconds)])
+        assert found.status == status
+        assert all(f"only {seconds:.1f} s" in reason for reason in found.reasons)
+
+
+def test_the_result_is_that_of_what_was_asked():
+    doubts = [Doubt("no_skill", "a", "b", {"predictions": None}), Doubt("implausible", "c", "d", {"Ix": None})]
+    verdicts = {name: verdict_of(name, Quantity(), doubts) for name in ("Ix", "Iy", "predictions")}
+    assert outcome("successful", ("Ix", "Iy"), verdicts, doubts) == "implausible"
+    assert outcome("successful", ("Iy",), verdicts, doubts) == "successful"
+    vague = {"Ix": verdict_of("Ix", Quantity(spread=1.0), [])}
+    assert outcome("successful", ("Ix",), vague, []) == "unidentifiable"
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A flight of the OS4 in gusts as `simulate --closed-loop` flies it by default, with longer samples."""
+    flight = flown(OS4, duration=20.0, seed=5, gust=5.0, name="os4.csv")
+    given = dict.fromkeys(("estimator", "bracket", "network", "validate"))
+    (case, *_) = prepare_vehicle([flight], OS4, VehicleSettings(sample_time=0.032), **given)
+    return case, fit_case(case)
+
+
+def test_a_parameter_at_another_value_moves_the_others(fitted):
+    """The cost rises by as much as the parameter says. The thrust is the scale of the inertias."""
+    _, fit = fitted
+    names, values = fit.problem.unknowns.names, np.asarray(fit.estimate.parameters)
+    constants = {"Iy": Constant(1 / values[5], 1e-4, "kg m^2")}
+    quantities = {"motors": ["rotor_delay"], "thrust": ["thrust_gain"]}
+
+    def moves(name, deviations):
+        place = names.index(name)
+        return consequences(fit, constants, quantities, name, values[place] + deviations * fit.bound[place])
+
+    gain = names.index("thrust_gain")
+    thrust = moves("thrust_gain", 3.0)
+    assert set(thrust) == {"Iy", "motors"}
+    assert thrust["Iy"].share == pytest.approx(3 * fit.bound[gain] / values[gain], rel=0.1)
+    assert thrust["Iy"].deviations == pytest.approx(thrust["Iy"].share / values[5] / 1e-4)
+    near, far = (moves("pitch_damping", x)["Iy"].share for x in (0.0, 3.0))
+    assert near < 0.005 < 0.03 < far
+    assert moves("pitch_damping", 3.0)["thrust"].share < 0.1
+
+
+def test_yaw_that_contradicts_the_other_axes_leaves_them_alone():
+    model = jaxos4.FlightModel(OS4, terms=("damping",))
+
+    def moved(**changed):
+        alpha = dict(zip(model.parameter_names, np.asarray(CorrectedOS4(OS4).alpha).tolist(), strict=False))
+        rows = {name: ParameterEstimate(x, 0.02 * abs(x) + 1e-3, None, None, "", "") for name, x in alpha.items()}
+        rows |= {name: ParameterEstimate(x, 0.02, None, None, "", "") for name, x in changed.items()}
+        return [set(doubt.moves) for doubt in doubts_of(model, rows, {}, None)]
+
+    assert moved() == []
+    # alpha1 and alpha4 of a body whose Iz is larger than alpha8 says.
+    assert moved(alpha8=1.4 * 76.9, alpha1=-1.4, alpha4=1.4) != []
+    assert moved(alpha8=-70.0) == [{"Iz"}]
+    assert moved(alpha1=4.0) == [{"Ix", "Iy", "Iz"}]
+
+
+# Whole flights.
+
+
+def halved(states):
+    states = np.array(states)
+    states[:, RATES] /= 2
+    return states
+
+
+@pytest.mark.parametrize("channels", ["rates", "all"])
+def test_an_os4_flight_whose_rates_are_halved_is_contradicted(channels):
+    flight, settings = standard_flight(), jaxos4.FlightSettings(channels=channels)
+    good = jaxos4.identify(flight, jaxos4.PublishedOS4(), settings=settings)
+    assert good.successful
+    assert good.verdicts["rigid body"].status == IDENTIFIED
+    assert {good.verdicts[name].status for name in ("alpha1", "alpha3", "alpha6", "alpha8")} == {IDENTIFIED}
+    wrong = jaxos4.identify(
+        dataclasses.replace(flight, states=halved(flight.states)), jaxos4.PublishedOS4(), settings=settings
+    )
+    assert (wrong.successful, wrong.result) == (False, "implausible")
+    assert {each.status for each in wrong.verdicts.values()} == {CONTRADICTED}
+    assert "the attitude turns 2 times as much as the gyro says" in wrong.verdicts["alpha3"].reasons[0]
+    assert set(wrong.to_dict()["verdicts"]) == {*good.parameters, "rigid body"}
+
+
+def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
+    flight = standard_flight()
+    states = halved(flight.states)
+    states[:, ANGLES] = np.nan
+    settings = jaxos4.FlightSettings(channels="rates")
+    found = jaxos4.identify(dataclasses.replace(flight, states=states), jaxos4.PublishedOS4(), settings=settings)
+    assert found.result == "implausible"
+    assert "alpha1 = -1.47 is not between -1 and 1" in found.verdicts["alpha1"].reasons[0]
+    said = " ".join(found.verdicts["rigid body"].reasons)
+    assert all(words in said for words in ("J_R = ", "is negative", "not those of one rigid body"))
+    assert found.verdicts["alpha3"].trusted
+
+
+def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
+    case, fit = fitted
+    vehicle = describe(case, fit, judge(case, fit, progress=lambda stage: None), (), 0.0)
+    assert vehicle.successful
+    for name, truth in zip(("Ix", "Iy"), np.asarray(OS4.inertia).tolist(), strict=False):
+        row = vehicle.rigid_body.constants[name]
+        assert vehicle.verdicts[name].trusted
+        assert f"{row.estimate:.4g} +- " in vehicle.verdicts[name].value
+        assert "if arms and mass are right" in vehicle.verdicts[name].value
+        assert abs(row.estimate - truth) < 3 * row.std
+    assert vehicle.verdicts["Iz"].status == MISSING
+    assert "fly more yaw" in vehicle.verdicts["Iz"].reasons[0]
+    assert "s ahead" in vehicle.verdicts["predictions"].value
+    written = vehicle.to_dict()
+    assert {*written["verdicts"]} > {"Ix", "Iy", "Iz", "thrust", "motors", "center of mass", "damping", "predictions"}
+    assert written["verdicts"]["Iz"]["status"] == MISSING
+    assert all(set(doubt) == {"result", "cause", "remedy", "moves"} for doubt in written["doubts"])
+
+
+SPOILED = {
+    "gyro scale": (
+        lambda flight: [flight._replace(states=halved(flight.states))],
+        CONTRADICTED,
+        "turns 2 times",
+    ),
+    "short": (lambda flight: [cut(flight, jaxos4.recording.Stretch(8.0, 10.5))], RESERVED, "the flight is short"),
+    "two vehicles": (lambda flight: [flight, heavier()], CONTRADICTED, "vehicles of different mass"),
+}
+
+
+def heavier():
+    airframe = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, np.asarray(0.035))
+    return flown(airframe, duration=12.0, seed=3, name="heavy.csv")
+
+
+@pytest.mark.parametrize("fault", SPOILED)
+def test_what_the_log_shows_counts_against_the_inertias_before_a_fit(fault):
+    spoil, status, cause = SPOILED[fault]
+    findings = prepare(spoil(flown(duration=12.0)), CRAZYFLIE, sample_time=0.016, holdout=0.0)[0].doubts
+    doubts = list(doubts_of_log(findings))
+    for name in ("Ix", "Iy"):
+        found = verdict_of(name, Quantity("1e-5 kg m^2"), doubts)
+        assert found.status == status
+        assert any(cause in reason for reason in found.reasons)
+    assert verdict_of("damping", Quantity(), doubts).status == IDENTIFIED
