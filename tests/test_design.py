@@ -30,6 +30,14 @@ OPEN_SETTINGS = {"duration": SECONDS, "dt": 0.01, "channels": "all", "criterion"
 LOOP_SETTINGS = {"duration": LOOP_SECONDS, "dt": LOOP_DT, "criterion": "D"}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def all_optimised():
+    """Designs compute for longer than they compile, also those of the fixtures."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
 @pytest.fixture(scope="module")
 def speeds():
     """Rotor speeds of 2 s."""
@@ -150,7 +158,6 @@ def test_other_vehicles_in_other_gusts_keep_the_limits(references):
     assert max(uses[name] for name in ("angle", "rate")) < 1.15
 
 
-@pytest.mark.usefixtures("quickly_compiled")
 def test_the_bounds_are_those_of_filter_error(references):
     """The bounds of an identified flight, whose filters know neither the noise nor the parameters."""
     designed = references.designed

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Count, InitialStates, Parameters, Scalar, integer, setting
-from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at, from_starts
 from ..linalg import coordinate_directions, gram, joint_factor, movable, room_to_limits, slopes_along
@@ -107,7 +106,7 @@ class IBSS(AbstractEstimator):
         if self.directions not in KINDS_OF_DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(KINDS_OF_DIRECTIONS)}, got {self.directions!r}.")
 
-    @quick_jit
+    @eqx.filter_jit
     def __call__(
         self,
         problem: AbstractProblem,

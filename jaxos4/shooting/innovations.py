@@ -131,6 +131,7 @@ class InnovationsProblem(AbstractProblem):
         return Segments.of(self.segments, room, samples, self.settling)
 
     @property
+    @eqx.filter_jit  # one compiled program instead of one for each operation, and traced once
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
         own, dt = self.problem.unknowns, self.flight.dt

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
-from .._xla import quick_jit
 from ..analysis.evaluation import cramer_rao_bound
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
@@ -78,7 +77,7 @@ def fleet_of(study: Study, scenario: Scenario) -> Fleet:
         return Fleet(model, bracket, omega, as_float(study.dt))
 
 
-@quick_jit
+@eqx.filter_jit
 def _bracket(model: AbstractModel, width: Float[Numeric, ""], key: Key, *, offset: bool) -> Bracket:
     """The bracket of all searches and networks: around the airframe's parameters, or off them."""
     center, half_width, most = model.alpha, width * model.half_width, _LARGEST_OFFSET
@@ -121,7 +120,7 @@ def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
         return _fly(fleet, numbers, key_of(study.seed, 1), as_float(scenario.scale), **kinds)
 
 
-@quick_jit
+@eqx.filter_jit
 def _fly(
     fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, scale: Scalar, *, method: str, kind: str, drawn: bool
 ) -> Flights:
@@ -143,7 +142,7 @@ def _fly(
     return truth, exact.states, each(measured, (exact, noise_keys))
 
 
-@quick_jit
+@eqx.filter_jit
 def cramer_rao_std(
     blank: ShootingProblem, exact: Lanes, truth: Float[Array, "lanes parameters"]
 ) -> Float[Array, "lanes parameters"]:
@@ -231,7 +230,7 @@ def _kept(found: Estimate) -> dict[str, Any]:
     return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width}
 
 
-_COMPILED_QUICKLY = quick_jit(_identify), quick_jit(_search)
+_COMPILED_QUICKLY = eqx.filter_jit(_identify), eqx.filter_jit(_search)
 _OPTIMISED = eqx.filter_jit(_identify), eqx.filter_jit(_search)
 
 
