@@ -12,6 +12,8 @@ from jaxos4.cli import studies
 from jaxos4.report import write_report
 from jaxos4.study import OUTCOMES, Training
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"durations": (0.5,), "flights": 16, "batch": 16, "channels": ("rates",)}
 SMALL |= {"estimators": ("ibss", "network", "hybrid"), "network": Training(steps=20, held_out=1000)}
 

@@ -17,6 +17,8 @@ from jaxos4.design.task import CRITERIA, criterion_of
 from jaxos4.study import load_study
 from jaxos4.study.cell import fleet_of
 
+pytestmark = pytest.mark.slow
+
 MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
 SECONDS = 2.0

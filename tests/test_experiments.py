@@ -12,7 +12,7 @@ import pytest
 import jaxos4
 from jaxos4.study import load_study, metrics, read_results
 
-pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 sys.path.append(str(EXPERIMENTS))
 

@@ -19,6 +19,8 @@ from jaxos4.recording.pieces import as_recordings
 from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise, Window, step_of
 
+pytestmark = pytest.mark.slow
+
 # A vehicle with measured rotor speeds and a large rotor inertia.
 VEHICLE = jaxos4.Airframe(
     mass=0.428,

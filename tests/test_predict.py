@@ -18,6 +18,8 @@ from jaxos4.airframe import airframe_table
 from jaxos4.closed_loop import Air, ClosedLoop, Sensors
 from jaxos4.closed_loop.flight import fly_standard
 
+pytestmark = pytest.mark.slow
+
 TERMS = ("offset", "damping", "lag", "delay", "reaction", "accelerometer", "inflow", "drag")
 DRAG, DAMPING, LAG, DELAY = (0.3, 0.4, 0.5), 0.5, 0.04, 0.01
 GUST, THRUST_GUST, GUST_TIME, GYRO, FORCE, DT = 3.0, 0.5, 0.25, 0.02, 0.3, 0.01

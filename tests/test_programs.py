@@ -18,6 +18,8 @@ import jaxos4
 from jaxos4.shooting import for_threads, padded
 from jaxos4.simulation import METHODS
 
+pytestmark = pytest.mark.slow
+
 # The search, the simulation with all derivatives, the default bracket, the intervals, a comparison of result codes.
 BUDGET = 6
 

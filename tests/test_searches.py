@@ -10,6 +10,8 @@ from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED = jaxos4.PublishedOS4
 
 

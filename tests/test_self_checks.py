@@ -17,6 +17,8 @@ from jaxos4.recording.checks.finding import Measured
 from jaxos4.recording.checks.response import rotor_response
 from jaxos4.recording.pieces import cut
 
+pytestmark = pytest.mark.slow
+
 INERTIAS = {"Ix", "Iy", "Iz"}
 CINERAT = jaxos4.Airframe(
     mass=0.428,

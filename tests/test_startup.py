@@ -26,6 +26,8 @@ from jaxos4.models.state import CHANNELS
 from jaxos4.networks import FEATURES, NetworkEstimator
 from jaxos4.simulation import METHODS
 
+pytestmark = pytest.mark.slow
+
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 # Libraries that only some commands need, and that are slow to import.
 HEAVY = set("diffrax lineax optax optimistix xarray h5netcdf h5py matplotlib jinja2 pandas dask".split())
