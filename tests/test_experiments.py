@@ -131,7 +131,7 @@ def test_frontier(run):
 
 
 def test_rollout_budget(run):
-    limits = {"limits": [1, 10], "names": ["IBSS, whitened", "output error"]}
+    limits = {"limits": [1, 10], "names": ["IBSS", "output error"]}
     data = shared.load_results(run("rollout_budget", **limits)).squeeze()
     reached, (few, enough) = load("rollout_budget", "plot").accuracy(data), data["rollouts"].mean("flight").T
     # One sweep, or one step, of each stage is nearly as good as the complete search: the rates are nearly linear.
