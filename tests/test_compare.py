@@ -34,8 +34,8 @@ def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monke
     with compiled_programs() as programs:
         code, out, err = run("compare", "--quick", "--out", "here")
     assert (code, err) == (0, "")
-    # One program for the network, and one search for IBSS and the hybrid.
-    assert [programs.count(f"jit({name})") for name in ("_identify", "_search")] == [1, 1]
+    # Flights, their bounds, the network, and one search for IBSS and the hybrid.
+    assert programs.count("jit(chunk)") == 4
     rows = ("noise x 0.1", "noise x 10", "bound, rates", "ibss", "network", "hybrid", "bracket centre")
     assert all(words in out for words in (*rows, "144 estimates"))
     figures = {path.name for path in (tmp_path / "here/figures").iterdir()}
