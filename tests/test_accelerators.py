@@ -20,6 +20,8 @@ from jaxos4.noise import NOISES
 from jaxos4.simulation import METHODS
 from jaxos4.study import cell as cells, load_study
 
+pytestmark = pytest.mark.slow
+
 PLATFORMS = "cuda", "tpu"
 LANES = 37  # more than a block of a CPU, and no other test's: JAX keeps what it has traced
 STATES = np.zeros((LANES, len(OMEGA), 12))
