@@ -120,4 +120,4 @@ def test_the_cells_of_a_study(foreign, tmp_path):
         if cell.scenario.noise == "white":
             identify = lambda *args, cell=cell: cells._answers(study, cell, *args)  # noqa: E731
             assert not foreign(identify, fleet, blank, STATES, trained()), cell
-    assert not foreign(cells.cramer_rao_std, blank, STATES, np.ones((LANES, 8)))
+    assert not foreign(cells.cramer_rao_std, (np.ones((LANES, 8)), STATES), blank)
