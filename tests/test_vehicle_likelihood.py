@@ -168,7 +168,7 @@ def test_the_noise_of_an_accelerometer_is_at_least_its_count_and_half_of_its_sec
 def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     case = case_of(flown(), 2 * DT)
-    _, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
+    _, _, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
     alone = fit_case(case)  # in one thread, from the first search on
     assert (alone.held, alone.rollouts) == (fit.held, fit.rollouts)
     np.testing.assert_array_equal(alone.estimate.covariance, fit.estimate.covariance)
@@ -194,7 +194,7 @@ def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeyp
         return case._replace(problem=case.problem.starting_from(jnp.full_like(found.parameters, 1e9)))
 
     monkeypatch.setattr(sample_time, "_starting_from", nowhere)
-    place, fit, answers = fit_at_sample_times(cases, progress=lambda stage: None)
+    place, _, fit, answers = fit_at_sample_times(cases, progress=lambda stage: None)
     assert [set(answer.constants) for answer in answers] == [{"Ix", "Iy", "Iz"}] * 2
     assert place == 0
     assert fit.rollouts > fit_case(cases[0]).rollouts  # both searches count

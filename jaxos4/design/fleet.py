@@ -20,7 +20,8 @@ from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
 from ..models.vehicle import FlightModel
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
-from ..shooting.innovations import NOISE_PRECISION, joined
+from ..shooting.innovations import NOISE_PRECISION
+from ..shooting.sums import joined
 from .envelope import Envelope, hover_squares
 from .rotor_speeds import drawn
 from .task import Inputs

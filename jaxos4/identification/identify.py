@@ -94,11 +94,10 @@ def _fit_vehicle(
     progress: Callable[[str], None],
 ) -> tuple[Case, Fit, tuple[SampleTime, ...]]:
     """The case at the chosen sample time and its fit. Newton's method compares several sample times."""
-    place, fit, sample_times = 0, None, ()
+    place, case, fit, sample_times = 0, cases[0], None, ()
     is_default = isinstance(estimator, str) and estimator == DEFAULT
     if is_default or len(cases) > 1:
-        place, fit, sample_times = fit_at_sample_times(cases, choose=choose, progress=progress)
-    case = cases[place]
+        place, case, fit, sample_times = fit_at_sample_times(cases, choose=choose, progress=progress)
     if fit is None or not is_default:
         case = with_estimator(case, estimator, seed=seed, progress=progress)
         fit = fit_case(case, progress=progress)

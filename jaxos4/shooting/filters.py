@@ -34,35 +34,15 @@ from .gains import (
     step_of,
 )
 from .scans import FASTEST
+from .sums import LAGS, Innovations, Segments, likelihood
 
-Segments = Float[Array, " segments"]
 Scalars = tuple[Float[Array, "*#segments"], ...]
 Move = Callable[[State, Forcing, Scalars], State]
 Observe = Callable[[State, Forcing, Scalars], Scalars]
 Functions = tuple[Move, Move, Observe]
 
-LAGS = 8
-"""The largest lag at which innovations are compared, in samples."""
-
 BLOCK = 32
 """The number of rows that are filtered before their likelihood is summed."""
-
-
-class Innovations(NamedTuple):
-    """The innovations of each segment and their negative log-likelihood.
-
-    The unknowns of a channel are the parameters, and then its own `LogNoise` and feedthroughs.
-
-    - `feasible`: whether the rates stay below `FASTEST`.
-    - `information`: the Fisher information.
-    - `products`: sums of the products of standardised innovations 0 to `LAGS` samples apart.
-    """
-
-    cost: Segments
-    feasible: Bool[Array, " segments"]
-    gradient: Float[Array, "channels unknowns segments"]
-    information: Float[Array, "channels unknowns unknowns segments"]
-    products: Float[Array, "channels lags segments"]
 
 
 class _Row(NamedTuple):
@@ -142,6 +122,7 @@ def innovate(
     parameters: Float[Array, "parameters *segments"],
     noise: LogNoise,
     feedthrough: tuple[Float[Array, " channels"], ...],
+    passed: tuple[Float[Array, " channels"], ...],
     *,
     dt: Scalar,
     window: Window,
@@ -159,7 +140,7 @@ def innovate(
       second its mean over what a measurement averages, the third the outputs of the sensors.
     - `observed`: its number of rows is a multiple of `BLOCK`.
     - `input_innovations`, `feedthrough`: what they explain of the innovations of the same samples, see
-      `jaxos4.shooting.feedthrough`.
+      `jaxos4.shooting.feedthrough`. `passed`: feedthroughs that were found before; what they explain counts as noise.
     - `parameters`: of all segments, or of each.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters at the positions `forcing_parameters`.
@@ -169,7 +150,7 @@ def innovate(
     """
     flight, at = (
         (observed, input_innovations, forcing, forcing_tangents, rows, dt, window),
-        (parameters, noise, feedthrough),
+        (parameters, noise, feedthrough, passed),
     )
     return with_batch(_innovate, _innovate_lanes, functions, forcing_parameters, flight, at)
 
@@ -222,10 +203,11 @@ def _innovate(functions: Functions, positions: tuple[int, ...], flight: tuple, a
 
 
 def _filter(
-    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise, tuple]
+    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise, tuple, tuple]
 ) -> Innovations:
     """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
-    (observed, passed, forcing, forcing_tangents, rows, dt, window), (parameters, noise, feedthrough) = flight, at
+    observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
+    parameters, noise, feedthrough, passed = at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
     unknowns = count + len(LogNoise._fields) + len(feedthrough)
     step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
@@ -254,10 +236,13 @@ def _filter(
     filtered = functools.partial(_filter_rows, advance, parameters, steps, np.asarray(positions, int))
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
     row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, observed.restart, following)
-    # By how much each innovation differs from what the controller let through, and its derivatives.
-    each = (v * (k if k.ndim > 1 else k[:, None]) for v, k in zip(jnp.moveaxis(passed, 1, 0), feedthrough, strict=True))
-    left = sum(each, jnp.zeros(observed.measured.shape, dtype=float))
-    data = row, observed.counts, (left, jnp.moveaxis(passed, 2, 1)), forcing, forcing_tangents
+
+    def explained(by: tuple[Array, ...]) -> Series:
+        each = (v * (k if k.ndim > 1 else k[:, None]) for v, k in zip(jnp.moveaxis(inputs, 1, 0), by, strict=True))
+        return sum(each, jnp.zeros(observed.measured.shape, dtype=float))
+
+    fed = explained(feedthrough), jnp.square(explained(passed)), jnp.moveaxis(inputs, 2, 1)
+    data = row, observed.counts, fed, forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
     def block(i: Count, carry: _Carry) -> _Carry:
@@ -274,14 +259,14 @@ def _filter_rows(
     carry: _Carry,
     row: _Row,
     counts: Bool[Array, "time segments"],
-    passed: tuple[Series, Float[Array, "time channels feedthroughs segments"]],
+    fed: tuple[Series, Series, Float[Array, "time channels feedthroughs segments"]],
     forcing: Forcing,
     forcing_tangents: Forcing | None,
 ) -> _Carry:
     """The filters after some more rows.
 
-    `steps`: the disturbance over a sample, with its derivatives in the noise. `passed`: what feedthroughs explain of
-    the innovations, with its derivatives in them.
+    `steps`: the disturbance over a sample, with its derivatives in the noise. `fed`: what feedthroughs explain of the
+    innovations, the squares of what they explained before, and the derivatives of the first.
     """
     count, segments = parameters.shape[0], counts.shape[1]
     scalars, own = tuple(parameters), parameters.shape[1:]
@@ -324,37 +309,8 @@ def _filter_rows(
     (covariance, known, feasible), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
     (errors, *slopes), variance, variance_slopes = found
     counts = row.is_measured & counts[:, None]
-    errors, slopes = errors - passed[0], jnp.concatenate([*slopes, -passed[1]], axis=2)
+    errors, slopes = errors - fed[0], jnp.concatenate([*slopes, -fed[2]], axis=2)
     noise = slice(count, count + len(LogNoise._fields))
-    found, last = _likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, noise)
+    found, last = likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, fed[1], noise)
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)
-
-
-def _likelihood(
-    counts: Bool[Array, "time channels segments"],
-    variance: Series,
-    variance_slopes: Float[Array, "time 3 channels segments"],
-    last: Float[Array, "lags channels segments"],
-    feasible: Bool[Array, " segments"],
-    errors: Series,
-    slopes: Float[Array, "time channels unknowns segments"],
-    noise: slice,
-) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
-    """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations.
-
-    `noise`: the places of the noise among the unknowns.
-    """
-    weight = jnp.where(counts, 1 / variance, 0.0)
-    logarithm = jnp.where(counts, jnp.log(variance), 0.0)
-    relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, 3, segments)
-    gradient = jnp.einsum("tcul,tcl->cul", slopes, weight * errors)
-    surprise = (weight > 0) * (1 - weight * errors**2) / 2
-    gradient = gradient.at[:, noise].add(jnp.einsum("tcul,tcl->cul", relative, surprise))
-    information = jnp.einsum("tcul,tcvl->cuvl", slopes * weight[:, :, None], slopes)
-    information = information.at[:, noise, noise].add(jnp.einsum("tcul,tcvl->cuvl", relative, relative) / 2)
-    cost = (weight * errors**2 + logarithm).sum(axis=(0, 1)) / 2
-    standard = jnp.concatenate([last, jnp.sqrt(weight) * errors])
-    now = standard[LAGS:]
-    products = [(now * standard[LAGS - lag : standard.shape[0] - lag]).sum(axis=0) for lag in range(LAGS + 1)]
-    return Innovations(cost, feasible, gradient, information, jnp.stack(products, axis=1)), standard[-LAGS:]

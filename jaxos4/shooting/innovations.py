@@ -25,11 +25,12 @@ from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing
 from .abstract import AbstractProblem, Stages, Unknowns, Values, WindowUnknowns
-from .filters import Innovations, innovate
+from .filters import innovate
 from .gains import INSTANT, LogNoise, Observed, Window, first_noise, is_rate
 from .problem import ShootingProblem
 from .scans import Curvature, Parts, Shot
 from .segments import Segments, observe_in_segments
+from .sums import Innovations, joined, placed
 
 # About how many samples a segment has by default, and how many settle its filter.
 _SEGMENT, SETTLING = 384, 128
@@ -64,6 +65,7 @@ class InnovationsProblem(AbstractProblem):
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
     - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample; by default
       nothing: the controller answers no measurement within its sample.
+    - `passed`: feedthroughs that were found before, see `passing`; by default 0.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
     """
@@ -75,6 +77,7 @@ class InnovationsProblem(AbstractProblem):
     start: Values = eqx.field(converter=as_float)
     least_noise: Float[Array, " channels"] = eqx.field(converter=as_float)
     input_innovations: Float[Array, "samples feedthroughs 3"] = eqx.field(converter=as_float)
+    passed: Float[Array, "channels feedthroughs"] = eqx.field(converter=as_float)
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
 
@@ -87,6 +90,7 @@ class InnovationsProblem(AbstractProblem):
         start: Float[ArrayLike, " unknowns"] | None = None,
         least_noise: Float[ArrayLike, " channels"] | None = None,
         input_innovations: Float[ArrayLike, "samples feedthroughs 3"] | None = None,
+        passed: Float[ArrayLike, "channels feedthroughs"] | None = None,
     ):
         if segments is None:
             segments = max(round((problem.flight.time.shape[-1] - settling) / _SEGMENT), 1)
@@ -104,6 +108,8 @@ class InnovationsProblem(AbstractProblem):
             raise ValueError(
                 f"`input_innovations` must have shape ({samples}, feedthroughs, 3), got {self.input_innovations.shape}."
             )
+        nothing = np.zeros((channels, self.input_innovations.shape[1]))
+        self.passed = as_float(nothing if passed is None else passed)
         unknowns = problem.unknowns.count + len(self._own) * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
         self.least_noise = as_float(np.zeros(channels) if least_noise is None else least_noise)
@@ -198,6 +204,13 @@ class InnovationsProblem(AbstractProblem):
         """The same problem, with another start."""
         return dataclasses.replace(self, start=start)
 
+    def passing(self, unknowns: Float[ArrayLike, " unknowns"]) -> "InnovationsProblem":
+        """The same problem, with what these feedthroughs explain counted as noise.
+
+        The noise made it: without it, the noise of the sensors comes out too small, and so do all errors.
+        """
+        return dataclasses.replace(self, passed=self._of_channels(jnp.asarray(unknowns))[:, 3:])
+
     def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "InnovationsProblem":
         """The same problem with some parameters held, see `ShootingProblem.hold`."""
         return dataclasses.replace(self, problem=self.problem.hold(values))
@@ -246,10 +259,7 @@ class InnovationsProblem(AbstractProblem):
             own = found.gradient.shape[1] - len(self._own)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, own)
             if places is not None:
-                segment = np.arange(self.segments)
-                gradient = jnp.zeros((self.segments, free.size)).at[segment[:, None], places].add(gradient)
-                pairs = segment[:, None, None], places[:, :, None], places[:, None, :]
-                information = jnp.zeros((self.segments, *both.shape)).at[pairs].add(information)
+                gradient, information = placed(gradient, information, places, free.size)
             off = values - unknowns.center
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
             slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
@@ -315,7 +325,7 @@ class InnovationsProblem(AbstractProblem):
         def at(parameters: Parameters, noise: LogNoise, feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
-            data = observed, passed, forcing, own, noise, tuple(feedthrough.T)
+            data = observed, passed, forcing, own, noise, tuple(feedthrough.T), tuple(self.passed.T)
             functions = problem.advance, problem.average, model.observe
             return innovate(functions, *data, forcing_tangents=tangents, **settings)
 
@@ -342,19 +352,3 @@ class InnovationsProblem(AbstractProblem):
             return segments_last(forcing), segments_last(tangents)
 
         return forced
-
-
-def joined(
-    gradient: Float[Array, "channels some"], information: Float[Array, "channels some some"], count: int
-) -> tuple[Values, Float[Array, "unknowns unknowns"]]:
-    """Gradient and information about all unknowns, from those of each channel about parameters and its own."""
-    channels, each = gradient.shape[0], gradient.shape[1] - count
-    size = count + each * channels
-    total = jnp.concatenate([gradient[:, :count].sum(axis=0), gradient[:, count:].ravel()])
-    whole = jnp.zeros((size, size), dtype=float).at[:count, :count].set(information[:, :count, :count].sum(axis=0))
-    for i in range(channels):
-        own = slice(count + each * i, count + each * (i + 1))
-        whole = whole.at[:count, own].set(information[i, :count, count:])
-        whole = whole.at[own, :count].set(information[i, count:, :count])
-        whole = whole.at[own, own].set(information[i, count:, count:])
-    return total, whole
