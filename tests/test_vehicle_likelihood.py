@@ -168,10 +168,13 @@ def test_the_noise_of_an_accelerometer_is_at_least_its_count_and_half_of_its_sec
 def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     case = case_of(flown(), 2 * DT)
-    _, _, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
-    alone = fit_case(case)  # in one thread, from the first search on
-    assert (alone.held, alone.rollouts) == (fit.held, fit.rollouts)
-    np.testing.assert_array_equal(alone.estimate.covariance, fit.estimate.covariance)
+    _, case, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
+    alone = fit_case(case)  # from the first search on
+    assert {*alone.held} == {*fit.held}
+    std = np.sqrt(np.diagonal(np.asarray(fit.estimate.covariance)))
+    free = std[: len(fit.problem.unknowns.names)] > 0
+    off = np.abs(alone.estimate.parameters - fit.estimate.parameters)[: free.size][free] / std[: free.size][free]
+    assert off.max() < 0.1
     assert set(answer.constants) == {"Ix", "Iy", "Iz"}
     place = fit.problem.model.parameter_names.index("thrust_gain")
     unknown = np.asarray(fit.estimate.covariance).copy()

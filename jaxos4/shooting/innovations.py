@@ -205,10 +205,7 @@ class InnovationsProblem(AbstractProblem):
         return dataclasses.replace(self, start=start)
 
     def passing(self, unknowns: Float[ArrayLike, " unknowns"]) -> "InnovationsProblem":
-        """The same problem, with what these feedthroughs explain counted as noise.
-
-        The noise made it: without it, the noise of the sensors comes out too small, and so do all errors.
-        """
+        """The same problem, with what these feedthroughs explain counted as noise, which made it."""
         return dataclasses.replace(self, passed=self._of_channels(jnp.asarray(unknowns))[:, 3:])
 
     def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "InnovationsProblem":
@@ -302,10 +299,7 @@ class InnovationsProblem(AbstractProblem):
     def innovations(
         self, parameters: Parameters, noise: LogNoise, feedthrough: Float[Array, "channels feedthroughs"] | None = None
     ) -> Innovations:
-        """The innovations of all segments. `feedthrough`: by default 0.
-
-        The derivatives in each segment are those in the parameters of its recording, see `AbstractModel.by_recording`.
-        """
+        """The innovations of all segments, with derivatives in the parameters of its recording. `feedthrough`: or 0."""
         nothing = jnp.zeros((self.problem.columns.size, self.input_innovations.shape[-2]))
         return self._innovations()(parameters, noise, nothing if feedthrough is None else feedthrough)
 
