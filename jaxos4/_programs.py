@@ -43,6 +43,11 @@ def keep_programs() -> None:
         _surroundings[:] = [repr((sizes, packages, sorted(settings.items()))).encode()]
 
 
+def keep_none() -> None:
+    """Keeps no traced program any more in this process: for code that the digest does not know."""
+    _surroundings.clear()
+
+
 def kept_program(
     function: Callable[..., Any], options: dict[str, Any], args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Callable[..., Any] | None:
