@@ -4,6 +4,9 @@ import importlib.util
 import json
 import pathlib
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 
 import jax
@@ -53,6 +56,30 @@ def test_the_picture_of_the_floors_is_up_to_date():
     drawn = (ROOT / "docs" / "pictures" / "floors.svg").read_text(encoding="utf-8")
     # If this fails: python experiments/pictures/run.py docs/pictures --only floors
     assert drawn == module.floors_picture(ROOT / "pyproject.toml")
+
+
+def test_the_links_of_the_readme_lead_somewhere_and_are_absolute_in_a_release(tmp_path):
+    for name in ("README.md", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
+    links = re.findall(r"\]\(([^)#]+)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert [link for link in links if not link.startswith("https:") and not (ROOT / link).exists()] == []
+    there = ("https://example.org/jaxos4", "https://example.org/docs", "v1.0.0")
+    subprocess.run([sys.executable, ROOT / ".ci" / "addresses.py", *there], cwd=tmp_path, check=True)
+    links = re.findall(r"\]\(([^)#]+)", (tmp_path / "README.md").read_text(encoding="utf-8"))
+    assert links
+    assert all(link.startswith("https://") for link in links)
+    urls = tomllib.loads((tmp_path / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"]
+    assert {"Documentation", "Source", "Issues", "Changelog"} <= set(urls)
+
+
+def test_the_last_release_of_the_changelog_is_the_version_of_the_package():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    heads = re.findall(r"^## \[(.+?)\](.*)$", text, flags=re.MULTILINE)
+    assert heads[0] == ("Unreleased", "")
+    assert all(re.fullmatch(r" - \d{4}-\d\d-\d\d", date) for _, date in heads[1:])
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert heads[1][0] == version
+    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_inner_functions_are_checked_at_each_call():
