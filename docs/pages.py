@@ -31,9 +31,24 @@ def on_files(files, config):
     return files
 
 
+def on_pre_page(page, config, files):
+    """A page that is made is not edited."""
+    if page.file.generated_by:
+        page.edit_url = None
+    return page
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Marks the blocks that are commands, which wrap on a narrow screen. Outputs do not."""
+    line = r"(?:jaxos4|python3?|pip|bash|source|export|\.venv/\S+| {4})\b.*\n|    --.*\n"
+    return re.sub(rf"^```\n((?:{line})+)```$", r"```sh\n\1```", markdown, flags=re.MULTILINE)
+
+
 def commands() -> str:
     """The page of the commands."""
-    text = "# Commands\n\nWhat `jaxos4 COMMAND --help` says. [Exit codes](../index.md#first-estimate) are the same for all.\n"
+    text = (
+        "# Commands\n\nWhat `jaxos4 COMMAND --help` says. All have the same [exit codes](../index.md#first-estimate).\n"
+    )
     for command in app.registered_commands:
         name = command.name or command.callback.__name__
         with contextlib.redirect_stdout(io.StringIO()) as said:

@@ -13,14 +13,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import documented_class, how_we_compile, standard_flight, standard_problem
+from helpers import CRAZYFLIE, documented_class, how_we_compile, standard_flight, standard_problem
 from jaxtyping import Array, Float, TypeCheckError, jaxtyped
 from test_startup import start
 from typechecker import check
+from typer.main import get_command
 
 import jaxos4
 from jaxos4._registry import Registry
+from jaxos4.airframe import airframe_table
+from jaxos4.cli._app import app
 from jaxos4.estimators import ESTIMATORS
+from jaxos4.identification import results
 from jaxos4.noise import NOISES
 from jaxos4.study import load_study
 
@@ -82,6 +86,55 @@ def test_the_last_release_of_the_changelog_is_the_version_of_the_package():
     assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
+def table(page: str, of: int = 0) -> list[list[str]]:
+    """The rows of a table of the documentation, cell by cell, without the marks of code."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    rows = re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE)[of].replace("`", "").splitlines()[2:]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+
+
+def test_the_table_of_parameters_is_that_of_the_terms():
+    rows = {name: rest for name, *rest in table("reference/parameters.md", of=1)}
+    assert [rows.pop(parameter.name)[0] for parameter in jaxos4.FlightModel(terms=()).parameters] == [
+        parameter.unit for parameter in jaxos4.FlightModel(terms=()).parameters
+    ]
+    terms = {}
+    for name, term in jaxos4.TERMS.items():
+        for parameter in term.parameters:
+            terms.setdefault(parameter, []).append(name)
+    assert rows.keys() == {parameter.name for parameter in terms}
+    for parameter, names in terms.items():
+        unit, of, prior, positive, each = rows[parameter.name]
+        assert (unit, of) == (parameter.unit, ", ".join(names)), parameter.name
+        assert (positive == "yes", each == "yes") == (parameter.nonnegative, parameter.each_recording), parameter.name
+        if callable(parameter.half_width):
+            assert not re.fullmatch(r"[\d.]+ ± [\d.]+", prior), parameter.name
+        else:
+            assert prior == f"{parameter.center:g} ± {parameter.half_width:g}", parameter.name
+
+
+def test_the_keys_of_airframe_and_result_files_are_in_their_tables():
+    keys = {name for name, *_ in table("reference/airframe.md")}
+    assert keys == {*airframe_table(CRAZYFLIE), "arm", "hover_speed"}
+    rows = {name: of for names, _, of in table("reference/result.md") for name in names.split(", ")}
+    apart = {"rigid_body", "estimate", "problem", "is_vehicle", "predictions", "response"}
+    assert rows.keys() == {*jaxos4.Identification.__struct_fields__, "constants", "airframe"} - apart
+    from_flights, of_vehicles = ({name for name, of in rows.items() if of == kind} for kind in ("OS4", "vehicle"))
+    assert (from_flights, of_vehicles) == (results._OF_FLIGHTS, results._OF_VEHICLES)
+
+
+def test_documented_commands_have_their_options():
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "experiments" / "README.md"]
+    text = "\n".join(page.read_text(encoding="utf-8").replace("\\\n", " ") for page in pages)
+    commands = re.findall(r"^jaxos4 ([a-z]+)\b(.*)$|`jaxos4 ([a-z]+)\b([^`\n]*)`", text, flags=re.MULTILINE)
+    known = {
+        name: {option for p in each.params for option in p.opts} for name, each in get_command(app).commands.items()
+    }
+    used = {(a or c, option) for a, b, c, d in commands for option in re.findall(r"--[a-z-]+", b + d)}
+    assert len(used) > 30
+    assert {(name, option) for name, option in used if option not in known[name] | {"--help"}} == set()
+
+
 def test_inner_functions_are_checked_at_each_call():
     def differences(values, annotation):
         @jaxtyped(typechecker=check)
@@ -141,6 +194,8 @@ FAKE = """
 import json, jax
 jax.config.update("jax_enable_x64", True)
 import jaxos4, lab
+from jaxos4.airframe import airframe_table
+from jaxos4.cli._app import app
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.models import default_terms
 used = [name for name in ("gauss_newton", "friction", "mylog") if hasattr(lab, name)]
