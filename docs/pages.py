@@ -46,9 +46,7 @@ def on_page_markdown(markdown, page, config, files):
 
 def commands() -> str:
     """The page of the commands."""
-    text = (
-        "# Commands\n\nWhat `jaxos4 COMMAND --help` says. All have the same [exit codes](../index.md#first-estimate).\n"
-    )
+    text = "# Commands\n\nWhat each `--help` says. All share the [exit codes](../index.md#first-estimate).\n"
     for command in app.registered_commands:
         name = command.name or command.callback.__name__
         with contextlib.redirect_stdout(io.StringIO()) as said:

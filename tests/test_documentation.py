@@ -127,9 +127,8 @@ def test_documented_commands_have_their_options():
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "experiments" / "README.md"]
     text = "\n".join(page.read_text(encoding="utf-8").replace("\\\n", " ") for page in pages)
     commands = re.findall(r"^jaxos4 ([a-z]+)\b(.*)$|`jaxos4 ([a-z]+)\b([^`\n]*)`", text, flags=re.MULTILINE)
-    known = {
-        name: {option for p in each.params for option in p.opts} for name, each in get_command(app).commands.items()
-    }
+    offered = get_command(app).commands.items()
+    known = {name: {option for each in command.params for option in each.opts} for name, command in offered}
     used = {(a or c, option) for a, b, c, d in commands for option in re.findall(r"--[a-z-]+", b + d)}
     assert len(used) > 30
     assert {(name, option) for name, option in used if option not in known[name] | {"--help"}} == set()
