@@ -84,6 +84,7 @@ def test_the_last_release_of_the_changelog_is_the_version_of_the_package():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     assert heads[1][0] == version
     assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version = {{{version}}}," in (ROOT / "docs" / "cite.md").read_text(encoding="utf-8")
 
 
 def table(page: str, of: int = 0) -> list[list[str]]:
