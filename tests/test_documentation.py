@@ -171,6 +171,17 @@ def test_the_documented_estimator_and_search_run():
     assert issubclass(searched["Descent"], jaxos4.AbstractEstimator)
 
 
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    noise = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)
+    jaxos4.write_flight(noise(standard_flight(), key=jax.random.key(0)), "flight.csv")
+    (code,) = blocks(ROOT / "README.md", "python")
+    exec(code, defined := {})  # noqa: S102
+    assert defined["found"].successful
+    low, high = defined["found"].parameters["alpha3"].ci95
+    assert low < 1 / 7.5e-3 < high
+
+
 def test_the_documented_term_brakes_the_yaw():
     model = run_blocks("term.md")["model"]
     flight = standard_flight()
