@@ -17,6 +17,7 @@ PAGES = {
     "security.md": "SECURITY.md",
     "experiments.md": "experiments/README.md",
 }
+COMMAND = re.compile(r"(jaxos4|python3?|pip|bash|source|export|\.venv/\S+)\b| +\S")
 
 
 def on_files(files, config):
@@ -39,9 +40,17 @@ def on_pre_page(page, config, files):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Marks the blocks that are commands, which wrap on a narrow screen. Outputs do not."""
-    line = r"(?:jaxos4|python3?|pip|bash|source|export|\.venv/\S+| {4})\b.*\n|    --.*\n"
-    return re.sub(rf"^```\n((?:{line})+)```$", r"```sh\n\1```", markdown, flags=re.MULTILINE)
+    """Marks the blocks that wrap on a narrow screen: commands, and outputs with lines wider than a terminal."""
+
+    def marked(block):
+        language, lines = block[1], block[2].splitlines()
+        if not language and all(COMMAND.match(line) for line in lines):
+            language = "sh"
+        elif not language and max(map(len, lines), default=0) > 110:
+            language = " { .text .wide }"
+        return f"```{language}\n{block[2]}```"
+
+    return re.sub(r"^```(.*)\n((?:(?!```).*\n)*)```$", marked, markdown, flags=re.MULTILINE)
 
 
 def commands() -> str:
