@@ -8,7 +8,7 @@ Import this package before JAX computes: it sets how loops are compiled (`jaxos4
 
 import lazy_loader
 
-from ._xla import make_loops_fast
+from ._xla import add_flags
 
-make_loops_fast()
+add_flags()
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -81,13 +81,6 @@ def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None
     write_file(path, dataset.to_netcdf(engine="h5netcdf", encoding=packed))  # in memory: HDF5 can crash on a full disk
 
 
-def load_netcdf() -> None:
-    """Import what `write_netcdf` needs: xarray imports a part of itself with its first file."""
-    import xarray as xr
-
-    xr.Dataset().to_netcdf(engine="h5netcdf")
-
-
 def check_writable(path: str | os.PathLike[str]) -> Path:
     """`path` with links resolved, checked before a long computation.
 

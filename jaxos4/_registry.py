@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from ._programs import keep_none
 from .errors import InputError
 
 if TYPE_CHECKING:  # its import takes a tenth of a second
@@ -41,7 +40,6 @@ class Registry(UserDict[str, T], Generic[T]):
 
     def __missing__(self, name: str) -> T:
         entry = self._others[name]
-        keep_none()  # the digest of a traced program does not know the code of other packages
         try:
             return entry.load()
         except Exception as error:  # noqa: BLE001 - whatever the other package does at its import

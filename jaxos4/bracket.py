@@ -6,7 +6,6 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Numeric, Parameters, as_float
-from ._xla import quick_jit
 from .models.abstract import AbstractModel
 
 # The largest standard deviation of an identifiable parameter, in half-widths of a bracket that is used as ...
@@ -72,6 +71,6 @@ def _numpy_if_known(a: Array, b: Array) -> tuple[Numeric, Numeric]:
     return (a, b) if isinstance(a, Tracer) or isinstance(b, Tracer) else (np.asarray(a), np.asarray(b))
 
 
-@quick_jit  # one compiled program instead of one for each operation
+@eqx.filter_jit  # one compiled program instead of one for each operation
 def _default(model: AbstractModel) -> Bracket:
     return Bracket.around(model.alpha, model.half_width)

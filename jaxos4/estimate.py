@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar
-from ._xla import quick_jit
 from .bracket import NO_PRIOR, Bracket
 from .linalg import covariance_of_shared, invert
 from .results import RESULTS
@@ -286,7 +285,7 @@ class AbstractRecursion(AbstractEstimator):
         return in_one_program(self.identify, problem, bracket)
 
 
-@quick_jit
+@eqx.filter_jit
 def in_one_program(
     identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem, bracket: Bracket | None
 ) -> Estimate:

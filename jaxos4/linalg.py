@@ -65,19 +65,6 @@ def joint_factor(information: Float[Array, "windows n n"], count: int) -> JointF
     return JointFactor(factor, jnp.swapaxes(inverse, 1, 2)[:, back] / scale[:, :, None])
 
 
-def coordinate_directions(information: Float[Array, "windows n n"], count: int) -> JointFactor:
-    """The unknowns themselves as directions, each scaled to unit information: the diagonal of A, and of A^-T.
-
-    An unknown without information keeps its own unit.
-    """
-    size = information.shape[-1]
-    diagonal = jnp.diagonal(information, axis1=1, axis2=2)
-    scale = jnp.sqrt(jnp.where(np.arange(size) < count, diagonal.sum(axis=0), diagonal))[:, :, None]
-    scale = jnp.where(scale > 0, scale, 1.0)
-    columns = jnp.eye(size)[:, np.roll(np.arange(size), -count)]
-    return JointFactor(scale * columns, columns / scale)
-
-
 def slopes_along(
     basis: Float[Array, "windows unknowns n"], gradient: Float[Array, "windows unknowns"], count: int
 ) -> PerWindow:

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector, as_float, setting
-from ._xla import quick_jit
 from .flight import STATE_NAMES, Flight, Inputs
 from .models.abstract import AbstractModel
 from .models.state import CASCADE_ORDER, Forcing, State, stack, unstack
@@ -111,7 +111,7 @@ def simulate(
     return _simulate(model, as_float(parameters), as_float(omega), dt, as_float(start), method)
 
 
-@quick_jit
+@eqx.filter_jit
 def _simulate(
     model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
 ) -> Flight:

@@ -20,6 +20,8 @@ from jaxos4.noise import NOISES
 from jaxos4.simulation import METHODS
 from jaxos4.study import cell as cells, load_study
 
+pytestmark = pytest.mark.slow
+
 PLATFORMS = "cuda", "tpu"
 LANES = 37  # more than a block of a CPU, and no other test's: JAX keeps what it has traced
 STATES = np.zeros((LANES, len(OMEGA), 12))
@@ -118,4 +120,4 @@ def test_the_cells_of_a_study(foreign, tmp_path):
         if cell.scenario.noise == "white":
             identify = lambda *args, cell=cell: cells._answers(study, cell, *args)  # noqa: E731
             assert not foreign(identify, fleet, blank, STATES, trained()), cell
-    assert not foreign(cells.cramer_rao_std, blank, STATES, np.ones((LANES, 8)))
+    assert not foreign(cells.cramer_rao_std, (np.ones((LANES, 8)), STATES), blank)

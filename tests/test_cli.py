@@ -79,14 +79,6 @@ def test_estimate_recovers_the_truth_within_its_intervals(run):
     assert (code, "rates channels" in out) == (0, True), err
 
 
-def test_kept_programs_change_no_digit(run, run_three_ways):
-    """Those of `predict`: `test_predict.py`."""
-    simulate(run, "flight.csv", "--noise", "1")
-    plain, kept, found = run_three_ways("estimate", "flight.csv", "--estimator", "output-error", "--out", "out.json")
-    assert plain[0] == 0
-    assert plain == kept == found
-
-
 def test_windows_and_validation(run):
     simulate(run, "flight.csv", "--noise", "1")
     simulate(run, "other.csv", "--noise", "1", "--seed", "1", "--excitation", "doublet", "--duration", "5")

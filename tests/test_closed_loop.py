@@ -15,6 +15,8 @@ import jaxos4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.noise import coloured
 
+pytestmark = pytest.mark.slow
+
 DT, SAMPLES = 0.004, 4001
 RATES, ANGLES, VELOCITY = [7, 9, 11], [6, 8, 10], [1, 3, 5]
 SUCCESS = jaxos4.RESULTS.successful

@@ -14,6 +14,8 @@ from test_closed_loop import ANGLES, DT, LEVEL, QUIET, RATES, SAMPLES, SUCCESS, 
 
 import jaxos4
 
+pytestmark = pytest.mark.slow
+
 TIME, RANDOM = DT * np.arange(SAMPLES), np.asarray(references())
 GRAVITY, HOVER = float(CRAZYFLIE.gravity), float(CRAZYFLIE.hover_speed)
 

@@ -17,6 +17,8 @@ from jaxos4.design.task import CRITERIA, criterion_of
 from jaxos4.study import load_study
 from jaxos4.study.cell import fleet_of
 
+pytestmark = pytest.mark.slow
+
 MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
 SECONDS = 2.0
@@ -28,6 +30,14 @@ CLOSED = ("--closed-loop", "--airframe", "mine.toml")
 
 OPEN_SETTINGS = {"duration": SECONDS, "dt": 0.01, "channels": "all", "criterion": "D", "start_is_known": True}
 LOOP_SETTINGS = {"duration": LOOP_SECONDS, "dt": LOOP_DT, "criterion": "D"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def all_optimised():
+    """Designs compute for longer than they compile, also those of the fixtures."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +160,6 @@ def test_other_vehicles_in_other_gusts_keep_the_limits(references):
     assert max(uses[name] for name in ("angle", "rate")) < 1.15
 
 
-@pytest.mark.usefixtures("quickly_compiled")
 def test_the_bounds_are_those_of_filter_error(references):
     """The bounds of an identified flight, whose filters know neither the noise nor the parameters."""
     designed = references.designed

@@ -10,6 +10,8 @@ from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors,
 
 import jaxos4
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 MAKE = {
     "ibss": jaxos4.IBSS,

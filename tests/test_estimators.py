@@ -18,6 +18,8 @@ import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
 from jaxos4.estimators import ESTIMATORS, make_estimator
 
+pytestmark = pytest.mark.slow
+
 MODEL, P = jaxos4.PublishedOS4(), jaxos4.STATE_NAMES.index("p")
 NAMES = [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
 

@@ -12,7 +12,7 @@ import pytest
 import jaxos4
 from jaxos4.study import load_study, metrics, read_results
 
-pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 sys.path.append(str(EXPERIMENTS))
 
@@ -131,7 +131,7 @@ def test_frontier(run):
 
 
 def test_rollout_budget(run):
-    limits = {"limits": [1, 10], "names": ["IBSS, whitened", "output error"]}
+    limits = {"limits": [1, 10], "names": ["IBSS", "output error"]}
     data = shared.load_results(run("rollout_budget", **limits)).squeeze()
     reached, (few, enough) = load("rollout_budget", "plot").accuracy(data), data["rollouts"].mean("flight").T
     # One sweep, or one step, of each stage is nearly as good as the complete search: the rates are nearly linear.

@@ -7,7 +7,7 @@ from test_experiments import load, plot, report_of  # noqa: F401
 
 import jaxos4
 
-pytestmark = pytest.mark.usefixtures("optimised")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
 
 def test_real_flight(shared_flights, report_of, plot):  # noqa: F811

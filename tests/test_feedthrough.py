@@ -130,6 +130,7 @@ def test_input_innovations_must_fit_the_flight(rng):
         InnovationsProblem(problem, input_innovations=rng.normal(size=(10, 1, 3)))
 
 
+@pytest.mark.slow
 def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias():
     """Commands every 4 ms, samples of 8 ms, a gyro with a noise of 0.05 rad/s.
 

@@ -23,6 +23,8 @@ from jaxos4.shooting.gains import LogNoise, Observed, gains_of
 from jaxos4.shooting.innovations import SETTLING
 from jaxos4.shooting.segments import Segments
 
+pytestmark = pytest.mark.slow
+
 MODEL = jaxos4.PublishedOS4()
 # Without gyroscopic torques a disturbed rate changes no other channel.
 UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])

@@ -14,6 +14,8 @@ from jaxos4.flight import Inputs, Stretches
 from jaxos4.models.rotors import Motor, Part, driven
 from jaxos4.models.state import CASCADE_ORDER
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("counts", [(1,), (37,), (5, 1, 20, 11), (64, 64)])
 def test_the_filter_is_the_recursion(counts):

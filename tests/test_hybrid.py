@@ -15,6 +15,8 @@ from small_network import BRACKET, CMAC, OMEGA, PUBLISHED, SMALL, flights, ident
 import jaxos4
 from jaxos4.estimators.hybrid import search_from_seed
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("seed", ["good", "misses", "outside"])
 def test_the_hybrid_finds_what_ibss_finds(seed):

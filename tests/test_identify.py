@@ -19,6 +19,8 @@ from jaxos4.recording import read_recording
 from jaxos4.recording.pieces import vehicle_evidence
 from jaxos4.recording.preparation import prepare
 
+pytestmark = pytest.mark.slow
+
 AIRFRAME = """
 mass = 0.65
 arm = 0.23

@@ -20,6 +20,9 @@ from jaxos4.recording.pieces import as_recordings
 from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise, Window, step_of
 
+pytestmark = pytest.mark.slow
+
+
 # The filters.
 
 

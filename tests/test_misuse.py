@@ -203,7 +203,6 @@ def test_arguments_of_excitations_out_of_range_are_named(excitations, name, valu
 
 
 SETTINGS = [
-    (jaxos4.IBSS, "directions", ["steepest"], "must be one of whitened, coordinate"),
     (jaxos4.IBSS, "halvings", [1], "must be an integer of at least 2"),
     (jaxos4.IBSS, "tolerance", [0.0, np.nan], "must be positive"),
     (jaxos4.IBSS, "reach", [-1.0], "must be positive"),

@@ -21,6 +21,8 @@ from lanes import LANES, identify
 import jaxos4
 from jaxos4.models.state import CASCADE_ORDER
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 SHOOTING = {"ibss": jaxos4.IBSS, "output error": jaxos4.OutputError}
 WINDOWS = 4

@@ -31,6 +31,8 @@ from small_network import (
 import jaxos4
 from jaxos4.networks.features import FEATURES, Coordinates, Features
 
+pytestmark = pytest.mark.slow
+
 # Features.
 
 

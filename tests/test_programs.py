@@ -1,4 +1,4 @@
-"""How many programs an identification compiles, which are kept, and that other numbers of one shape are other data.
+"""How many programs an identification compiles, and that other numbers of one shape are other data.
 
 `eqx.filter_eval_shape` traces a program as a call does, but does not compile it, which takes long.
 """
@@ -15,11 +15,10 @@ import pytest
 from helpers import compiled_programs, curvatures, first_state, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4 import _programs
-from jaxos4.bracket import _default
-from jaxos4.cli import _jax
 from jaxos4.shooting import for_threads, padded
 from jaxos4.simulation import METHODS
+
+pytestmark = pytest.mark.slow
 
 # The search, the simulation with all derivatives, the default bracket, the intervals, a comparison of result codes.
 BUDGET = 6
@@ -212,104 +211,3 @@ def test_another_problem_needs_no_other_trace(counted, compute):
     # Another kind of problem is seen.
     eqx.filter_eval_shape(lambda problem: compute(problem, 0), problem_of(model_class, 0).restrict("attitude"))
     assert count[0] > counts[0]
-
-
-# Programs that are kept for the next process.
-
-
-@pytest.fixture
-def kept(tmp_path, monkeypatch):
-    """Looks for the program of a function as the command line does, in a folder of files, as another process does."""
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    monkeypatch.setattr(_programs, "_surroundings", [b"this process"])
-
-    def find(*args, function=_default.__wrapped__):
-        monkeypatch.setattr(_programs, "_programs", {})
-        return _programs.kept_program(function, {}, args, {})
-
-    yield find
-    jax.config.update("jax_compilation_cache_dir", before)
-
-
-def test_a_folder_that_the_user_chose_is_kept(kept, tmp_path, monkeypatch):
-    monkeypatch.setattr(_jax, "_usable_folder", None)  # the default folder would call it
-    _jax.prepare()
-    assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path)
-    assert kept(jaxos4.PublishedOS4(jaxos4.OS4)) is not None
-    assert len(list(tmp_path.glob("jaxos4-*"))) == 1
-
-
-class OwnModel(jaxos4.CorrectedOS4):
-    """A model whose source the package does not know."""
-
-
-def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known(kept, tmp_path, monkeypatch):
-    function, one, other = _default.__wrapped__, jaxos4.PublishedOS4(jaxos4.OS4), jaxos4.PublishedOS4(jaxos4.VOOS)
-
-    def files():
-        return {path.name: path.read_bytes() for path in tmp_path.glob("jaxos4-*")}
-
-    for model in (one, other):
-        for found, expected in zip(*map(jax.tree.leaves, (kept(model)(model), function(model))), strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-14)
-    written = files()
-    assert len(written) == 1
-    with monkeypatch.context() as patch:
-        patch.setattr(_programs, "_write", None)  # tracing would call it
-        assert jax.tree.structure(kept(one)(one)) == jax.tree.structure(function(one))
-    # Another static value, and other sources, are other programs.
-    kept(jaxos4.CorrectedOS4(jaxos4.OS4))
-    with monkeypatch.context() as patch:
-        patch.setattr(_programs, "_surroundings", [b"changed"])
-        kept(one)
-    assert len(files()) == 3
-    # A damaged file is written again.
-    for name, content in written.items():
-        (tmp_path / name).write_bytes(content[:-1])
-    assert kept(one) is not None
-    assert all(_programs._read(tmp_path / name) for name in written)
-    assert kept(OwnModel(jaxos4.OS4)) is None
-    assert kept(1.0, function=lambda x: x) is None
-    assert kept(np.ones(1), function=np.shape) is None  # its results are no arrays
-    assert len(files()) == 3
-    with monkeypatch.context() as patch:
-        patch.setattr(_programs, "_surroundings", [])  # not the command line
-        assert kept(one) is None
-    jax.config.update("jax_compilation_cache_dir", None)
-    assert kept(one) is None
-
-
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="this system has no users of POSIX")
-def test_a_program_that_another_user_owns_or_can_write_to_is_not_read(kept, tmp_path, monkeypatch):
-    """To read it would run that user's code. The folder is not used at all; a file is written again."""
-    model, us = jaxos4.PublishedOS4(jaxos4.OS4), os.getuid()
-    assert kept(model) is not None
-    (path,) = tmp_path.glob("jaxos4-*")
-    assert path.stat().st_mode & 0o777 == 0o600
-
-    def read():
-        """Whether the file is read, if there is a program."""
-        found, loads = [], _programs.pickle.loads
-        with monkeypatch.context() as patch:
-            patch.setattr(_programs.pickle, "loads", lambda content: found.append(content) or loads(content))
-            return None if kept(model) is None else bool(found)
-
-    assert read() is True
-    for mode in (0o620, 0o602):
-        path.chmod(mode)
-        assert read() is False
-        assert (read(), path.stat().st_mode & 0o777) == (True, 0o600)
-    for mode in (0o720, 0o702):
-        tmp_path.chmod(mode)
-        assert read() is None
-    with monkeypatch.context() as patch:
-        patch.delattr(os, "getuid")  # as on Windows
-        assert read() is True
-    tmp_path.chmod(0o700)
-    monkeypatch.setattr(os, "getuid", lambda: us + 1)
-    assert read() is None
-    assert _programs._read(path) is None
-    path.unlink()
-    assert read() is None
-    assert not list(tmp_path.glob("jaxos4-*"))

@@ -13,6 +13,8 @@ import jaxos4
 from jaxos4.estimators.kalman import JointEKF
 from jaxos4.estimators.svsf import SVSF
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])  # p, q, r, phi, theta, psi, x, vx, ...
 

@@ -15,6 +15,8 @@ from jaxos4.design.task import Designed
 from jaxos4.report import write_flight_page, write_report
 from jaxos4.report.design_page import write_design
 
+pytestmark = pytest.mark.slow
+
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")

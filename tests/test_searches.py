@@ -10,6 +10,8 @@ from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED = jaxos4.PublishedOS4
 
 
@@ -45,28 +47,15 @@ def test_too_few_sweeps_are_reported():
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("directions", ["whitened", "coordinate"])
-def test_both_kinds_of_directions_reach_the_maximum_of_the_likelihood(directions):
+def test_ibss_reaches_the_maximum_of_the_likelihood():
     """That of output error, which is that of another minimiser: `test_estimators.py`."""
     problem, *arguments = lanes(noisy_states(LANES, seed=5))
     best = identify(jaxos4.OutputError(tolerance=1e-9), problem, *arguments).parameters
-    if directions == "coordinate":
-        best, *arguments = (each[:FEW] for each in (best, *arguments))
     # What the default tolerance allows is far below the noise.
     for settings, most in (({"tolerance": 1e-5}, 1e-4), ({}, 0.05)):
-        estimates = identify(jaxos4.IBSS(directions=directions, **settings), problem, *arguments)
+        estimates = identify(jaxos4.IBSS(**settings), problem, *arguments)
         assert set(names(estimates)) == {"successful"}
         assert np.abs((estimates.parameters - best) / bound()).max() < most
-
-
-@pytest.mark.usefixtures("optimised")
-def test_coordinates_search_innovations_too_and_say_that_they_need_more_sweeps():
-    """A level of the noise at its limit is slow."""
-    problem = jaxos4.InnovationsProblem(standard_problem(channels="rates", states=noisy_states(1)[0], free=True))
-    best, found = jaxos4.FilterError()(problem), jaxos4.IBSS(directions="coordinate")(problem)
-    assert names(found) == "max_sweeps"
-    assert 0 < float(found.cost - best.cost) < 2
-    assert (np.abs(found.parameters - best.parameters)[:8] <= 0.5 * best.std[:8]).all()
 
 
 def broken(problem, lowest, highest, factor):
@@ -126,8 +115,8 @@ def test_rollouts_are_counted_right():
 
     flight = standard_flight(duration=0.5)
     states = noisy_states(1, duration=0.5)[0]
-    free, slow = None, {"directions": "coordinate", "halvings": 3, "max_sweeps": 5}
-    for start, unknowns, most, settings in ((flight.states[0], 8, 2, {}), (free, 11, 3 * 11, slow)):
+    free, slow = None, {"halvings": 3}
+    for start, unknowns, most, settings in ((flight.states[0], 8, 2, {}), (free, 11, 3, slow)):
         problem = jaxos4.ShootingProblem(
             Counting(),
             eqx.tree_at(lambda f: f.states, flight, states),

@@ -17,6 +17,8 @@ from jaxos4.recording.checks.finding import Measured
 from jaxos4.recording.checks.response import rotor_response
 from jaxos4.recording.pieces import cut
 
+pytestmark = pytest.mark.slow
+
 INERTIAS = {"Ix", "Iy", "Iz"}
 WIND = {"wind": 1.0, "drag": 0.3, "inflow": 0.6, "flapping": 2.0}
 P, Q, AX, AY, AZ = 7, 9, 0, 1, 2

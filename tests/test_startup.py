@@ -10,14 +10,12 @@ import sys
 from typing import get_args
 
 import jax
-import numpy as np
 import pytest
 from helpers import how_we_compile
-from jax._src import compiler
 
 import jaxos4
-from jaxos4._xla import LOOP_FLAGS, NO_OPTIONS, make_loops_fast, quick_jit
-from jaxos4.cli import _jax, _options, estimate
+from jaxos4._xla import LOOP_FLAGS, NO_FLAGS, QUICK_FLAGS, add_flags
+from jaxos4.cli import _options, estimate
 from jaxos4.closed_loop import LOGGED
 from jaxos4.design.task import CRITERIA
 from jaxos4.estimators import ESTIMATORS
@@ -28,6 +26,8 @@ from jaxos4.models.state import CHANNELS
 from jaxos4.networks import ARCHITECTURES, FEATURES, NetworkEstimator
 from jaxos4.simulation import METHODS
 
+pytestmark = pytest.mark.slow
+
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 # Libraries that only some commands need, and that are slow to import.
 HEAVY = set("diffrax lineax optax optimistix xarray h5netcdf h5py matplotlib jinja2 pandas dask".split())
@@ -36,18 +36,18 @@ SIMULATE = ("simulate", "--duration", "0.1", "--out", "flight.csv")
 COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
 # Prints the loaded packages when the process ends, however it ends.
 LIST = "import atexit, sys; atexit.register(lambda: print('\\nloaded', *{name.split('.')[0] for name in sys.modules}));"
-# Counts the programs that the cache of compiled programs gave, and those that it did not have.
+# Prints how many programs the cache of compiled programs gave, how many it did not have, and the flags of XLA.
 COUNT = """
-import atexit, collections, jax
+import atexit, collections, jax, os
 seen = collections.Counter()
 jax.monitoring.register_event_listener(lambda event, **_: seen.update([event.rsplit('/', 1)[-1]]))
-atexit.register(lambda: print('\\ncounted', seen['cache_hits'], seen['cache_misses']))
+atexit.register(lambda: print('\\ncounted', seen['cache_hits'], seen['cache_misses'], os.environ.get('XLA_FLAGS')))
 """
 
 
 def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Runs Python code in another process, without the tests' cache of compiled programs."""
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "JAXOS4_"))}
+    """Runs Python code in another process, without the tests' cache of compiled programs and flags of XLA."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "JAXOS4_", "XLA_"))}
     variables = inherited | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]), "JAX_PLATFORMS": "cpu"}
     process = [sys.executable, "-c", code, *arguments]
     return subprocess.run(process, env=variables | environment, cwd=cwd, capture_output=True, text=True, timeout=300)
@@ -168,43 +168,44 @@ def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_comma
     assert json.dumps(jax.config.values, default=str, sort_keys=True) == before
 
 
-def programs(*arguments: str, cwd: pathlib.Path, **environment: str) -> tuple[int, int]:
-    """How many programs of a command came from the cache, and how many did not; it must succeed and stay silent."""
+def ended(*arguments: str, cwd: pathlib.Path, **environment: str) -> tuple[int, int, bool]:
+    """Of a command: programs from the cache, programs that it did not have, and whether all compiled quickly."""
     process = start(*arguments, code=COUNT + COMMAND, cwd=cwd, **environment)
     assert (process.returncode, process.stderr) == (0, ""), process.stderr
-    hits, misses = process.stdout.splitlines()[-1].split()[1:]
-    return int(hits), int(misses)
+    hits, misses, flags = process.stdout.splitlines()[-1].split(maxsplit=3)[1:]
+    return int(hits), int(misses), all(flag in flags for flag in QUICK_FLAGS.values())
 
 
 def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwise(tmp_path):
-    """The first one is the console command. It ends the process without the clean-up of Python: nothing is lost."""
     home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    console = COMMAND.replace("main", "console")
-    first = start(*SIMULATE, code=console, cwd=tmp_path, **home)
-    assert (first.returncode, first.stderr, "flight.csv: 11 samples" in first.stdout) == (0, "", True)
-    assert len((tmp_path / "flight.csv").read_text().splitlines()) == 12
+    hits, misses, quickly = ended(*SIMULATE, cwd=tmp_path, **home)
+    assert (hits, misses > 1, quickly) == (0, True, True)
+    folder = tmp_path / "cache" / "jaxos4" / "compiled"
+    assert len(list(folder.glob("*-atime"))) == misses  # when each was used last: JAX keeps a limit
+    next(folder.glob("*-cache")).write_bytes(b"cut")  # compiled again, in silence
+    assert ended(*SIMULATE, cwd=tmp_path, **home)[0] == misses - 1
+    off = {"JAXOS4_NO_CACHE": "1", NO_FLAGS: "1"}
+    assert ended(*SIMULATE, cwd=tmp_path, **off, **home) == (0, 0, False)
+    # A folder that the user chose is used; one that cannot be written is not.
     chosen = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "chosen"), "XDG_CACHE_HOME": str(tmp_path / "default")}
-    refused = start("estimate", "nowhere.csv", code=console, cwd=tmp_path, **home | chosen)
-    assert (refused.returncode, "nowhere.csv: there is no such file" in refused.stderr) == (2, True)
+    assert ended(*SIMULATE, cwd=tmp_path, **home | chosen)[0] == 0
+    assert len(list((tmp_path / "chosen").glob("*-cache"))) == misses
     assert not (tmp_path / "default").exists()
-    compiled = (tmp_path / "cache" / "jaxos4" / "programs").glob("*")
-    cut, *others = (path for path in compiled if not path.name.startswith("jaxos4-"))
-    cut.write_bytes(cut.read_bytes()[:100])  # compiled again, in silence
-    assert programs(*SIMULATE, cwd=tmp_path, **home)[0] == len(others) > 1
-    assert programs(*SIMULATE, cwd=tmp_path, JAXOS4_NO_CACHE="1", **home) == (0, 0)
+    assert ended(*SIMULATE, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "flight.csv"))[0] == 0
 
 
-def test_the_cache_is_limited_and_keeps_what_was_used_last_and_a_folder_may_be_unusable(tmp_path, monkeypatch):
-    for age, name in enumerate("abcd"):
-        (tmp_path / name).write_bytes(b"0" * 10)
-        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
-    _jax._remove_oldest(tmp_path, 40)
-    assert len(list(tmp_path.iterdir())) == 4
-    _jax._remove_oldest(tmp_path, 39)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a"]
-    for name in ("HOME", "XDG_CACHE_HOME"):
-        monkeypatch.setenv(name, str(tmp_path / "a"))  # not a folder
-    assert _jax._usable_folder() is None
+def test_the_console_command_ends_at_once_with_the_code_of_main_and_all_output(tmp_path):
+    console = COMMAND.replace("main", "console")
+    refused = start("estimate", "nowhere.csv", code=f"import atexit; atexit.register(print, 'late'); {console}")
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert "nowhere.csv: there is no such file" in refused.stderr
+    version = start("--version", code=console)
+    assert (version.returncode, version.stdout) == (0, f"jaxos4 {jaxos4.__version__}\n")
+
+
+def test_a_study_of_many_flights_is_fully_optimised(tmp_path):
+    (tmp_path / "study.toml").write_text("")
+    assert not ended("study", "study.toml", "--out", "study", "--dry-run", cwd=tmp_path)[2]
 
 
 NATIVE, WIDE = LOOP_FLAGS.values()
@@ -220,44 +221,14 @@ NATIVE, WIDE = LOOP_FLAGS.values()
         ({"XLA_FLAGS": WIDE.replace("512", "128")}, f"{WIDE.replace('512', '128')} {NATIVE}"),
         ({"XLA_FLAGS": f"{WIDE} {NATIVE}"}, f"{WIDE} {NATIVE}"),
         ({"XLA_FLAGS": "flags.txt"}, "flags.txt"),
-        ({"XLA_FLAGS": "--own=1", NO_OPTIONS: "1"}, "--own=1"),
-        ({NO_OPTIONS: "1"}, None),
+        ({"XLA_FLAGS": "--own=1", NO_FLAGS: "1"}, "--own=1"),
+        ({NO_FLAGS: "1"}, None),
     ],
 )
-def test_the_import_makes_loops_fast_and_replaces_no_flag(variables, flags, monkeypatch, recwarn):
-    for name in ("XLA_FLAGS", NO_OPTIONS):
+def test_the_import_makes_loops_fast_and_replaces_no_flag(variables, flags, monkeypatch):
+    for name in ("XLA_FLAGS", NO_FLAGS):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    jax.devices()
-    make_loops_fast()
+    add_flags()
     assert os.environ.get("XLA_FLAGS") == flags
-    # JAX has computed in this process, so that a new flag comes too late.
-    assert len(recwarn) == (flags != variables.get("XLA_FLAGS"))
-    assert all("JAX has computed before `import jaxos4`" in str(each.message) for each in recwarn)
-
-
-@pytest.mark.parametrize("off", [False, True])
-def test_only_a_program_that_is_called_alone_is_compiled_quickly(off, monkeypatch):
-    """By the options of each program that is compiled: the whole key of the cache would be private to JAX."""
-    quickly, original = [], compiler.get_compile_options
-
-    def spy(*args, **options):
-        quickly.append(bool(options.get("env_options_overrides")))
-        return original(*args, **options)
-
-    monkeypatch.setattr(compiler, "get_compile_options", spy)
-    monkeypatch.setenv(NO_OPTIONS, "1" if off else "")
-    twice, x, before = quick_jit(lambda x, *, scale: 2 * x * scale), np.ones(3), os.environ.get("XLA_FLAGS")
-    uses = {
-        "alone": lambda x, scale: twice(x, scale=scale),
-        "jit": jax.jit(lambda x, scale: twice(x, scale=scale)),
-        "vmap": jax.vmap(lambda x, scale: twice(x, scale=scale), in_axes=(0, None)),
-        "grad": jax.grad(lambda x, scale: twice(x, scale=scale).sum()),
-        "loop": lambda x, scale: jax.lax.scan(lambda c, _: (twice(c, scale=scale), None), x, None, 1)[0],
-    }
-    for name, use in uses.items():
-        quickly.clear()
-        np.testing.assert_array_equal(use(x, 1.0), np.full(3, 2.0))
-        assert any(quickly) == (name == "alone" and not off), name
-    assert os.environ.get("XLA_FLAGS") == before

@@ -19,6 +19,8 @@ from jaxos4.study.cell import run_cell
 from jaxos4.study.dataset import open_store, read_store
 from jaxos4.study.specification import AXES
 
+pytestmark = pytest.mark.slow
+
 SPECIFICATION = """
 durations = [1.0]
 scales = [1.0, 0.1]

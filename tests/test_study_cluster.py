@@ -18,7 +18,10 @@ from jaxos4.study import load_study, run_on_cluster
 from jaxos4.study.dataset import RESULTS_FILE, assemble, open_store
 
 # The sockets of a killed worker are closed by the garbage collector.
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
+]
 
 
 @pytest.fixture(scope="module")

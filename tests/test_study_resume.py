@@ -18,6 +18,8 @@ from jaxos4.study import load_study
 from jaxos4.study.dataset import open_store, read_store
 from jaxos4.study.run import compute
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):

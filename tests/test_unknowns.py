@@ -12,6 +12,8 @@ from jaxos4 import estimators
 from jaxos4.results import NAMES
 from jaxos4.shooting import InnovationsProblem
 
+pytestmark = pytest.mark.slow
+
 HELD = {"alpha2": 0.0079, "alpha7": 0.01}
 PLACES = [1, 6]
 ESTIMATORS = {name: kind() for name, kind in estimators.ESTIMATORS.items() if not kind.needs_network}

@@ -20,6 +20,8 @@ from jaxos4.identification.sample_time import answer_of
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
 
+pytestmark = pytest.mark.slow
+
 FLIGHTS, PERIOD, SECONDS = 8, 0.004, 10.0
 LAG, DELAY, GYRO = 0.05, 0.01, 0.02
 GUSTS = np.linspace(5, 10, FLIGHTS)

@@ -25,6 +25,8 @@ from jaxos4.recording import Recording
 from jaxos4.recording.pieces import cut
 from jaxos4.recording.preparation import prepare
 
+pytestmark = pytest.mark.slow
+
 IDENTIFIED, RESERVED = "identified", "identified with a reservation"
 MISSING, CONTRADICTED = "not identified", "contradicted"
 

@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from shared import load_results, write_figure
 
-SEARCHES = ("IBSS, whitened", "IBSS, coordinate", "output error", "hybrid")
-LOOKS = dict(zip(SEARCHES, styles(["ibss", "kalman", "output-error", "hybrid"]).values(), strict=True))
+SEARCHES = ("IBSS", "output error", "hybrid")
+LOOKS = dict(zip(SEARCHES, styles(["ibss", "output-error", "hybrid"]).values(), strict=True))
 
 
 def accuracy(data: xr.Dataset) -> xr.DataArray:
@@ -41,7 +41,7 @@ def draw(data: xr.Dataset) -> Figure:
         panel.set_title({"rates": "body rates", "all": "all channels"}.get(str(channels), str(channels)))
         panel.set_xlabel("rollouts for one flight")
     axes[0].set_ylabel("RMSE / bound, mean of the parameters")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 

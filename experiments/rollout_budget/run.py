@@ -30,8 +30,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 SEARCHES: dict[str, Callable[[int], jaxos4.AbstractEstimator]] = {
-    "IBSS, whitened": lambda most: jaxos4.IBSS(max_sweeps=most),
-    "IBSS, coordinate": lambda most: jaxos4.IBSS(max_sweeps=most, directions="coordinate"),
+    "IBSS": lambda most: jaxos4.IBSS(max_sweeps=most),
     "output error": lambda most: jaxos4.OutputError(max_steps=most),
 }
 HYBRID = "hybrid"

@@ -7,13 +7,13 @@ are coloured, or not as large as sigma says, it is the sandwich covariance.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Covariance, InitialStates, Parameters, as_float
-from .._xla import quick_jit
 from ..linalg import covariance_of_shared
 from ..models.state import CHANNELS
 from ..shooting import FASTEST, ShootingProblem, padded
@@ -124,7 +124,7 @@ def evaluate(
     )
 
 
-@quick_jit
+@eqx.filter_jit
 def _fly(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
 ) -> tuple[Array, Float[Array, "unknowns samples columns"], Float[Array, "samples 3"], Parameters]:
@@ -147,7 +147,7 @@ def _fly(
     return predicted, slopes, jnp.stack(problem.forcing(parameters)[:3], axis=1), problem.model.alpha
 
 
-@quick_jit
+@eqx.filter_jit
 def cramer_rao_bound(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Covariance:

@@ -4,13 +4,13 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Parameters, as_float
-from .._xla import quick_jit
 from ..flight import RATES
 from ..models.state import Rates
 from ..results import NINETY_FIVE
@@ -150,7 +150,7 @@ def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> F
     return np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
 
 
-@quick_jit
+@eqx.filter_jit
 def _modelled(
     problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
 ) -> Float[Array, "steps 3"]:

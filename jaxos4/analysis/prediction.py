@@ -4,13 +4,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import Numeric, Parameters, Scalar, as_float
-from .._xla import quick_jit
 from ..flight import RATES, Flight
 from ..models.state import State, unstack
 from ..shooting import FASTEST, ShootingProblem
@@ -111,7 +111,7 @@ def _ahead(flight: Flight, horizons: tuple[float, ...]) -> Int[np.ndarray, " hor
     return np.maximum(np.rint(np.asarray(horizons) / float(flight.dt)).astype(int), 1)
 
 
-@quick_jit
+@eqx.filter_jit
 def _predict(
     problem: ShootingProblem,
     parameters: Parameters,
@@ -216,4 +216,4 @@ def filtered(
     return jax.lax.scan(step, Filtered(zero, zero), rows)[1]
 
 
-_known_by = quick_jit(filtered)
+_known_by = eqx.filter_jit(filtered)

@@ -2,9 +2,7 @@
 
 import shlex
 import sys
-import threading
 import time
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -73,8 +71,6 @@ def estimate(
         if report is not None and not isinstance(subject, Airframe):
             sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
             raise InputError(f"--report: is for real vehicles, {sign}; leave it out.")
-        if report is not None:  # slow to import: while the first program runs
-            threading.Thread(target=import_module, args=["jaxos4.report.identification_page"], daemon=True).start()
         found = identify(
             recordings,
             subject,

@@ -1,13 +1,12 @@
 """`jaxos4 export` and `jaxos4 predict`: an identified vehicle as a model for a simulator, and on another flight."""
 
-import threading
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
-from .._files import check_writable, load_netcdf, write_file
+from .._files import check_writable, write_file
 from ..errors import InputError
 from . import _options as options
 from ._output import check_outputs, end, in_options, option_names, stages, write_folder, write_json
@@ -85,8 +84,6 @@ def predict(
         vehicle = vehicle_of(result)
         recording = read_recording(flight, vehicle.model.airframe, columns=columns)
         progress("predicting")
-        if out is not None and out.suffix == ".nc":  # slow to import: while the program runs
-            threading.Thread(target=load_netcdf, daemon=True).start()
         found = predict_flight(vehicle, recording, horizon=horizon, sample_time=sample_time, spacing=spacing, seed=seed)
         progress("writing")
         if out is not None:

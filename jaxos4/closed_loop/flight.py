@@ -4,13 +4,13 @@ import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from .._custom_types import Key, Numeric, Scalar, as_float, integer, setting
-from .._xla import quick_jit
 from ..airframe import alpha_scalars
 from ..flight import Flight
 from ..linalg import invert
@@ -206,7 +206,7 @@ def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Draw
     return _Drawn(gusts, winds, noise * jax.random.normal(noise_key, (runs, 9)), own)
 
 
-@quick_jit
+@eqx.filter_jit
 def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substeps: int) -> Flight:
     samples, steps = references.shape[0], substeps // loop.log_every
     runs, period = samples * loop.log_every, dt / loop.log_every

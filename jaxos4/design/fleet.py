@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, as_float
-from .._xla import quick_jit
 from ..bracket import Bracket
 from ..closed_loop import ClosedLoop, References, fly_closed_loop
 from ..errors import InputError
@@ -70,7 +69,7 @@ def batch_of(loop: ClosedLoop, in_gusts: np.ndarray | None = None, **values: Flo
     return copies
 
 
-@quick_jit
+@eqx.filter_jit
 def fly_batch(loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt: Scalar, key: Key) -> Flight:
     """Fly a batch. Velocity and position are integrals of measured attitude and specific force."""
 
@@ -146,7 +145,7 @@ class Fleet(eqx.Module):
         unit = np.append(np.asarray(self.model.airframe.inertia), np.ones(count - len(INERTIAS)))
         return relative[:count] * unit
 
-    @quick_jit
+    @eqx.filter_jit
     def informations(
         self, flights: Flight
     ) -> tuple[Float[Array, "flights n n"], Float[Array, "flights channels parameters parameters"]]:

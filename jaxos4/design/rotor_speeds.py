@@ -13,7 +13,6 @@ import scipy.optimize
 from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Parameters, RotorSpeeds as Speeds, Scalar, as_float
-from .._xla import quick_jit
 from ..airframe import Airframe
 from ..bracket import Bracket
 from ..errors import InputError, named
@@ -159,7 +158,7 @@ class RotorSpeeds(task.AbstractTask):
             judged[name] = Designed(omega, dt, history[-1], uses, dt * (omega.shape[0] - 1), history)
         return judged
 
-    @quick_jit
+    @eqx.filter_jit
     def _history(self, omega: Speeds) -> Float[Array, "samples parameters"]:
         """The bounds after each sample of a flight of the airframe's vehicle."""
         parameters = self.model.alpha
@@ -203,7 +202,7 @@ def drawn(bracket: Bracket, key: Key, count: int) -> Float[Array, "count paramet
     return lower + (upper - lower) * jax.random.uniform(key, (count, lower.shape[0]), dtype=float)
 
 
-@quick_jit
+@eqx.filter_jit
 def fly_finely(
     model: AbstractModel, vehicles: Float[Array, "vehicles parameters"], omega: Speeds, dt: Scalar, finer: int = FINER
 ) -> Float[Array, "vehicles times 12"]:

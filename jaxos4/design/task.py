@@ -20,7 +20,6 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float
 from .._files import write_atomically
-from .._xla import quick_jit
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..linalg import gram, joint_factor
@@ -173,7 +172,7 @@ def solve(task: AbstractTask, plan: tuple[int, float, int], *, compare: bool, ke
     return Design(task, judged.pop("designed"), judged)
 
 
-@quick_jit
+@eqx.filter_jit
 def _minimise(
     task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar, steps: int
 ) -> tuple[Float[Array, "starts coefficients"], Float[Array, " starts"]]:

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Key, Scalar, integer, setting
-from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at
 from ..shooting import ROUNDING, AbstractProblem
@@ -68,7 +67,7 @@ class AntColony(AbstractEstimator):
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-3)
     max_sweeps: Count = eqx.field(converter=integer("max_sweeps", 1), default=5000)
 
-    @quick_jit
+    @eqx.filter_jit
     def __call__(self, problem: AbstractProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 

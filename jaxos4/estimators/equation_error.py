@@ -20,7 +20,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar, integer, setting
-from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, fit_start, in_one_program
 from ..flight import RATES
@@ -284,7 +283,7 @@ class EquationError(AbstractEstimator):
         steps, inverse = solve(*normal_equations(rows))
         return data.answer(steps, data.covariance(rows, back, steps, inverse))
 
-    @quick_jit
+    @eqx.filter_jit
     def solution(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Parameters:
         """The least-squares solution alone, without its covariance and without a simulation.
 

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric
-from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
@@ -86,7 +85,7 @@ class Seed(NamedTuple):
         return cls(nowhere, unknown, nowhere, np.zeros(starts, kind), np.zeros((), jnp.result_type(int)))
 
 
-@quick_jit
+@eqx.filter_jit
 def search_from_seed(ibss: IBSS, problem: AbstractProblem, answer: Estimate) -> Estimate:
     """`search_near` the seed of an `answer`, as one program."""
     return search_near(ibss, problem, Seed.of(answer))

@@ -13,15 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Count, InitialStates, Parameters, Scalar, integer, setting
-from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at, from_starts
-from ..linalg import coordinate_directions, gram, joint_factor, movable, room_to_limits, slopes_along
+from ..linalg import gram, joint_factor, movable, room_to_limits, slopes_along
 from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
 from ..shooting.abstract import WindowUnknowns
 from .bisection import Brackets, Directions, Flag, PerDirection, Stage, prior_std
-
-KINDS_OF_DIRECTIONS = {"whitened": joint_factor, "coordinate": coordinate_directions}
 
 _COARSE = 0.5  # every stage but the last ends when the minimum is at most this many standard deviations away
 # The first sweep of a stage: its longest step in standard deviations of the stage's start, and the half-width of its
@@ -76,17 +73,15 @@ class IBSS(AbstractEstimator):
     the cost's slope along a direction decides** which side of the trial holds the minimum, and so which part of the
     bracket is dropped. The quadratic model and the secant through the last slopes **propose** where to shoot. The size
     of the slopes decides when to stop, and the cost whether a point is kept. A *sweep* is one iteration. A *stage*
-    repeats sweeps on some of the data until the minimum is near; the last stage fits all of them. Parameters are
-    bisected on the sum of all windows' slopes, initial states on those of their own window.
+    repeats sweeps on some of the data until the minimum is near; the last stage fits all of them. The directions of a
+    sweep are the columns of L^-T, with L L^T the Fisher information at the current estimate: the cost is nearly
+    separable along them, so a sweep bisects all together. Parameters are bisected on the sum of all windows' slopes,
+    initial states on those of their own window.
 
     **Arguments:**
 
-    - `directions`: `"whitened"`: the columns of L^-T, with L L^T the Fisher information at the current estimate; the
-      cost is nearly separable along them, so a sweep bisects all together. The rates are fitted first, then all
-      channels. `"coordinate"`: the unknowns themselves, one in each sweep, on all channels at once: slow on more
-      channels than the rates.
     - `halvings`: the shots of a sweep that narrow the brackets.
-    - `max_sweeps`: the most sweeps of a stage; along coordinates, times the number of unknowns that are searched.
+    - `max_sweeps`: the most sweeps of a stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
       direction. These are scaled by the `misfit` of the residuals, so noise-free data are fitted to rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
@@ -96,18 +91,13 @@ class IBSS(AbstractEstimator):
     shoots: ClassVar[bool] = True
     in_closed_loop: ClassVar[bool] = True
 
-    directions: str = eqx.field(static=True, default="whitened")
     halvings: int = eqx.field(static=True, converter=integer("halvings", 2, static=True), default=2)
     max_sweeps: Count = eqx.field(converter=integer("max_sweeps", 1), default=60)
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=0.005)
     reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
     record: int = eqx.field(static=True, converter=integer("record", 0, static=True), default=0)
 
-    def __check_init__(self):
-        if self.directions not in KINDS_OF_DIRECTIONS:
-            raise ValueError(f"`directions` must be one of {', '.join(KINDS_OF_DIRECTIONS)}, got {self.directions!r}.")
-
-    @quick_jit
+    @eqx.filter_jit
     def __call__(
         self,
         problem: AbstractProblem,
@@ -147,7 +137,7 @@ class IBSS(AbstractEstimator):
         - `skip`: whether to return no answer, without a shot. Other lanes of the batch do not wait for this one.
         """
         initial = problem.first_state()[0] if initial_state is None else initial_state
-        stages = problem.stages(cascade=self.directions == "whitened")
+        stages = problem.stages(cascade=True)
         stages = stages._replace(evaluate=jax.jit(stages.evaluate, inline=True))  # traced once, although called twice
 
         def from_one(start: Parameters) -> Estimate:
@@ -158,7 +148,7 @@ class IBSS(AbstractEstimator):
                 stage = Stage.of(problem, stages, number, self.reach)
                 sweep = functools.partial(self.sweep, stage)
                 begin = first._replace(**{name: getattr(state, name) for name in _KEPT})
-                return jax.lax.while_loop(lambda state: ~self.terminate(stage, state), sweep, begin)
+                return jax.lax.while_loop(lambda state: ~self.terminate(state), sweep, begin)
 
             # One loop, so that the search is compiled once for all stages.
             begin = jnp.where(cascade, 0, stages.number - 1).astype(int)
@@ -202,16 +192,16 @@ class IBSS(AbstractEstimator):
         found = self._bisect(stage, state, directions, near, brackets)
         return self._judge(stage, state, directions, predicted, near, found)
 
-    def terminate(self, stage: Stage, state: State) -> Flag:
+    def terminate(self, state: State) -> Flag:
         """Whether the stage has ended. One more call after the last sweep does not shoot: is the minimum near?"""
-        return state.done | (state.number_in_stage > self._most_sweeps(stage))
+        return state.done | (state.number_in_stage > self.max_sweeps)
 
     def _look_around(self, stage: Stage, state: State) -> Directions:
         """1. Choose directions in which the cost is nearly separable, from its curvature where the sweep begins."""
         unknowns, curvature, count = state.unknowns, state.curvature, stage.problem.unknowns.count
         moves = movable(unknowns, curvature.gradient, stage.limits, count)
         information = jnp.where(moves[:, :, None] & moves[:, None, :], curvature.information, 0.0)
-        factor, basis = KINDS_OF_DIRECTIONS[self.directions](information + stage.added_information, count)
+        factor, basis = joint_factor(information + stage.added_information, count)
         lower, upper = (jnp.where(moves, limit, unknowns) for limit in stage.limits)
         return Directions(factor, basis, moves, *room_to_limits(unknowns, basis, (lower, upper)))
 
@@ -226,26 +216,18 @@ class IBSS(AbstractEstimator):
         opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", directions.factor, state.spread, directions.factor))
         later = jnp.maximum(state.relative_width * longest, stage.smallest_step) * state.growth
         half_width = jnp.where(state.number_in_stage == 0, _FIRST * opening, later)
-        furthest = self._furthest(stage, state, opening, longest)
+        number, restricted = state.number_in_stage, jnp.where(state.trust < 1, state.trust * longest, jnp.inf)
+        # The first shot is at the start.
+        furthest = jnp.where(number < 0, 0.0, jnp.where(number == 0, opening, restricted))
         below, above = jnp.minimum(directions.below, furthest), jnp.minimum(directions.above, furthest)
         return Brackets.around(predicted, half_width, below, above)
-
-    def _furthest(self, stage: Stage, state: State, opening: PerDirection, longest: Scalar) -> PerDirection:
-        """How far this sweep may go. The first shot is at the start; of the coordinates, one has its turn."""
-        number, count = state.number_in_stage, stage.problem.unknowns.count
-        later = jnp.where(state.trust < 1, state.trust * longest, jnp.inf)
-        furthest = jnp.where(number < 0, 0.0, jnp.where(number == 0, opening, later))
-        if self.directions == "whitened":
-            return furthest
-        turn = stage.searched & (jnp.cumsum(stage.searched) - 1 == number % jnp.maximum(stage.searched.sum(), 1))
-        return jnp.where(jnp.roll(turn, -count), furthest, 0.0)  # the order of directions, see `bisection`
 
     def _bisect(self, stage: Stage, state: State, directions: Directions, near: Flag, brackets: Brackets) -> Bisected:
         """4. Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
 
         The last shot is at what the others found. There is none if the minimum is near, or after the last sweep.
         """
-        over = near | (state.number_in_stage >= self._most_sweeps(stage))
+        over = near | (state.number_in_stage >= self.max_sweeps)
         shots = jnp.where(state.number_in_stage < 0, 1, jnp.where(over, 0, self.halvings + 1))
 
         def shoot(carry):
@@ -314,16 +296,10 @@ class IBSS(AbstractEstimator):
         return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
     def _may_stall(self, stage: Stage, state: State, predicted: PerDirection, curvature: Curvature) -> Flag:
-        """Whether a short sweep may end the stage: only if an unknown has a stride, as its slopes are inexact.
-
-        One coordinate alone does not say how far the others have to go.
-        """
+        """Whether a short sweep may end the stage: only if an unknown has a stride, as its slopes are inexact."""
         feasible = curvature.shot.feasible.all() & state.curvature.shot.feasible.all()
         short = jnp.isfinite(stage.problem.unknowns.stride).any() & (jnp.abs(predicted).max() <= _SHORT)
-        return feasible & short & (self.directions == "whitened")
-
-    def _most_sweeps(self, stage: Stage) -> Count:
-        return self.max_sweeps * (1 if self.directions == "whitened" else stage.searched.sum())
+        return feasible & short
 
 
 def _next_widths(stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar, integer, setting
-from .._xla import quick_jit
 from ..bracket import GAUSSIAN_PRIOR, NO_PRIOR, Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, as_estimate, estimate_at, fit_start, from_starts
 from ..linalg import joint_factor, movable, slopes_along
@@ -166,7 +165,7 @@ class OutputError(AbstractEstimator):
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-5)
     max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
 
-    @quick_jit
+    @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
@@ -216,7 +215,7 @@ class FilterError(AbstractEstimator):
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=3e-3)
     max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=200)
 
-    @quick_jit
+    @eqx.filter_jit
     def __call__(self, problem: ShootingProblem | InnovationsProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 

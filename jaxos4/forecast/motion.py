@@ -2,13 +2,13 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Numeric, Scalar
-from .._xla import quick_jit
 from ..analysis.prediction import filtered
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.state import Forcing, Rates, State
@@ -193,7 +193,7 @@ def departures(states: Any, others: Any) -> Any:
     return xp.concatenate([difference[..., :6], xp.stack(turn, axis=-1), difference[..., 10:]], axis=-1)
 
 
-@quick_jit
+@eqx.filter_jit
 def fly_chunk(
     model: FlightModel, lanes: Lanes, known: Known, first: Int[Array, " starts"], noise: LogNoise, dt: Scalar
 ) -> tuple[Float[Array, "starts 2 steps 13"], Float[Array, "starts steps 12"]]:
@@ -208,7 +208,7 @@ def fly_chunk(
     return jax.vmap(every)(first)
 
 
-@quick_jit
+@eqx.filter_jit
 def known_at_samples(
     model: FlightModel,
     flight: Flight,
@@ -285,7 +285,7 @@ def _past(values: Array, kept: Scalar) -> Float[Array, "samples columns"]:
     return jax.lax.scan(gather, jnp.zeros(values.shape[1:], dtype=float), values)[1]
 
 
-@quick_jit
+@eqx.filter_jit
 def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[Array, " channels"]]:
     """The state of each channel's filter when its gains no longer change.
 

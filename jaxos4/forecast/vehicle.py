@@ -5,11 +5,11 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import Parameters
-from .._xla import quick_jit
 from ..airframe import airframe_from_table
 from ..errors import InputError, named, printable, shortened
 from ..flight import FORCE_NAMES
@@ -105,7 +105,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
         )
 
 
-@quick_jit
+@eqx.filter_jit
 def _bracket(model: FlightModel) -> tuple[Parameters, Parameters]:
     """The centre and the half-width of the default bracket."""
     return model.alpha, model.half_width

@@ -1,10 +1,10 @@
 """Parameters and moments of inertia with their intervals, and how well the model explains each channel."""
 
+import equinox as eqx
 import msgspec
 import numpy as np
 
 from .._custom_types import Parameters
-from .._xla import quick_jit
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.identifiability import identifiability
 from ..analysis.inertia import fit_inertia
@@ -65,7 +65,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
     }
 
 
-@quick_jit  # one compiled program instead of one for each operation
+@eqx.filter_jit  # one compiled program instead of one for each operation
 def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
     return estimate.std, estimate.half_width(0.95)
 

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array
 
 from .._custom_types import Numeric, as_float
-from .._xla import quick_jit
 from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate
 from ..analysis.frequency_response import frequency_response
@@ -83,7 +82,7 @@ def _regressed(problem: ShootingProblem, room: int, values: np.ndarray, held: Se
     return np.asarray(_regression(with_room(problem, room), as_float(values), np.asarray(held)))
 
 
-@quick_jit
+@eqx.filter_jit
 def _regression(problem: ShootingProblem, values: Array, held: Numeric) -> Array:
     """The parameters by regression; held ones, and those that it cannot estimate, have the values of the fit."""
     linear = np.array([not each.in_forcing for each in problem.model.parameters])
@@ -95,7 +94,7 @@ def _regression(problem: ShootingProblem, values: Array, held: Numeric) -> Array
 def validate_on(fit: Fit, other: ShootingProblem, name: str) -> Validation:
     """How well the parameters explain another flight; only its initial state is fitted."""
     other, parameters = eqx.tree_at(lambda p: p.sigma, other, fit.problem.sigma), fit.estimate.parameters
-    start, cost, feasible, _ = quick_jit(fit_start)(padded(other), parameters)
+    start, cost, feasible, _ = eqx.filter_jit(fit_start)(padded(other), parameters)
     if not bool(feasible):
         return Validation(name, None, None)
     diagnostics = residual_diagnostics(evaluate(other, parameters, start), fitted=False)

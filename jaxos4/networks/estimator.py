@@ -14,7 +14,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Parameters, Scalar, as_float, integer, setting
-from .._xla import quick_jit
 from ..bracket import UNIFORM_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Calibration, Estimate
 from ..flight import STATE_NAMES
@@ -136,7 +135,7 @@ class NetworkEstimator(eqx.Module):
             raise ValueError(f'`features` "raw" {what}: use "score".')
 
 
-@quick_jit
+@eqx.filter_jit
 def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> Features:
     return Features.of(features, problem, Coordinates.of(problem, bracket, noise))
 
@@ -239,7 +238,7 @@ class TrainedNetwork(AbstractEstimator):
         start = ~(jnp.abs(first_state - coordinates.first_state) <= allowed).all()
         return {what: differ(quantity) for what, quantity in _QUANTITIES.items()} | {"start": start}
 
-    @quick_jit
+    @eqx.filter_jit
     def _identify(self, problem: ShootingProblem) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
         return in_blocks(self._answer, problem)
 

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar
-from .._xla import quick_jit
 from ..bracket import Bracket
 from ..linalg import unit_directions
 from ..models.state import CASCADE_ORDER
@@ -182,7 +181,7 @@ def draw_chunks(
     return [_chunk(features, key, place_of(purpose, number), np.asarray(uniform)) for number in numbers]
 
 
-@quick_jit
+@eqx.filter_jit
 def _chunk(features: Features, key: Key, place: Int[Numeric, ""], uniform: Bool[Numeric, ""]) -> Flights:
     unknowns, parameters = features.coordinates.center.shape[0], len(features.problem.model.parameter_names)
     drawn = jax.random.uniform(jax.random.fold_in(key, place), (CHUNK, unknowns + 1), minval=-1, maxval=1, dtype=float)
@@ -214,7 +213,7 @@ def noisy_chunks(
     return [_noisy_chunk(features, chunk, scales, key, place) for chunk, place in places]
 
 
-@quick_jit
+@eqx.filter_jit
 def _noisy_chunk(
     features: Features, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
 ) -> Flights:

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import Key, Numeric, Scalar, as_float
-from .._xla import quick_jit
 from ..errors import TrainingError
 from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
 from .features import CHUNK, Features, Flights, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
@@ -45,7 +44,7 @@ def untrained(features: Features, settings: "NetworkEstimator", key: Key) -> tup
     return _untrained(features, chunks, scales, key, settings.architecture, settings.shape)
 
 
-@quick_jit
+@eqx.filter_jit
 def _untrained(
     features: Features,
     chunks: list[Flights],
@@ -123,7 +122,7 @@ def train(
     return whole, np.asarray(history)
 
 
-@quick_jit
+@eqx.filter_jit
 def _advance(
     regressor: Regressor,
     state: PyTree,
@@ -169,7 +168,7 @@ def _joined(chunks: list[Flights]) -> Flights:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
 
 
-@quick_jit
+@eqx.filter_jit
 def _first_state(regressor: Regressor) -> PyTree:
     return _optimiser(0.0).init(eqx.filter(regressor, eqx.is_inexact_array))
 
@@ -221,7 +220,7 @@ def calibrate(
     return ErrorTable(scales, *(as_float(np.stack(column)) for column in zip(*tables, strict=True)))
 
 
-@quick_jit
+@eqx.filter_jit
 def _standardised(
     regressor: Regressor, scaling: Scaling, flights: Flights, scale: Scalar
 ) -> Float[Array, "flights unknowns"]:

@@ -13,7 +13,6 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
-from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket, is_identifiable
 from ..flight import Flight
 from ..models.abstract import AbstractModel
@@ -145,7 +144,7 @@ def _all(mask: Bool[Array, "..."]) -> bool:
     return not isinstance(mask, Tracer) and bool(np.asarray(mask).all())
 
 
-@quick_jit  # one compiled program instead of one for each operation
+@eqx.filter_jit  # one compiled program instead of one for each operation
 def _held(
     center: Values, free: Bool[Array, " unknowns"], held: Bool[Numeric, " unknowns"], given: list[Scalar]
 ) -> tuple[Values, Bool[Array, " unknowns"]]:

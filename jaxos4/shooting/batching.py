@@ -9,15 +9,17 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
-from .._xla import P, R
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # The most lanes of a block: two to four of the processor's vectors. In 64 lanes a flight takes up to twice as long.
 _BLOCK = 16
@@ -125,7 +127,7 @@ def on_all_cores(function: Callable) -> Callable:
     """A batch on all cores of a CPU: threads run one compiled program. Results are the same on any number of cores.
 
     The returned function takes a batch of `function`'s first argument, all arrays of which have the flights as their
-    first axis, and the other arguments as they are. Call it outside of `jax.jit`. On an accelerator it is one call.
+    first axis, and the other arguments as they are. On an accelerator, and inside of `jax.jit`, it is one call.
     """
 
     @eqx.filter_jit
@@ -142,6 +144,8 @@ def on_all_cores(function: Callable) -> Callable:
         lanes = leaves[0].shape[0]
         if not lanes:
             raise ValueError("`many` must hold at least one lane.")
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return chunk(many, jnp.asarray(0), lanes, shared)
         size = min(lanes, _CHUNK) if jax.default_backend() == "cpu" else lanes
 
         @for_threads

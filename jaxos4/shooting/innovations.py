@@ -156,6 +156,7 @@ class InnovationsProblem(AbstractProblem):
         return self.model.by_recording(np.asarray(stretch) if is_known else stretch)
 
     @property
+    @eqx.filter_jit  # one compiled program instead of one for each operation, and traced once
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
         own, dt = self.problem.unknowns, self.flight.dt

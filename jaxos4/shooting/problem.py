@@ -12,7 +12,6 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
-from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
@@ -214,7 +213,7 @@ class ShootingProblem(AbstractProblem):
         off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
         return jnp.where(jnp.isnan(value), 0.0, value).ravel(), off.ravel()
 
-    @quick_jit
+    @eqx.filter_jit
     def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
 
@@ -225,7 +224,7 @@ class ShootingProblem(AbstractProblem):
         cost, feasible = self.shots(parameters, start)
         return jnp.where(feasible, cost, jnp.inf)
 
-    @quick_jit
+    @eqx.filter_jit
     def residuals(
         self, parameters: Parameters, initial_state: InitialStates | None = None
     ) -> Float[Array, " residuals"]:
@@ -234,7 +233,7 @@ class ShootingProblem(AbstractProblem):
         predicted, measured = self.predict(parameters, start), self.measured()
         return jnp.where(jnp.isnan(measured), 0.0, (measured - predicted) / self.sigma[self.columns]).ravel()
 
-    @quick_jit
+    @eqx.filter_jit
     def predict(self, parameters: Parameters, initial_state: InitialStates) -> Float[Array, "samples columns"]:
         """The output of noise-free sensors, in the order of `columns`."""
         _, within = self.cut()

@@ -1,13 +1,11 @@
 """The cells of a study: their flights, and the results of an estimator on them.
 
-Flights are pure functions of the specification and of their numbers; results also of the network. A cell is one call of
-each of its programs, on one device. Last digits depend on the length of a batch and on the number of devices that share
-a program; with whole cells they are the same in any order and in any process.
+Flights are pure functions of the specification and of their numbers; results also of the network. All cores share the
+flights of a cell, see `on_all_cores`. Last digits depend on the length of a batch; with whole cells they are the same
+in any order, in any process, and on any number of cores.
 """
 
 import functools
-import math
-import threading
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,11 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
-from .._xla import quick_jit
 from ..analysis.evaluation import cramer_rao_bound
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
-from ..estimators import ESTIMATORS, IBSS, Hybrid, make_estimator
+from ..estimators import IBSS, Hybrid, make_estimator
 from ..estimators.hybrid import Seed, search_near
 from ..flight import Flight
 from ..models import MODELS
@@ -30,7 +27,7 @@ from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import TrainedNetwork
 from ..noise import NOISES, SENSOR_SIGMA
 from ..results import NAMES, result_names
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, on_all_cores
 from ..simulation import simulate
 from .specification import Cell, Scenario, Study
 
@@ -42,15 +39,8 @@ LEVELS = (0.5, 0.9, 0.95, 0.99)
 
 # Attributes of an estimate that are kept.
 _KEPT = ("parameters", "std", "cost", "rollouts", "result", "seed")
-# An estimator with more flights computes for longer than its fully optimised program compiles.
-_FEW_FLIGHTS = 2000
 # The largest offset of a bracket from the parameters that all flights have, as a share of its half-width.
 _LARGEST_OFFSET = 0.8
-# Programs that all estimators share are compiled once: the second thread waits for the first.
-_ONE_THREAD = threading.Lock()
-# For each program: whether its first cell has ended, so that other threads do not compile it too.
-_COMPILED: dict[tuple, threading.Event] = {}
-
 
 Lanes = Float[Array, "lanes samples 12"]
 
@@ -64,7 +54,8 @@ class Fleet(NamedTuple):
     dt: Scalar
 
 
-# True parameters, true states and measured states of the flights of a cell.
+# True parameters, true states and measured states of a flight, and of the flights of a cell.
+Flown = tuple[Parameters, States, States]
 Flights = tuple[Float[Array, "lanes parameters"], Lanes, Lanes]
 
 
@@ -78,7 +69,7 @@ def fleet_of(study: Study, scenario: Scenario) -> Fleet:
         return Fleet(model, bracket, omega, as_float(study.dt))
 
 
-@quick_jit
+@eqx.filter_jit
 def _bracket(model: AbstractModel, width: Float[Numeric, ""], key: Key, *, offset: bool) -> Bracket:
     """The bracket of all searches and networks: around the airframe's parameters, or off them."""
     center, half_width, most = model.alpha, width * model.half_width, _LARGEST_OFFSET
@@ -118,121 +109,79 @@ def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
     scenario, numbers = cell.scenario, cell.first + np.arange(study.batch)
     kinds = {"method": scenario.method, "kind": scenario.noise, "drawn": study.truth == "drawn"}
     with jax.enable_x64(True):
-        return _fly(fleet, numbers, key_of(study.seed, 1), as_float(scenario.scale), **kinds)
+        return _fly(jnp.asarray(numbers), fleet, key_of(study.seed, 1), as_float(scenario.scale), kinds)
 
 
-@quick_jit
-def _fly(
-    fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, scale: Scalar, *, method: str, kind: str, drawn: bool
-) -> Flights:
-    def simulated(number: Int[Array, ""]) -> tuple[Parameters, Flight, Key]:
-        truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
-        truth = fleet.model.alpha
-        if drawn:
-            u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
-            truth = fleet.bracket.center + u * fleet.bracket.half_width
-        return truth, simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method), noise_key
-
-    def measured(exact_and_key: tuple[Flight, Key]) -> States:
-        exact, noise_key = exact_and_key
-        return NOISES[kind](scale * SENSOR_SIGMA)(exact, key=noise_key).states
-
-    truth, exact, noise_keys = jax.vmap(simulated)(jnp.asarray(numbers))
-    # XLA takes seconds to compile a batch of random numbers for a CPU; one flight after the other runs as fast there.
-    each = jax.lax.map if jax.default_backend() == "cpu" else lambda one, flights: jax.vmap(one)(flights)
-    return truth, exact.states, each(measured, (exact, noise_keys))
+@on_all_cores
+def _fly(number: Int[Array, ""], fleet: Fleet, key: Key, scale: Scalar, kinds: dict[str, Any]) -> Flown:
+    truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
+    truth = fleet.model.alpha
+    if kinds["drawn"]:
+        u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
+        truth = fleet.bracket.center + u * fleet.bracket.half_width
+    exact = simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=kinds["method"])
+    return truth, exact.states, NOISES[kinds["kind"]](scale * SENSOR_SIGMA)(exact, key=noise_key).states
 
 
-@quick_jit
-def cramer_rao_std(
-    blank: ShootingProblem, exact: Lanes, truth: Float[Array, "lanes parameters"]
-) -> Float[Array, "lanes parameters"]:
+@on_all_cores
+def cramer_rao_std(flown: tuple[Parameters, States], blank: ShootingProblem) -> Parameters:
     """The Cramer-Rao standard deviations of each flight, at the noise of a problem."""
-
-    def one(states: States, parameters: Parameters) -> Parameters:
-        start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
-        return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem_of(blank, states), parameters, start)))
-
-    return jax.vmap(one)(exact, truth)
+    parameters, states = flown
+    start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
+    return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem_of(blank, states), parameters, start)))
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
     """Identifies the flights of a cell on the default device; `network`: that of `Study.job`."""
     scenario = cell.scenario
     with jax.enable_x64(True):
-        with _ONE_THREAD:
-            fleet = fleet_of(study, scenario)
-            truth, exact, measured = fly(study, fleet, cell)
-            blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
-            standard = blank_problem(study, fleet, 1.0, scenario.seen)
-            bound = scenario.scale * np.asarray(cramer_rao_std(standard, exact, truth))
-        own = threading.Event()
-        first = _COMPILED.setdefault(program_of(scenario), own)
-        if first is not own:
-            first.wait()
-        try:
-            found = _answers(study, cell, fleet, blank, measured, network)
-        finally:
-            own.set()
+        fleet = fleet_of(study, scenario)
+        truth, exact, measured = fly(study, fleet, cell)
+        blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
+        standard = blank_problem(study, fleet, 1.0, scenario.seen)
+        bound = scenario.scale * np.asarray(cramer_rao_std((truth, exact), standard))
+        found = _answers(study, cell, fleet, blank, measured, network)
         return _results(study, cell, np.asarray(truth), bound, jax.tree.map(np.asarray, found))
-
-
-def program_of(scenario: Scenario) -> tuple:
-    """The key of the program that searches for the parameters of a scenario's flights."""
-    kind = ESTIMATORS[scenario.estimator]
-    kind = IBSS if issubclass(kind, Hybrid) else kind  # the hybrid shares its search with IBSS
-    return kind, scenario.model, scenario.duration, scenario.seen
 
 
 def _answers(
     study: Study, cell: Cell, fleet: Fleet, blank: ShootingProblem, states: Lanes, network: TrainedNetwork | None
 ) -> dict[str, Any]:
     """The attributes in `_KEPT` of each flight's estimate, and its `half_width` at `LEVELS`, by name."""
-    few = math.prod(study.shape[:-1]) * study.flights <= _FEW_FLIGHTS
-    identify, search = _COMPILED_QUICKLY if few else _OPTIMISED
     if network is not None:  # a history of another length would be another program
         network = eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
     estimator, channels = make_estimator(cell.scenario.estimator, network), study.seed_channels(cell.scenario)
     if isinstance(estimator, Hybrid):
         looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
-        _, seeds = identify(estimator.network, looked_at, fleet.bracket, states)
-        return search(estimator.ibss, blank, fleet.bracket, states, seeds)
+        _, seeds = _identify(states, estimator.network, looked_at, fleet.bracket)
+        return _search((states, seeds), estimator.ibss, blank, fleet.bracket)
     if isinstance(estimator, IBSS):
         # Without an answer near which to search, it searches the whole bracket.
         none = Seed.none(len(fleet.model.parameter_names), CHANNELS[channels])
-        seeds = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (study.batch, *leaf.shape)), none)
-        return search(estimator, blank, fleet.bracket, states, seeds) | {"seed": None}
-    return identify(estimator, blank, fleet.bracket, states)[0]
+        seeds = jax.tree.map(lambda leaf: jnp.asarray(np.broadcast_to(leaf, (study.batch, *leaf.shape))), none)
+        return _search((states, seeds), estimator, blank, fleet.bracket) | {"seed": None}
+    return _identify(states, estimator, blank, fleet.bracket)[0]
 
 
+@on_all_cores
 def _identify(
-    estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Lanes
+    states: States, estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket
 ) -> tuple[dict[str, Any], Seed]:
     """The results as in `_answers`, and for each answer the seed of a search."""
-
-    def one(states: States) -> tuple[dict[str, Any], Seed]:
-        found = estimator(problem_of(blank, states), bracket)
-        return _kept(found), Seed.of(found)
-
-    return jax.vmap(one)(states)
+    found = estimator(problem_of(blank, states), bracket)
+    return _kept(found), Seed.of(found)
 
 
-def _search(ibss: IBSS, blank: ShootingProblem, bracket: Bracket, states: Lanes, seeds: Seed) -> dict[str, Any]:
+@on_all_cores
+def _search(flown: tuple[States, Seed], ibss: IBSS, blank: ShootingProblem, bracket: Bracket) -> dict[str, Any]:
     """The results as in `_answers`, of a search near the seeds."""
-
-    def one(states: States, seed: Seed) -> dict[str, Any]:
-        return _kept(search_near(ibss, problem_of(blank, states).within(bracket), seed))
-
-    return jax.vmap(one)(states, seeds)
+    states, seed = flown
+    return _kept(search_near(ibss, problem_of(blank, states).within(bracket), seed))
 
 
 def _kept(found: Estimate) -> dict[str, Any]:
     half_width = jnp.stack([found.half_width(level) for level in LEVELS], axis=-1)
     return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width}
-
-
-_COMPILED_QUICKLY = quick_jit(_identify), quick_jit(_search)
-_OPTIMISED = eqx.filter_jit(_identify), eqx.filter_jit(_search)
 
 
 def _results(

@@ -4,14 +4,9 @@ The results are the same bit for bit. Workers of a cluster need only this packag
 repeats its tasks.
 """
 
-import concurrent.futures
-import contextlib
-import ctypes
 import functools
 import io
 import itertools
-import queue
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +19,7 @@ from .._files import write_file, write_netcdf
 from ..errors import InputError, TrainingError
 from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_network
 from ..shooting import cores
-from .cell import blank_problem, fleet_of, key_of, program_of, run_cell
+from .cell import blank_problem, fleet_of, key_of, run_cell
 from .dataset import RESULTS_FILE, Store, assemble, check_store, open_store
 from .specification import Cell, Scenario, Study
 
@@ -40,18 +35,10 @@ FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError
 _RETRIES = 2
 
 
-def workers() -> list[Any]:
-    """The device of each cell that this process computes at a time.
-
-    A CPU is one device for all its cores: their threads share compiled programs, and so the results' last digits.
-    """
-    devices = jax.local_devices()
-    return devices if devices[0].platform != "cpu" else devices[:1] * cores()
-
-
 def device_name() -> str:
-    """The workers of this process, in words."""
-    return f"{len(workers())} x {jax.local_devices()[0].device_kind}"
+    """What computes in this process, in words: an accelerator, or the cores of the CPU."""
+    device = jax.local_devices()[0]
+    return f"{cores() if device.platform == 'cpu' else 1} x {device.device_kind}"
 
 
 def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
@@ -64,34 +51,22 @@ def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
 
 
 def run_here(store: Store) -> Iterator[tuple[str, int]]:
-    """Computes the remaining cells, each by one worker: a divided program gives other last digits.
+    """Computes the remaining cells one after another, each on all cores.
 
     Yields the label of each cell that is finished, and the number of finished cells.
 
     A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
-    devices = workers()
-    free, pool = queue.SimpleQueue[Any](), concurrent.futures.ThreadPoolExecutor(len(devices))
-    for device in devices:
-        free.put(device)
 
-    def call(function: Callable[..., Any], *arguments: Any) -> Any:
-        given = [x.result() if isinstance(x, concurrent.futures.Future) else x for x in arguments]
-        device = free.get()
-        try:
-            with jax.default_device(device):
-                return function(*given)
-        finally:
-            free.put(device)
+    def submit(function: Callable[..., Any], *arguments: Any) -> Any:
+        return functools.cache(lambda: function(*(x() if callable(x) else x for x in arguments)))
 
-    def results(futures: list[concurrent.futures.Future]) -> Iterator[tuple[Any, Any]]:
-        return ((future, future.result()) for future in concurrent.futures.as_completed(futures))
+    def results(tasks: list[Any]) -> Iterator[tuple[Any, Any]]:
+        while tasks:  # a task keeps its result
+            task = tasks.pop(0)
+            yield task, task()
 
-    try:
-        yield from _run(store, functools.partial(pool.submit, call), results)
-    finally:
-        # An interrupt does not wait for running tasks, which may last minutes; their results are lost.
-        pool.shutdown(wait=False, cancel_futures=True)
+    yield from _run(store, submit, results)
 
 
 def run_on_cluster(store: Store, client: "Client") -> Iterator[tuple[str, int]]:
@@ -127,15 +102,13 @@ def _run(
     - `submit`: takes a function and its arguments, some of which may be futures; returns a future.
     - `results`: the finished futures with their results.
     """
-    study, numbers, begun = store.study, store.study.jobs(), Counter[tuple]()
+    study, numbers = store.study, store.study.jobs()
+    cells = [study.cell(number) for number in store.missing()]
 
-    def turn(cell: Cell) -> tuple[bool, int]:
-        """Cells without a network first, and one cell of each program first: threads compile different programs."""
-        program = program_of(cell.scenario)
-        begun[program] += 1
-        return study.job(cell.scenario) is not None, begun[program]
+    def turn(task: tuple[Any, Scenario | Cell]) -> int:
+        """First the cells without a network, then the training."""
+        return 1 if isinstance(task[1], Scenario) else 2 * (study.job(task[1].scenario) is not None)
 
-    cells = sorted(map(study.cell, store.missing()), key=turn)
     networks: dict[Scenario | None, Any] = {None: None}
     tasks: dict[Any, Scenario | Cell] = {}
     for job in dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None):
@@ -146,6 +119,7 @@ def _run(
             networks[job] = submit(bytes, store.network_file(numbers[job]).read_bytes())
     tasks |= {submit(compute, study, cell, networks[study.job(cell.scenario)]): cell for cell in cells}
     done = study.count - len(cells)
+    tasks = dict(sorted(tasks.items(), key=turn))
     for future, data in results(list(tasks)):
         task = tasks.pop(future)
         if isinstance(task, Cell):
@@ -156,9 +130,6 @@ def _run(
             yield " ".join([estimator, *varied]), done
         elif isinstance(data, bytes):
             write_file(store.network_file(numbers[task]), data)
-        # The C library keeps half a gigabyte that the compiler freed. Not every one can give it back.
-        with contextlib.suppress(OSError, AttributeError, TypeError):
-            ctypes.CDLL(None).malloc_trim(0)
 
 
 def train(study: Study, job: Scenario) -> bytes | str:
