@@ -149,7 +149,7 @@ import diffrax
 
 
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_command_keeps_settings(run):
-    tables = {"Estimator": ESTIMATORS, "Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
+    tables = {"Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
     tables |= {
         "Channels": CHANNELS,
         "Features": FEATURES,

@@ -26,9 +26,7 @@ NOISE, STEPS = (0.1, 10.0), 4000
 
 def estimate(
     flights: Annotated[list[Path], Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
-    estimator: Annotated[
-        options.Estimator | None, Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
-    ] = None,
+    estimator: options.EstimatorOption = None,
     model: Annotated[
         options.VehicleModel | None,
         Option(help="Equations: as published, corrected, or of a real vehicle. Default: by the log."),
@@ -77,7 +75,7 @@ def estimate(
             recordings,
             subject,
             settings=settings_for(subject, asked),
-            estimator=None if estimator is None else str(estimator),
+            estimator=estimator,
             bracket=options.read_bracket(bracket),
             network=network,
             validate=None if validate is None else read_recording(validate, vehicle, columns=columns),

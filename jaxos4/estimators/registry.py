@@ -1,23 +1,25 @@
 """The estimators by name."""
 
 import pkgutil
-from collections import UserDict
 from typing import TYPE_CHECKING, Any
+
+from .._registry import Registry
 
 if TYPE_CHECKING:  # the command line offers the names before it imports JAX
     from ..estimate import AbstractEstimator
     from ..networks import TrainedNetwork
 
 
-class Estimators(UserDict[str, Any]):
+class Estimators(Registry[Any]):
     """Classes by name. A class given as `"module:Class"` is imported when it is looked up."""
 
     def __getitem__(self, name: str) -> "type[AbstractEstimator]":
-        kind = self.data[name]
+        kind = super().__getitem__(name)
         return pkgutil.resolve_name(f"jaxos4.{kind}") if isinstance(kind, str) else kind
 
 
 ESTIMATORS = Estimators(
+    "jaxos4.estimators",
     {
         "ibss": "estimators.ibss:IBSS",
         "network": "networks:TrainedNetwork",
@@ -29,9 +31,10 @@ ESTIMATORS = Estimators(
         "svsf": "estimators.svsf:SVSF",
         "kalman": "estimators.kalman:JointEKF",
         "ant-colony": "estimators.ant_colony:AntColony",
-    }
+    },
 )
-"""The estimators by name: what the command line, studies and figures offer. A new estimator is one line here."""
+"""The estimators by name: what the command line, studies and figures offer. A new estimator is one line here, or an
+entry point of another package in the group `jaxos4.estimators`, with the class."""
 
 
 def make_estimator(name: str, network: "TrainedNetwork | None" = None) -> "AbstractEstimator":

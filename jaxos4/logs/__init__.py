@@ -1,12 +1,14 @@
 """Files of recorded flights to `Recording` and `Flight`, and back to CSV.
 
-Each log format is one file and one line in `FORMATS`.
+Each log format is one file and one line in `FORMATS`, or an entry point of another package in `jaxos4.log_formats`.
 """
 
+import itertools
 import os
 import warnings
 from typing import Any
 
+from .._registry import Registry
 from ..airframe import Airframe
 from ..errors import printable
 from ..flight import Flight
@@ -32,6 +34,7 @@ from .unread import unread_kind
 
 FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
+_OTHERS: Registry[LogFormat] = Registry("jaxos4.log_formats", {})
 
 _FIRST_BYTES = 1 << 18
 
@@ -99,14 +102,15 @@ def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
 def log_format(path: Path) -> LogFormat:
     """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
 
-    A pipe can be read only once, so it always counts as the last.
+    Formats of other packages are asked before the last. A pipe can be read only once, so it always counts as the last.
 
     **Raises:** `InputError` if the file cannot be opened, or is evidently of another kind.
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
         begin = file.read(_FIRST_BYTES) if file.seekable() else b""
-    kind = next((each for each in FORMATS[:-1] if each.recognises(begin)), FORMATS[-1])
+    formats = itertools.chain(FORMATS[:-1], _OTHERS.values())
+    kind = next((each for each in formats if each.recognises(begin)), FORMATS[-1])
     if kind is FORMATS[-1] and (unread := unread_kind(begin)):
-        refuse(path, f"{unread}. Logs that are read: {', '.join(each.label for each in FORMATS)}")
+        refuse(path, f"{unread}. Logs that are read: {', '.join(each.label for each in (*FORMATS, *_OTHERS.values()))}")
     return kind

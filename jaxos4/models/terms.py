@@ -1,6 +1,7 @@
 """The terms of the vehicle model: one object for each effect of real vehicles that the corrected OS4 lacks.
 
-A new term is one more `Term` in `TERMS`; everything else is found in that object.
+A new term is one more `Term` in `TERMS`, or an entry point of another package in the group `jaxos4.terms`; everything
+else is found in that object.
 """
 
 from collections.abc import Callable, Container, Mapping
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import RotorSpeeds, Scalar
+from .._registry import Registry
 from ..airframe import GRAVITY, Airframe
 from ..excitation import AXES
 from .abstract import Contradiction, Parameter
@@ -201,7 +203,7 @@ def _add_force_bias(force: Vector, values: Values) -> Vector:
 # Small vehicles have 0.02 to 0.1 s.
 _LAG = Parameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-_EARLY, _INF, _LATE, _CLOCKS)))
 
-TERMS: dict[str, Term] = {
+_OWN: dict[str, Term] = {
     "offset": Term(
         "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
         tuple(Parameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(AXES)),
@@ -316,14 +318,18 @@ TERMS: dict[str, Term] = {
 }
 
 
+TERMS: Registry[Term] = Registry("jaxos4.terms", _OWN)
+"""The terms by name. One of another package (an entry point in the group `jaxos4.terms`) is used if it is named."""
+
+
 def default_terms(available: frozenset[str]) -> tuple[str, ...]:
     """The terms that an estimate uses if the user names none, given what the logs and the airframe provide."""
-    return tuple(name for name, term in TERMS.items() if term.needs <= available and term.by_default(available))
+    return tuple(name for name, term in TERMS.data.items() if term.needs <= available and term.by_default(available))
 
 
 def clash(terms: Container[str]) -> str:
     """Why these terms cannot be used together; empty if they can."""
-    first, *others = [name for name, term in TERMS.items() if name in terms and term.speed] or [""]
+    first, *others = [name for name in TERMS if name in terms and TERMS[name].speed] or [""]
     return f"{first} says how the rotors follow their commands; leave out {', '.join(others)}" if others else ""
 
 

@@ -286,7 +286,7 @@ class FlightModel(AbstractModel):
 
     @property
     def _terms(self) -> tuple[Term, ...]:
-        return tuple(term for name, term in TERMS.items() if name in self.terms)
+        return tuple(TERMS[name] for name in TERMS if name in self.terms)
 
     @property
     def _table(self) -> tuple[Row, ...]:

@@ -1,0 +1,64 @@
+"""Pages of the site that are made: files of the repository, and the commands as their `--help` describes them."""
+
+import contextlib
+import io
+import pathlib
+import re
+
+from mkdocs.structure.files import File
+
+from jaxos4.cli._app import app
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+PAGES = {
+    "changelog.md": "CHANGELOG.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "conduct.md": "CODE_OF_CONDUCT.md",
+    "security.md": "SECURITY.md",
+    "experiments.md": "experiments/README.md",
+}
+COMMAND = re.compile(r"(jaxos4|python3?|pip|bash|source|export|\.venv/\S+)\b| +\S")
+
+
+def on_files(files, config):
+    """Adds the pages, with links that lead to pages of the site."""
+    for page, source in PAGES.items():
+        text = (ROOT / source).read_text(encoding="utf-8")
+        text = re.sub(r"\]\((?:\.\./)?docs/", "](", text)
+        for other, path in PAGES.items():
+            text = text.replace(f"]({path}", f"]({other}").replace(f"](../{path}", f"]({other}")
+        files.append(File.generated(config, page, content=text))
+    files.append(File.generated(config, "reference/commands.md", content=commands()))
+    return files
+
+
+def on_pre_page(page, config, files):
+    """A page that is made is not edited."""
+    if page.file.generated_by:
+        page.edit_url = None
+    return page
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Marks the blocks that wrap on a narrow screen: commands, and outputs with lines wider than a terminal."""
+
+    def marked(block):
+        language, lines = block[1], block[2].splitlines()
+        if not language and all(COMMAND.match(line) for line in lines):
+            language = "sh"
+        elif not language and max(map(len, lines), default=0) > 110:
+            language = " { .text .wide }"
+        return f"```{language}\n{block[2]}```"
+
+    return re.sub(r"^```(.*)\n((?:(?!```).*\n)*)```$", marked, markdown, flags=re.MULTILINE)
+
+
+def commands() -> str:
+    """The page of the commands."""
+    text = "# Commands\n\nWhat each `--help` says. All share the [exit codes](../index.md#first-estimate).\n"
+    for command in app.registered_commands:
+        name = command.name or command.callback.__name__
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            app([name, "--help"], prog_name="jaxos4", standalone_mode=False)
+        text += f"\n## {name}\n\n```\n{said.getvalue().strip()}\n```\n"
+    return text

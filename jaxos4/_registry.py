@@ -1,0 +1,60 @@
+"""Tables of names that other packages extend by entry points, without a change to this one.
+
+Installed packages are searched when a name is looked up that the table does not have, or when all names are listed. So
+a start costs nothing. An entry point is imported when it is used.
+"""
+
+from collections import UserDict
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from .errors import InputError
+
+if TYPE_CHECKING:  # its import takes a tenth of a second
+    from importlib.metadata import EntryPoint
+
+T = TypeVar("T")
+
+
+class Registry(UserDict[str, T], Generic[T]):
+    """Objects by name: those of the table, then those of installed packages, which replace none of the table.
+
+    **Arguments:**
+
+    - `group`: the group of entry points. The name of an entry point is the name in the table.
+    - `own`: the table.
+
+    **Raises:** `InputError` if an entry point that is looked up cannot be imported.
+    """
+
+    def __init__(self, group: str, own: Mapping[str, T]):
+        super().__init__(own)
+        self.group = group
+
+    @cached_property
+    def _others(self) -> "dict[str, EntryPoint]":
+        from importlib.metadata import entry_points
+
+        return {each.name: each for each in entry_points(group=self.group)}
+
+    def __missing__(self, name: str) -> T:
+        entry = self._others[name]
+        try:
+            return entry.load()
+        except Exception as error:  # noqa: BLE001 - whatever the other package does at its import
+            package = entry.dist.name if entry.dist else entry.module
+            raise InputError(
+                f"{package}: its entry point `{name}` in {self.group} cannot be imported ({error}); "
+                "update or uninstall the package."
+            ) from error
+
+    def __contains__(self, name: Any) -> bool:
+        return name in self.data or name in self._others
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self.data
+        yield from (name for name in self._others if name not in self.data)
+
+    def __len__(self) -> int:
+        return len(self.data.keys() | self._others)
