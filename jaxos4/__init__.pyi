@@ -114,6 +114,7 @@ from .noise import (
     WhiteNoise as WhiteNoise,
 )
 from .recording import Recording as Recording, join as join
+from .result_file import read_result as read_result
 from .results import RESULTS as RESULTS, result_names as result_names
 from .shooting import (
     InnovationsProblem as InnovationsProblem,

@@ -154,7 +154,7 @@ KEYS = {
         {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit"},
     ),
     "vehicle": (
-        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times"},
+        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times", "predictions", "response"},
         {*SETTINGS, "flights", "validate", "terms", "fitted_seconds", "tested_seconds"},
         {"estimate", "std", "bound", "ci95", "unit", "note"},
     ),

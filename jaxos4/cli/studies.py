@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from ..errors import InputError
+from ..errors import InputError, named
 from ._options import ESTIMATORS
-from ._output import stages
+from ._output import check_outputs, stages
 
 if TYPE_CHECKING:
     from ..study import Study
@@ -78,17 +78,33 @@ def _connected(address: str):
 
 
 def report(
-    directory: Annotated[Path, Argument(metavar="DIR", help="The folder of a study, with its results.nc.")],
+    source: Annotated[Path, Argument(metavar="SOURCE", help="The folder of a study, or a file of `estimate --out`.")],
+    out: Annotated[Path | None, Option(help="Of a file: the page to write. Default: beside it, as .html.")] = None,
 ) -> None:
-    """Write the report of a study: report.html, and figures/ as SVG."""
+    """Write the report of a study: report.html, and figures/ as SVG; or the page of a vehicle that was estimated."""
+    page = source.with_suffix(".html") if out is None else out
+    if not source.is_dir():
+        check_outputs(source, out=page)
+    elif out is not None:
+        raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
     with stages("loading the library") as progress:
-        from ..report import write_report
-        from ..study import read_results
+        from ..report import write_flight_page, write_report
 
         progress("reading")
-        dataset = read_results(directory)
-        progress("drawing")
-        page, *figures = write_report(dataset, directory)
+        figures: list[Path] = []
+        if source.is_dir():
+            from ..study import read_results
+
+            dataset = read_results(source)
+            progress("drawing")
+            page, *figures = write_report(dataset, source)
+        else:
+            from ..result_file import read_result
+
+            found = read_result(source)
+            progress("drawing")
+            with named(source):
+                write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
         typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")

@@ -80,7 +80,8 @@ def predict(
     begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed)
     ahead = start[:, None] + np.arange(1, steps + 1)
     gravity = float(vehicle.model.airframe.gravity)
-    trained = Measured.of(found.problem.flight) if isinstance(found, Identification) else measured.first_half
+    fitted = found.problem if isinstance(found, Identification) else None
+    trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
     sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(

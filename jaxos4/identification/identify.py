@@ -125,6 +125,7 @@ def describe(
         seconds=seconds,
         provenance=msgspec.structs.replace(case.provenance, notes=notes),
         covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
+        airframe=fit.problem.model.airframe,
         estimate=fit.estimate,
         problem=fit.problem,
         is_vehicle=case.is_vehicle,

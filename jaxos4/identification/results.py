@@ -1,17 +1,16 @@
 """The result of an identification: typed, and as JSON."""
 
 import math
-import os
 from typing import Any, SupportsFloat
 
 import msgspec
+import numpy as np
 
-from ..airframe import airframe_table
+from ..airframe import Airframe, airframe_table
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
-from ..errors import InputError, named, shortened
 from ..estimate import Estimate
-from ..results import NAMES, result_names
+from ..results import result_names
 from ..shooting import ShootingProblem
 from .verdict import Doubt, Verdict
 
@@ -194,7 +193,9 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """The parameters of a quadrotor, with what a user needs to judge them. Made by `jaxos4.identify`.
+    """The parameters of a quadrotor, with what a user needs to judge them.
+
+    Made by `jaxos4.identify`, or read from a file by `jaxos4.read_result`.
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
@@ -207,8 +208,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `doubts`: what speaks against the estimate, and how far it would move each quantity.
     - `provenance`: inputs, settings, versions, and notes about the data.
     - `covariance`: of `parameters`; `None` without an answer.
+    - `airframe`: the constants that were not estimated.
     - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the noise levels
-      that were found; not in `to_dict`.
+      that were found. Files do not hold them: `None` if the result was read from one.
 
     Only of a flight of an OS4:
 
@@ -223,24 +225,25 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
-    - `predictions`: the predictions themselves; not in `to_dict`.
-    - `response`: the frequency response with the fitted data; not in `to_dict`. `None` without an answer.
+    - `predictions`: the predictions themselves, at most 2,000 starts.
+    - `response`: the frequency response with the fitted data. `None` without an answer.
     """
 
     estimator: str
     model: str
     result: str
-    rollouts: int
-    cost: float | None
-    seconds: float
+    rollouts: int = 0
+    cost: float | None = None
+    seconds: float = 0.0
     parameters: dict[str, ParameterEstimate]
     rigid_body: RigidBody = RigidBody()
     verdicts: dict[str, Verdict] = {}
     doubts: tuple[Doubt, ...] = ()
     provenance: Provenance
     covariance: list[list[float]] | None
-    estimate: Estimate
-    problem: ShootingProblem
+    airframe: Airframe
+    estimate: Estimate | None = None
+    problem: ShootingProblem | None = None
     is_vehicle: bool
     fit: dict[str, ChannelFit] = {}
     validation: Validation | None = None
@@ -264,6 +267,11 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return self.result not in NO_ANSWER
 
     @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the estimate cannot be trusted, and what to do; one line each."""
+        return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
+
+    @property
     def motor_clock(self) -> str:
         """How late motors are recorded, if `rotor_delay` is clearly negative; else empty."""
         delay = self.parameters.get("rotor_delay")
@@ -277,60 +285,27 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`; `None`
         without an answer.
         """
-        apart = {"rigid_body", "estimate", "problem", "is_vehicle", "predictions", "response"}
-        apart |= _OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES
+        apart = APART | (_OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES)
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
-        computed = {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.problem.model.airframe)}
-        return msgspec.to_builtins(fields | computed)
+        fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
+        if self.is_vehicle:
+            fields |= {"predictions": _series(self.predictions), "response": _series(self.response)}
+        return msgspec.to_builtins(fields)
 
 
+def _series(value: Any) -> Any:
+    """A tuple of arrays as dictionaries and lists; `None` for what is not finite."""
+    if value is None:
+        return None
+    if hasattr(value, "_asdict"):
+        return {name: _series(each) for name, each in value._asdict().items()}
+    found = np.asarray(value).astype(object)
+    found[~np.isfinite(value)] = None
+    return found.tolist()
+
+
+APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", "predictions", "response"}
+"""Fields that a file holds in another form, or not at all."""
 # Fields that are written of one kind of identification only.
 _OF_FLIGHTS = {"fit", "validation"}
 _OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}
-
-
-class ResultFile(msgspec.Struct, frozen=True, kw_only=True):
-    """The fields of `Identification.to_dict` that an export or a prediction needs."""
-
-    estimator: str
-    model: str
-    result: str
-    parameters: dict[str, ParameterEstimate]
-    provenance: Provenance
-    covariance: list[list[float]] | None
-    held: dict[str, HeldParameter] = {}
-    doubts: tuple[Doubt, ...] = ()
-    disturbances: dict[str, Disturbance] = {}
-    constants: dict[str, Any]
-    airframe: dict[str, Any] | None
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why the estimate cannot be trusted, and what to do; one line each."""
-        return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
-
-    @classmethod
-    def of(cls, found: Any, name: str | os.PathLike[str] = "") -> "ResultFile":
-        """The result of a vehicle, from `Identification.to_dict` or from the values of a file called `name`.
-
-        **Raises:** `InputError`, one line, if it is no result, has no vehicle or no estimate, or is not of this
-        version.
-        """
-        remedy, again = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
-        with named(name):
-            try:
-                own = msgspec.convert(found, cls)
-            except msgspec.MsgspecError as error:
-                what = " ".join(str(error).split())[:200]
-                raise InputError(f"not a result ({what}); {remedy}.") from None
-            if own.model != "flight":
-                which = "only a vehicle (--model flight) can be exported or can predict"
-                raise InputError(f"`model` {shortened(own.model, 40)}: {which}.")
-            if own.result not in NAMES:
-                raise InputError(f"`result` {shortened(own.result, 40)}: is not a result code; {again}")
-            if not own.covariance or own.airframe is None:
-                raise InputError(f"{own.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
-            rows, count = own.covariance, len(own.parameters)
-            if [len(row) for row in rows] != count * [count] or any(row[i] < 0 for i, row in enumerate(rows)):
-                raise InputError(f"`covariance`: is not one of {count} parameters; {again}")
-            return own

@@ -1,5 +1,8 @@
 from .identification_page import write_flight_page as write_flight_page
-from .identification_text import print_identification as print_identification
+from .identification_text import (
+    identification_summary as identification_summary,
+    print_identification as print_identification,
+)
 from .prediction import print_prediction as print_prediction, write_prediction_figure as write_prediction_figure
 from .study_page import write_report as write_report
 from .study_tables import error_table as error_table

@@ -4,6 +4,7 @@ import json
 import math
 import os
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,8 +16,10 @@ from matplotlib.ticker import MultipleLocator
 from .._files import check_writable, write_file
 from ..airframe import Airframe
 from ..analysis.frequency_response import FrequencyResponse
-from ..analysis.inertia import CenterOfMass, center_of_mass
+from ..analysis.inertia import CenterOfMass
 from ..analysis.prediction import Predictions, decisive_horizon
+from ..errors import InputError, printable
+from ..identification.physical import centers_of_mass
 from ..identification.results import Constant, Identification, SampleTime
 from ..identification.verdict import headline
 from ..results import NINETY_FIVE, meaning
@@ -35,16 +38,21 @@ _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 
 _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 
 
-def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str) -> None:
-    """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
+def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
+    """Writes the page of an identified vehicle, completely or not at all.
+
+    It shows what the result's file holds, so that a result that was read makes the same page. `title`: by default the
+    names of the logs.
+
+    **Raises:** `InputError` if the result is of an OS4; `OSError` if the page cannot be written.
+    """
     check_writable(path)
+    if not found.is_vehicle:
+        raise InputError(f"the result of the {found.model} model has no page: pages are of vehicles (--model flight).")
     look, used = styles([found.estimator])[found.estimator], found.provenance
-    airframe, count = found.problem.model.airframe, len(found.parameters)
-    values = np.array([math.nan if row.estimate is None else row.estimate for row in found.parameters.values()])
-    covariance = np.zeros((count, count)) if found.covariance is None else np.asarray(found.covariance)
-    center = [x for x in center_of_mass(tuple(found.parameters), values, covariance, airframe) if math.isfinite(x.std)]
+    center = centers_of_mass(found)
     with drawing():
-        figures = {"vehicle": vehicle(airframe, found.rigid_body.constants, center, look)}
+        figures = {"vehicle": vehicle(found.airframe, found.rigid_body.constants, center, look)}
         if found.sample_times:
             figures["sample-times"] = inertias_by_sample_time(found.sample_times, used.sample_time, look)
         if found.response is not None:
@@ -56,7 +64,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         drawings = {name: draw(figure, name) for name, figure in figures.items()}
     text = render(
         "identification.html.j2",
-        title=title,
+        title=title or ", ".join(printable(Path(name).name) for name in used.flights or ()),
         found=found,
         verdict=verdict(found),
         headline=headline(found.verdicts, found.doubts),
@@ -110,7 +118,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
     (x, y), distances = positions.T, np.linalg.norm(positions[:, None] - positions, axis=2)
     radius = 0.42 * distances[distances > 0].min()
     for i, spin in enumerate(np.asarray(airframe.rotor_spins)):
-        end = 1 - 0.25 * radius / math.hypot(x[i], y[i])  # leaves room for the number
+        end = 1 - 0.25 * radius / max(math.hypot(x[i], y[i]), radius)  # leaves room for the number
         above.plot([0, -end * y[i]], [0, end * x[i]], color=FAINT, linewidth=3, zorder=1)
         above.add_patch(Circle((-y[i], x[i]), radius, facecolor=PAPER, edgecolor=INK, linewidth=1.1))
         turn = np.radians(np.linspace(200, 200 + 280 * spin, 60))

@@ -1,0 +1,143 @@
+"""A result read from its file is the one that was found: the same page, numbers and words; and results compared."""
+
+import io
+import json
+
+import jaxos4
+import msgspec
+import numpy as np
+import pytest
+from helpers import refused
+from hypothesis import given, settings, strategies as st
+from rich.console import Console
+from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
+from test_doors import STRANGE, in_one_line, nodes
+
+from jaxos4.cli._output import write_json
+from jaxos4.identification.results import Disturbance, ParameterEstimate
+from jaxos4.report import print_identification, write_flight_page
+
+FULL = {
+    "sample_times": SAMPLE_TIMES,
+    "covariance": [[1.0, 0.0], [0.0, 4.0]],
+    "widened": {"alpha3": 1.7},
+    "disturbances": {"p": Disturbance(1.2, "rad/s^2", 0.1, 0.02, 0.01)},
+}
+
+
+def written(found, path):
+    write_json(found.to_dict(), path)
+    return jaxos4.read_result(path)
+
+
+def text_of(found):
+    console = Console(width=80, file=io.StringIO())
+    print_identification(console, found, verbose=True)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("found", [identified_vehicle(**FULL), identified_flight()], ids=["vehicle", "os4"])
+def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
+    again = written(found, tmp_path / "found.json")
+    assert (again.estimate, again.problem) == (None, None)
+    assert again.to_dict() == found.to_dict()
+    assert text_of(again) == text_of(found)
+    assert written(again, tmp_path / "again.json").to_dict() == found.to_dict()
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "found.json").read_bytes()
+
+
+def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path):
+    found = identified_vehicle(**FULL)
+    write_flight_page(tmp_path / "fresh.html", found)
+    write_json(found.to_dict(), tmp_path / "found.json")
+    code, out, err = run("report", "found.json")
+    assert (code, err) == (0, "")
+    assert out.startswith("found.html: ")
+    assert (tmp_path / "found.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
+    assert run("report", "found.json", "--out", "other.html")[0] == 0
+    assert (tmp_path / "other.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
+    refused(run("report", "found.json", "--out", "found.json"), "would overwrite an input")
+    write_json(identified_flight().to_dict(), tmp_path / "os4.json")
+    refused(run("report", "os4.json"), "os4.json: the result of the published model has no page")
+    (tmp_path / "study").mkdir()
+    refused(run("report", "study", "--out", "page.html"), "--out: study is a folder")
+
+
+def test_a_file_of_an_older_version_has_a_page_without_the_figures_that_it_lacks(tmp_path):
+    found = identified_vehicle()
+    table = {
+        name: each for name, each in found.to_dict().items() if name not in ("predictions", "response", "verdicts")
+    }
+    (tmp_path / "old.json").write_text(json.dumps(table))
+    old = jaxos4.read_result(tmp_path / "old.json")
+    assert (old.predictions, old.response, old.verdicts) == (None, None, {})
+    write_flight_page(tmp_path / "old.html", old)
+    assert "Measured and predicted" not in (tmp_path / "old.html").read_text(encoding="utf-8")
+
+
+def test_predictions_in_a_file_are_few_and_on_short_lines(tmp_path):
+    many = synthetic_predictions(4000).thinned(1000)
+    np.testing.assert_array_equal(many.start, synthetic_predictions(4000).start[::4])
+    np.testing.assert_allclose(many.predicted, synthetic_predictions(4000).predicted[::4], atol=5.1e-5)
+    found = identified_vehicle(predictions=synthetic_predictions(4000).thinned(2000))
+    written(found, tmp_path / "found.json")
+    assert (tmp_path / "found.json").stat().st_size < 1e6
+    assert '"horizons": [0.1, 0.248, 0.5]' in (tmp_path / "found.json").read_text()
+
+
+def shown(path):
+    """All that is made of a result's file."""
+    found = jaxos4.read_result(path)
+    text_of(found)
+    if found.is_vehicle:
+        write_flight_page(path.with_suffix(".html"), found)
+
+
+WRONG = [
+    (("predictions", "start", 1), 5, "`predictions`: starts must increase"),
+    (("predictions", "horizons", 0), -1.0, "`predictions`"),
+    (("predictions", "measured", 0), [], "`predictions.measured`"),
+    (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
+    (("response", "roll", "phase"), [1.0], "`response.roll.phase`: has another shape"),
+    (("response", "yaw"), {}, "`response.yaw.frequency`: is not an array"),
+    (("skill", "horizons"), [0.1], "`skill`"),
+    (("constants", "Ix", "std"), -1.0, "`std`: is negative"),
+    (("constants", "other"), 1.0, "'other' is no name"),
+    (("sample_times", 0, "sample_time"), 0.0, "`sample_time`: is not positive"),
+    (("cost",), float("nan"), "`cost`"),
+    (("airframe", "mass"), -1.0, "`mass` must be"),
+    (("result",), "unheard", "`result` unheard"),
+]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"), WRONG, ids=lambda x: ".".join(map(str, x)) if isinstance(x, tuple) else ""
+)
+def test_what_no_result_has_is_named(run, tmp_path, place, value, said):
+    table = identified_vehicle(**FULL).to_dict()
+    holder = table
+    for key in place[:-1]:
+        holder = holder[key]
+    holder[place[-1]] = value
+    (tmp_path / "found.json").write_text(json.dumps(table))
+    refused(run("report", "found.json"), "found.json: ", said)
+    assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
+
+
+def test_a_damaged_result_ends_in_one_line(tmp_path):
+    path = tmp_path / "found.json"
+    few = identified_vehicle(**FULL, predictions=synthetic_predictions(6)).to_dict()
+    tables = [json.dumps(few), json.dumps(identified_flight().to_dict())]
+
+    @given(data=st.data())
+    @settings(max_examples=25)
+    def law(data):
+        tree = json.loads(data.draw(st.sampled_from(tables)))
+        for _ in range(data.draw(st.integers(1, 3))):
+            places = list(nodes(tree))
+            holder, key = places[data.draw(st.integers(0, len(places) - 1))]
+            holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(STRANGE))))
+        path.write_text(json.dumps(tree), encoding="utf-8")
+        in_one_line(shown, path)
+
+    law()
