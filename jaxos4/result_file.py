@@ -158,7 +158,8 @@ def _response(table: dict[str, dict[str, Any]] | None) -> FrequencyResponse | No
     axes = {}
     for name in FrequencyResponse._fields:
         arrays = axes[name] = _arrays(AxisResponse, table.get(name, {}), f"response.{name}")
-        frequency, unusable = arrays["frequency"], (arrays["gain"] <= 0) | (arrays["error"] < 0)
+        frequency = arrays["frequency"]
+        unusable = (arrays["gain"] <= 0) | (arrays["error"] < 0) | (arrays["half_width"] < 0)
         if not (frequency > 0).all() or not (np.diff(frequency) > 0).all() or unusable.any():
-            raise InputError(f"`response.{name}`: frequencies must increase, and gains be positive; {_AGAIN}")
+            raise InputError(f"`response.{name}`: frequencies must increase, gains and errors be positive; {_AGAIN}")
     return FrequencyResponse(**{name: AxisResponse(**arrays) for name, arrays in axes.items()})

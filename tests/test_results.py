@@ -3,19 +3,23 @@
 import io
 import json
 
-import jaxos4
+import equinox as eqx
+import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
 from rich.console import Console
 from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
 from test_doors import STRANGE, in_one_line, nodes
+from test_report import stands_alone, words
 
+import jaxos4
 from jaxos4.cli._output import write_json
-from jaxos4.identification.results import Disturbance, ParameterEstimate
-from jaxos4.report import print_identification, write_flight_page
+from jaxos4.identification.results import Constant, Disturbance, RigidBody
+from jaxos4.identification.verdict import Verdict
+from jaxos4.report import print_comparison, print_identification, write_flight_page
 
 FULL = {
     "sample_times": SAMPLE_TIMES,
@@ -89,6 +93,7 @@ def shown(path):
     """All that is made of a result's file."""
     found = jaxos4.read_result(path)
     text_of(found)
+    print_comparison(Console(file=io.StringIO()), jaxos4.compare_results([found, path]))
     if found.is_vehicle:
         write_flight_page(path.with_suffix(".html"), found)
 
@@ -122,6 +127,77 @@ def test_what_no_result_has_is_named(run, tmp_path, place, value, said):
     (tmp_path / "found.json").write_text(json.dumps(table))
     refused(run("report", "found.json"), "found.json: ", said)
     assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
+
+
+# Comparison
+
+
+def of_inertias(ix, std=2e-7, **changes):
+    """A result with this Ix, and an Iy and a Iz that are the same in all results."""
+    table = {"Ix": Constant(ix, std, "kg m^2"), "Iy": Constant(1.7e-5, 2e-7, "kg m^2")}
+    return identified_vehicle(rigid_body=RigidBody(table), verdicts={}, **changes)
+
+
+AGREE = (1.66e-5, 1.69e-5, 1.64e-5)
+
+
+@pytest.fixture
+def files(tmp_path):
+    for i, ix in enumerate((*AGREE, 1.9e-5)):
+        write_json(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}).to_dict(), tmp_path / f"{i}.json")
+    return [f"{i}.json" for i in range(4)]
+
+
+def test_three_results_that_agree_are_pooled_and_one_that_does_not_is_named(run, tmp_path, files):
+    code, out, err = run("compare", *files[:3])
+    assert (code, err) == (0, "")
+    assert out.startswith("The results agree in 2 of 2 quantities: Ix, Iy.")
+    agree = jaxos4.compare_results([tmp_path / name for name in files[:3]])
+    ix, iy = agree.quantities
+    errors = (np.array(AGREE) - np.mean(AGREE)) / 2e-7
+    assert ix.value == pytest.approx(np.mean(AGREE))
+    assert ix.chi2 == pytest.approx(errors @ errors)
+    assert ix.p == pytest.approx(np.exp(-ix.chi2 / 2))  # chi-squared with two degrees of freedom
+    widened = max(1.0, np.sqrt(ix.chi2 / 2))
+    assert ix.std == pytest.approx(2e-7 / np.sqrt(3) * widened)
+    assert iy.std == pytest.approx(2e-7 / np.sqrt(3))
+    assert (agree.different, iy.p) == ((), pytest.approx(1.0))
+    code, out, err = run("compare", *files, "--report", "page.html")
+    assert code == 1
+    assert err == "jaxos4: the results differ by more than chance: see the quantities that differ\n"
+    assert "differ by more than chance in 1 of 2 quantities: Ix (p = " in " ".join(out.split())
+    assert "3.json" in out
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    stands_alone(page)
+    assert all(said in words(page) for said in ("Ix (p = ", "1.90e-5", "differ", "3.json"))
+    (different,) = jaxos4.compare_results([tmp_path / name for name in files]).different
+    assert different.name == "Ix"
+
+
+def test_what_a_verdict_refuses_is_shown_and_does_not_count(tmp_path):
+    refusing = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
+    results = [of_inertias(ix) for ix in AGREE]
+    wrong = msgspec.structs.replace(of_inertias(9e-5), verdicts=refusing, result="implausible")
+    found = jaxos4.compare_results([*results, wrong])
+    assert found.quantities[0].used == (True, True, True, False)
+    assert found.quantities[0].value == pytest.approx(np.mean(AGREE))
+    console = Console(width=80, file=io.StringIO())
+    print_comparison(console, found)
+    assert "not counted: contradicted" in console.file.getvalue()
+    assert "not to be trusted as a whole" in console.file.getvalue()
+
+
+def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):
+    refused(run("compare", "0.json"), "two results or more")
+    refused(run("compare", "--report", "page.html"), "--report: is for a comparison of results")
+    refused(run("compare", *files, "--quick"), "--quick: is for a comparison of estimators")
+    write_json(identified_flight().to_dict(), tmp_path / "os4.json")
+    refused(run("compare", "0.json", "os4.json"), "os4.json: is of the published model")
+    heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, jnp.asarray(0.03))
+    other = of_inertias(1.66e-5, airframe=heavy)
+    notes = jaxos4.compare_results([of_inertias(1.66e-5), other]).notes
+    assert any("airframes differ in `mass`" in note for note in notes)
+    assert any("flight.csv was fitted in several results" in note for note in notes)
 
 
 def test_a_damaged_result_ends_in_one_line(tmp_path):

@@ -1,5 +1,6 @@
 """`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
 
+import shlex
 import time
 from functools import partial
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from ..errors import InputError, named
+from ..errors import InputError, named, printable
 from ._options import ESTIMATORS
 from ._output import check_outputs, stages
 
@@ -111,10 +112,51 @@ def report(
 
 
 def compare(
+    results: Annotated[
+        list[Path] | None,
+        Argument(
+            metavar="[RESULT.json...]", help="Files of `estimate --out` to compare. Without them: all estimators."
+        ),
+    ] = None,
+    page: Annotated[Path | None, Option("--report", help="With results: an HTML page to write.")] = None,
     out: Annotated[Path | None, Option(help="The folder to write. Default: comparison, or comparison-quick.")] = None,
     quick: Annotated[bool, Option("--quick", help="Only body rates, 128 flights and four estimators.")] = False,
 ) -> None:
-    """Compare all estimators on the standard flight at three noise levels: table, figures, report."""
+    """Compare results of repeated flights; or, without results, all estimators on the standard flight."""
+    if results:
+        if quick or out is not None:
+            raise InputError(f"{'--quick' if quick else '--out'}: is for a comparison of estimators; leave it out.")
+        _compare_results(results, page)
+    elif page is not None:
+        raise InputError("--report: is for a comparison of results; give the files of `jaxos4 estimate --out`.")
+    else:
+        _compare_estimators(out, quick=quick)
+
+
+def _compare_results(results: list[Path], page: Path | None) -> None:
+    """Exit code 1 if the results differ."""
+    check_outputs(*results, report=page)
+    with stages("loading the library") as progress:
+        from rich.console import Console
+
+        from ..comparison import compare_results
+        from ..report import print_comparison, write_comparison
+
+        progress("reading")
+        found = compare_results(results)
+        if page is not None:
+            progress("drawing")
+            command = shlex.join(["jaxos4", "compare", *map(str, results), "--report", str(page)])
+            write_comparison(page, found, command=printable(command))
+    print_comparison(Console(), found)
+    if page is not None:
+        typer.echo(f"report: {page}")
+    if found.different:
+        typer.echo("jaxos4: the results differ by more than chance: see the quantities that differ", err=True)
+        raise typer.Exit(1)
+
+
+def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
     with stages("loading the library"):
         from rich.console import Console

@@ -1,3 +1,4 @@
+from .comparison import print_comparison as print_comparison, write_comparison as write_comparison
 from .identification_page import write_flight_page as write_flight_page
 from .identification_text import (
     identification_summary as identification_summary,

@@ -34,6 +34,7 @@ _INERTIAS = ("Ix", "Iy", "Iz")
 _ELSEWHERE = ("command", "notes")
 # The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
 _HIGHEST, _GAINS = 40.0, (0.2, 5.0)
+_WIDEST = 50.0  # the logarithm of a factor that no figure shows
 _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 0.2, "hspace": 0.6}
 _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 
@@ -183,7 +184,8 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     for row, (name, axis) in enumerate(found._asdict().items()):
         gain, phase, coherence = panels[3 * row : 3 * row + 3]
         degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
-        bands = axis.gain * np.exp([-axis.half_width, axis.half_width]), degrees + np.array([-spread, spread])
+        factor = np.exp(np.minimum(axis.half_width, _WIDEST))
+        bands = np.array([axis.gain / factor, axis.gain * factor]), degrees + np.array([-spread, spread])
         for panel, values, band, model in zip((gain, phase), (axis.gain, degrees), bands, (1.0, 0.0), strict=True):
             panel.plot(axis.frequency, values, color=FAINT, linewidth=0.8)
             low, high = np.where(axis.clear, band, np.nan)
