@@ -2,14 +2,17 @@
 
 import io
 import json
+import sys
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
+from matplotlib.figure import Figure
 from rich.console import Console
 from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
 from test_doors import STRANGE, in_one_line, nodes
@@ -17,6 +20,7 @@ from test_report import stands_alone, words
 
 import jaxos4
 from jaxos4.cli._output import write_json
+from jaxos4.errors import InputError
 from jaxos4.identification.results import Constant, Disturbance, RigidBody
 from jaxos4.identification.verdict import Verdict
 from jaxos4.report import print_comparison, print_identification, write_flight_page
@@ -127,6 +131,97 @@ def test_what_no_result_has_is_named(run, tmp_path, place, value, said):
     (tmp_path / "found.json").write_text(json.dumps(table))
     refused(run("report", "found.json"), "found.json: ", said)
     assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
+
+
+# In Python
+
+
+def test_a_result_shows_itself(tmp_path):
+    found = identified_vehicle(**FULL)
+    assert len(repr(found)) < 200
+    assert repr(found).startswith("<Identification by ibss, flight model: successful, Ix = 1.733e-05 kg m^2")
+    lines = found.summary().splitlines()
+    assert max(map(len, lines)) <= 80
+    place = [
+        next(i for i, line in enumerate(lines) if line.startswith(said)) for said in ("identified: ", "Ix ", "Iz: ")
+    ]
+    assert place == sorted(place)  # verdict, quantities, reservations
+    assert place[1] < 5
+    assert "alpha3" not in found.summary()
+    assert "alpha3" in found.summary(verbose=True)
+    assert any(line.startswith("Ix") and line.endswith("if arms and mass are right") for line in wide(found))
+    shown = found._repr_html_()
+    assert "What was asked is identified: Ix." in shown
+    assert "1.733e-05" in shown
+    evil = identified_vehicle(verdicts={"Ix": Verdict("contradicted", "", ("<script>",))})
+    assert "<script>" not in evil._repr_html_()
+
+
+def wide(found):
+    lines = found.summary(width=120).splitlines()
+    assert max(map(len, lines)) <= 120
+    return lines
+
+
+def test_a_result_as_tables():
+    found = identified_vehicle(**FULL)
+    table = found.to_dataframe()
+    assert list(table.index) == ["Ix", "J_R", "alpha3", "alpha6", "alpha1"]
+    assert table.loc["alpha3", ["kind", "estimate", "low", "bound"]].tolist() == ["parameter", 57712.3, 56708.8, 130.0]
+    assert np.isnan(table.loc["alpha6", "estimate"])
+    assert table.loc["alpha1", "kind"] == "held"
+    data = found.to_dataset()
+    assert data["covariance"].sel(parameter="alpha6", other="alpha6") == 4.0
+    np.testing.assert_array_equal(data["predicted"], found.predictions.predicted)
+    np.testing.assert_allclose(data["start"], 0.004 * found.predictions.start)
+    np.testing.assert_array_equal(data["gain"].sel(axis="pitch"), found.response.pitch.gain)
+    assert set(identified_flight().to_dataset().data_vars) == {"estimate", "std", "low", "high"}
+
+
+@pytest.mark.parametrize(("package", "method"), [("pandas", "to_dataframe"), ("xarray", "to_dataset")])
+def test_a_missing_package_is_named(monkeypatch, package, method):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=f"the package {package} is missing"):
+        getattr(identified_vehicle(), method)()
+
+
+def test_figures_are_on_one_axis_each():
+    found, ax = identified_vehicle(), Figure().add_subplot()
+    assert found.plot.rates("q", horizon=0.1, ax=ax) is ax
+    measured, predicted = (np.asarray(line.get_ydata()) for line in ax.lines)
+    np.testing.assert_allclose(np.delete(measured, 80), found.predictions.measured[:, 0, 1])
+    np.testing.assert_allclose(np.delete(predicted, 80), found.predictions.predicted[:, 0, 1])
+    assert np.isnan(measured[80])  # between the stretches
+    np.testing.assert_allclose(np.delete(ax.lines[0].get_xdata(), 80), 0.004 * found.predictions.start + 0.1)
+    bars = found.plot.inertias(ax=Figure().add_subplot())
+    assert [label.get_text() for label in bars.get_xticklabels()] == ["Ix"]
+    assert bars.lines[1].get_ydata() == [1.733e-5]
+    gain = found.plot.response("pitch", ax=Figure().add_subplot())
+    np.testing.assert_array_equal(gain.lines[0].get_ydata(), found.response.pitch.gain)
+    empty = identified_flight()
+    for wrong, said in (
+        (lambda: found.plot.rates("x"), "`rate`: must be one of p, q, r"),
+        (empty.plot.rates, "no predictions"),
+        (empty.plot.response, "no frequency response"),
+    ):
+        with pytest.raises(InputError, match=said):
+            wrong()
+
+
+def test_identify_takes_paths(tmp_path, monkeypatch):
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=1.0, dt=0.01), dt=0.01)
+    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
+    jaxos4.write_flight(flight, tmp_path / "flight.csv")
+    found = [
+        jaxos4.identify(source, model, estimator="equation-error", validate=tmp_path / "flight.csv")
+        for source in (tmp_path / "flight.csv", str(tmp_path / "flight.csv"), [tmp_path / "flight.csv"])
+    ]
+    assert len({json.dumps(each.to_dict()["parameters"]) for each in found}) == 1
+    assert found[0].provenance.flight == str(tmp_path / "flight.csv")
+    assert found[0].validation.flight == str(tmp_path / "flight.csv")
+    with pytest.raises(FileNotFoundError):
+        jaxos4.identify(tmp_path / "none.csv", model)
 
 
 # Comparison

@@ -1,10 +1,9 @@
 """The result of an identification: typed, and as JSON."""
 
 import math
-from typing import Any, SupportsFloat
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import msgspec
-import numpy as np
 
 from ..airframe import Airframe, airframe_table
 from ..analysis.frequency_response import FrequencyResponse
@@ -12,7 +11,14 @@ from ..analysis.prediction import Predictions
 from ..estimate import Estimate
 from ..results import result_names
 from ..shooting import ShootingProblem
+from .tables import dataframe, dataset, series
 from .verdict import Doubt, Verdict
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+    from ..report import Plots
 
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
 
@@ -289,19 +295,50 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
         fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
         if self.is_vehicle:
-            fields |= {"predictions": _series(self.predictions), "response": _series(self.response)}
+            fields |= {"predictions": series(self.predictions), "response": series(self.response)}
         return msgspec.to_builtins(fields)
 
+    def summary(self, *, verbose: bool = False, width: int = 80) -> str:
+        """What `jaxos4 estimate` prints on a terminal of this width [columns]. `verbose`: with all parameters."""
+        from ..report import identification_summary
 
-def _series(value: Any) -> Any:
-    """A tuple of arrays as dictionaries and lists; `None` for what is not finite."""
-    if value is None:
-        return None
-    if hasattr(value, "_asdict"):
-        return {name: _series(each) for name, each in value._asdict().items()}
-    found = np.asarray(value).astype(object)
-    found[~np.isfinite(value)] = None
-    return found.tolist()
+        return identification_summary(self, verbose=verbose, width=width)
+
+    def __repr__(self) -> str:
+        inertias = "".join(f", {name} = {row.estimate:.4g} kg m^2" for name, row in self.rigid_body.constants.items())
+        return f"<Identification by {self.estimator}, {self.model} model: {self.result}{inertias}; see summary()>"
+
+    def _repr_html_(self) -> str:
+        """Verdict, physical quantities and reservations, for a notebook."""
+        from ..report import identification_html
+
+        return identification_html(self)
+
+    @property
+    def plot(self) -> "Plots":
+        """Figures on one axis each, such as `found.plot.rates()`; see `jaxos4.report.Plots`."""
+        from ..report import Plots
+
+        return Plots(self)
+
+    def to_dataframe(self) -> "pd.DataFrame":
+        """Constants, parameters and held parameters as a pandas DataFrame, one row each by name.
+
+        Columns: `kind` (`"constant"`, `"parameter"`, `"held"`), `unit`, `estimate`, `std`, `low` and `high` (the 95 %
+        interval), `bound`, `note`. NaN: not known.
+
+        **Raises:** `InputError` if pandas is not installed.
+        """
+        return dataframe(self)
+
+    def to_dataset(self) -> "xr.Dataset":
+        """Parameters, covariance, predictions and response as an xarray Dataset.
+
+        Dimensions: `parameter`, `other` (the same names), `start` [s], `horizon` [s], `rate`, `axis`, `frequency` [Hz].
+
+        **Raises:** `InputError` if xarray is not installed.
+        """
+        return dataset(self)
 
 
 APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", "predictions", "response"}

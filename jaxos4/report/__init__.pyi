@@ -1,5 +1,9 @@
 from .comparison import print_comparison as print_comparison, write_comparison as write_comparison
-from .identification_page import write_flight_page as write_flight_page
+from .identification_page import (
+    identification_html as identification_html,
+    write_flight_page as write_flight_page,
+)
+from .identification_plots import Plots as Plots
 from .identification_text import (
     identification_summary as identification_summary,
     print_identification as print_identification,

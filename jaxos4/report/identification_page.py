@@ -19,11 +19,12 @@ from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.inertia import CenterOfMass
 from ..analysis.prediction import Predictions, decisive_horizon
 from ..errors import InputError, printable
-from ..identification.physical import centers_of_mass
+from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Constant, Identification, SampleTime
-from ..identification.verdict import headline
+from ..identification.verdict import headline, reasons
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
+from .identification_text import quantity_rows
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
 
@@ -83,6 +84,13 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         ],
     )
     write_file(path, text)
+
+
+def identification_html(found: Identification) -> str:
+    """Verdict, physical quantities and reservations, for a notebook."""
+    rows = zip(*quantity_rows(physical_quantities(found)), strict=True)
+    lines = [*reasons(found.verdicts, found.doubts), *(f"note: {note}" for note in found.provenance.notes)]
+    return render("summary.html.j2", verdict=verdict(found), rows=list(rows), lines=lines)
 
 
 def verdict(found: Identification) -> str:
