@@ -61,8 +61,7 @@ def identify(
 
     **Returns:** an `Identification`. Check its `result`.
 
-    **Raises:** `InputError` for unusable arguments or flights; `OSError` if a log cannot be read; `TrainingError` if a
-    network cannot be trained.
+    **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
     """
     own = subject if isinstance(subject, Airframe) else getattr(subject, "airframe", None)
     recordings = as_recordings(flights, airframe=own)

@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -48,7 +48,7 @@ def as_recordings(
     `airframe`: of logs that are read, see `jaxos4.read_log`.
     """
     single = isinstance(flights, Recording | str) or not isinstance(flights, Sequence)
-    every: Sequence[Any] = [flights] if single else flights
+    every = [flights] if single else cast(Sequence[Any], flights)
     names = [f"{name} {i + 1}" if len(every) > 1 else name for i in range(len(every))]
     return tuple(as_recording(each, one, airframe) for each, one in zip(every, names, strict=True))
 
@@ -58,8 +58,7 @@ def as_recording(flight: Source, name: str = "flight", airframe: Airframe | None
 
     A path, or arrays by their names, are read as a log of this `airframe`.
 
-    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible, or if a log cannot be used;
-    `OSError` if it cannot be read.
+    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible, or if a log cannot be used.
     """
     if isinstance(flight, Recording):
         return flight

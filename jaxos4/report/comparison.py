@@ -59,8 +59,7 @@ def agreement(found: Comparison) -> str:
     if not tested:
         return "Nothing can be compared: no quantity is identified in two results."
     if not different:
-        which = ", ".join(each.name for each in tested)
-        return f"The results agree in {len(tested)} of {len(tested)} quantities: {which}."
+        return f"The results agree in all {len(tested)} quantities that are identified in two results or more."
     which = ", ".join(f"{each.name} (p = {plain(each.p, 2)})" for each in different)
     return f"The results differ by more than chance in {len(different)} of {len(tested)} quantities: {which}."
 
