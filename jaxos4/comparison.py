@@ -125,11 +125,7 @@ def _names(results: Sequence[Source], every: Sequence[Identification]) -> tuple[
     paths = ["" if isinstance(each, Identification) else os.fspath(each) for each in results]
     short = [Path(path).name for path in paths]
     chosen = short if len({*short}) == len({*paths}) else paths
-    return tuple(printable(name) or ", ".join(_logs(each)) for name, each in zip(chosen, every, strict=True))
-
-
-def _logs(found: Identification) -> tuple[str, ...]:
-    return tuple(found.provenance.flights or (found.provenance.flight or "",))
+    return tuple(printable(name) or ", ".join(each.logs) for name, each in zip(chosen, every, strict=True))
 
 
 def _notes(names: Sequence[str], every: Sequence[Identification]) -> list[str]:
@@ -141,7 +137,7 @@ def _notes(names: Sequence[str], every: Sequence[Identification]) -> list[str]:
             notes.append(
                 f"the airframes differ in `{constant}`: moments of inertia {why}; estimate again with one airframe"
             )
-    logs = [name for each in every for name in _logs(each)]
+    logs = [name for each in every for name in each.logs]
     if twice := sorted({name for name in logs if logs.count(name) > 1}):
         notes.append(f"{twice[0]} was fitted in several results, which are not independent")
     refused = [name for name, each in zip(names, every, strict=True) if not each.successful]

@@ -85,7 +85,7 @@ def vehicle_result(found: Identification | str | os.PathLike[str]) -> Identifica
     own = found if given else read_result(found)
     with named("" if given else found):
         if not own.is_vehicle:
-            which = "only a vehicle (--model flight) can be exported, can predict and has a page"
+            which = "only a vehicle (--model flight) can be exported or can predict"
             raise InputError(f"`model` {shortened(own.model, 40)}: {which}.")
         if not own.covariance:
             raise InputError(f"{own.result}: {_EMPTY}")

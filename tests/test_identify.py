@@ -200,7 +200,7 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     monkeypatch.chdir(vehicle)
     files = ("--out", str(tmp_path / "found.json"), "--report", str(tmp_path / "found.html"))
     logs = ("flight1.csv", "flight2.csv", "--airframe", "airframe.toml", "--terms", ",".join(TERMS))
-    code, page_text, err = run("estimate", *logs, "--sample-time", "0.01", *files)
+    code, page_text, err = run("estimate", *logs, "--sample-time", "0.01", "--verbose", *files)
     assert code == 0, err
     report = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
     assert (report["result"], report["model"]) == ("successful", "flight")

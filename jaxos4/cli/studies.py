@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from ..errors import InputError, named, printable
+from ..errors import InputError, printable
 from ._options import ESTIMATORS
 from ._output import check_outputs, stages
 
@@ -82,7 +82,7 @@ def report(
     source: Annotated[Path, Argument(metavar="SOURCE", help="The folder of a study, or a file of `estimate --out`.")],
     out: Annotated[Path | None, Option(help="Of a file: the page to write. Default: beside it, as .html.")] = None,
 ) -> None:
-    """Write the report of a study: report.html, and figures/ as SVG; or the page of a vehicle that was estimated."""
+    """Write the report of a study: report.html, and figures/ as SVG; or the page of a result."""
     page = source.with_suffix(".html") if out is None else out
     if not source.is_dir():
         check_outputs(source, out=page)
@@ -104,8 +104,7 @@ def report(
 
             found = read_result(source)
             progress("drawing")
-            with named(source):
-                write_flight_page(page, found)
+            write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
         typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")

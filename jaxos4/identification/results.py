@@ -273,6 +273,11 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return self.result not in NO_ANSWER
 
     @property
+    def logs(self) -> tuple[str, ...]:
+        """The names of the flights that were fitted."""
+        return tuple(self.provenance.flights or (self.provenance.flight or "flight",))
+
+    @property
     def reasons(self) -> tuple[str, ...]:
         """Why the estimate cannot be trusted, and what to do; one line each."""
         return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
@@ -288,8 +293,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON.
 
-        `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`; `None`
-        without an answer.
+        `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`.
         """
         apart = APART | (_OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES)
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
@@ -324,8 +328,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def to_dataframe(self) -> "pd.DataFrame":
         """Constants, parameters and held parameters as a pandas DataFrame, one row each by name.
 
-        Columns: `kind` (`"constant"`, `"parameter"`, `"held"`), `unit`, `estimate`, `std`, `low` and `high` (the 95 %
-        interval), `bound`, `note`. NaN: not known.
+        Columns: `kind`, `unit`, `estimate`, `std`, `low` and `high` (the 95 % interval), `bound`, `note`.
 
         **Raises:** `InputError` if pandas is not installed.
         """
@@ -343,6 +346,5 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", "predictions", "response"}
 """Fields that a file holds in another form, or not at all."""
-# Fields that are written of one kind of identification only.
-_OF_FLIGHTS = {"fit", "validation"}
+_OF_FLIGHTS = {"fit", "validation"}  # and those of a vehicle: written of this kind only
 _OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}

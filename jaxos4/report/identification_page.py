@@ -18,7 +18,7 @@ from ..airframe import Airframe
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.inertia import CenterOfMass
 from ..analysis.prediction import Predictions, decisive_horizon
-from ..errors import InputError, printable
+from ..errors import printable
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Constant, Identification, SampleTime
 from ..identification.verdict import headline, reasons
@@ -41,16 +41,14 @@ _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 
 
 def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
-    """Writes the page of an identified vehicle, completely or not at all.
+    """Writes the page of an identification, completely or not at all.
 
     It shows what the result's file holds, so that a result that was read makes the same page. `title`: by default the
     names of the logs.
 
-    **Raises:** `InputError` if the result is of an OS4; `OSError` if the page cannot be written.
+    **Raises:** `OSError` if the page cannot be written.
     """
     check_writable(path)
-    if not found.is_vehicle:
-        raise InputError(f"the result of the {found.model} model has no page: pages are of vehicles (--model flight).")
     look, used = styles([found.estimator])[found.estimator], found.provenance
     center = centers_of_mass(found)
     with drawing():
@@ -66,7 +64,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         drawings = {name: draw(figure, name) for name, figure in figures.items()}
     text = render(
         "identification.html.j2",
-        title=title or ", ".join(printable(Path(name).name) for name in used.flights or ()),
+        title=title or ", ".join(printable(Path(name).name) for name in found.logs),
         found=found,
         verdict=verdict(found),
         headline=headline(found.verdicts, found.doubts),
