@@ -213,6 +213,8 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     assert all(words in page_text for words in ("inertias", "note: "))
     page = (tmp_path / "found.html").read_text(encoding="utf-8")
     assert all(name in page for name in TRUTH)
+    assert run("report", str(tmp_path / "found.json"), "--out", str(tmp_path / "again.html"))[0] == 0
+    assert (tmp_path / "again.html").read_text(encoding="utf-8") == page
     assert report["provenance"]["terms"] == list(TERMS)
     # The log says that it is of a real vehicle, and the page says that this decided.
     chosen = "flight1.csv has commands, not rotor speeds: taken as a real vehicle's (--model flight)"

@@ -88,9 +88,11 @@ def test_predictions_in_a_file_are_few_and_on_short_lines(tmp_path):
     many = synthetic_predictions(4000).thinned(1000)
     np.testing.assert_array_equal(many.start, synthetic_predictions(4000).start[::4])
     np.testing.assert_allclose(many.predicted, synthetic_predictions(4000).predicted[::4], atol=5.1e-5)
-    found = identified_vehicle(predictions=synthetic_predictions(4000).thinned(2000))
+    found = identified_vehicle(predictions=synthetic_predictions(4000).thinned(1200))
     written(found, tmp_path / "found.json")
-    assert (tmp_path / "found.json").stat().st_size < 1e6
+    assert (tmp_path / "found.json").stat().st_size < 5e5
+    write_flight_page(tmp_path / "found.html", found)
+    assert (tmp_path / "found.html").stat().st_size < 6e5
     assert '"horizons": [0.1, 0.248, 0.5]' in (tmp_path / "found.json").read_text()
 
 

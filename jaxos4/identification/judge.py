@@ -33,8 +33,8 @@ from .quantities import doubts_of_flight, flight_quantities, vehicle_quantities
 from .results import RigidBody, SampleTime
 from .verdict import CONTRADICTED, Doubt, Quantity, outcome, verdict_of
 
-# Predictions that a result keeps: 300 kB as JSON.
-_MOST_STARTS = 2000
+# Predictions that a result keeps: those of four minutes, 200 kB of a page.
+_MOST_STARTS = 1200
 _OF_YAW = ("alpha7", "alpha8")
 _NOT_LOWEST = Doubt(
     "max_sweeps",

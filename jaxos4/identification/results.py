@@ -231,7 +231,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
-    - `predictions`: the predictions themselves, at most 2,000 starts.
+    - `predictions`: the predictions themselves, at most 1,200 starts.
     - `response`: the frequency response with the fitted data. `None` without an answer.
     """
 
