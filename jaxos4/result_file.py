@@ -162,4 +162,6 @@ def _response(table: dict[str, dict[str, Any]] | None) -> FrequencyResponse | No
         unusable = (arrays["gain"] <= 0) | (arrays["error"] < 0) | (arrays["half_width"] < 0)
         if not (frequency > 0).all() or not (np.diff(frequency) > 0).all() or unusable.any():
             raise InputError(f"`response.{name}`: frequencies must increase, gains and errors be positive; {_AGAIN}")
+    if any(not np.array_equal(each["frequency"], axes["roll"]["frequency"]) for each in axes.values()):
+        raise InputError(f"`response`: its axes must have the same frequencies; {_AGAIN}")
     return FrequencyResponse(**{name: AxisResponse(**arrays) for name, arrays in axes.items()})

@@ -106,10 +106,12 @@ def shown(path):
 
 WRONG = [
     (("predictions", "start", 1), 5, "`predictions`: starts must increase"),
+    (("predictions", "start", 0), -1, "`predictions`: starts must increase"),
     (("predictions", "horizons", 0), -1.0, "`predictions`"),
     (("predictions", "measured", 0), [], "`predictions.measured`"),
     (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
     (("response", "roll", "phase"), [1.0], "`response.roll.phase`: has another shape"),
+    (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),
     (("response", "yaw"), {}, "`response.yaw.frequency`: is not an array"),
     (("skill", "horizons"), [0.1], "`skill`"),
     (("constants", "Ix", "std"), -1.0, "`std`: is negative"),
@@ -157,6 +159,14 @@ def test_a_result_shows_itself(tmp_path):
     assert "1.733e-05" in shown
     evil = identified_vehicle(verdicts={"Ix": Verdict("contradicted", "", ("<script>",))})
     assert "<script>" not in evil._repr_html_()
+
+
+def test_verdicts_have_colours_on_a_terminal_alone():
+    shown = {"force_terminal": True, "color_system": "standard", "no_color": False}
+    for options, begin in ((shown, "\x1b[32midentified: "), ({"force_terminal": False}, "identified: ")):
+        console = Console(width=80, file=io.StringIO(), **options)
+        print_identification(console, identified_vehicle())
+        assert console.file.getvalue().startswith(begin)
 
 
 def wide(found):

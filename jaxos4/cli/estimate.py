@@ -142,6 +142,8 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
     if out is not None:
         write_json(found.to_dict(), out)
     print_identification(console, found, verbose=verbose)
+    if found.is_vehicle and found.has_answer and not verbose:
+        console.print("--verbose shows all parameters, the noise, and how well rates are predicted", highlight=False)
     if report is not None:
         with stages("drawing"):
             from ..report import write_flight_page

@@ -34,7 +34,7 @@ _INERTIAS = ("Ix", "Iy", "Iz")
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
 # The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
-_HIGHEST, _GAINS = 40.0, (0.2, 5.0)
+HIGHEST, GAINS = 40.0, (0.2, 5.0)
 _WIDEST = 50.0  # the logarithm of a factor that no figure shows
 _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 0.2, "hspace": 0.6}
 _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
@@ -186,7 +186,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     A frequency without a clear response is drawn faintly.
     """
     figure, panels = grid(9, columns=3, height=1.9)
-    top = min(_HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
+    top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
     for row, (name, axis) in enumerate(found._asdict().items()):
         gain, phase, coherence = panels[3 * row : 3 * row + 3]
         degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
@@ -201,7 +201,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
         coherence.plot(axis.frequency, axis.coherence, color=look.color)
         coherence.axhline(0.6, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[1])
         gain.set_yscale("log")
-        gain.set_ylim(_GAINS)
+        gain.set_ylim(GAINS)
         ticks_at(gain.yaxis, _GAIN_TICKS)
         phase.set_ylim(-180, 180)
         phase.yaxis.set_major_locator(MultipleLocator(90))

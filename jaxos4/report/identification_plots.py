@@ -9,6 +9,7 @@ from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
 from ..identification.results import Identification
+from .identification_page import GAINS, HIGHEST
 from .style import BOUND_DASHES, FAINT, INK, log_axis, styles
 
 _RATES, _INERTIAS = ("p", "q", "r"), ["Ix", "Iy", "Iz"]
@@ -76,7 +77,7 @@ class Plots(NamedTuple):
         ax.plot(one.frequency, gain, color=self._color)
         ax.fill_between(one.frequency, gain / factor, gain * factor, color=self._color, alpha=0.25, linewidth=0)
         ax.axhline(1.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
-        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}")
+        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, HIGHEST), ylim=GAINS)
         for which in ("x", "y"):
             log_axis(ax, which)
         return ax

@@ -9,12 +9,15 @@ from rich.console import Console
 from ..estimators import ESTIMATORS
 from ..identification.physical import PhysicalQuantity, physical_quantities
 from ..identification.results import COLOURED, Identification
-from ..identification.verdict import reasons, statuses
+from ..identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED, reasons, statuses
 from ..results import NINETY_FIVE
 from .text import Listing
 
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
+
+# Of the lines that begin with a verdict, on terminals that have colours.
+_COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
 
 Section = Iterator[str | Listing]
 
@@ -34,7 +37,7 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
             if isinstance(part, Listing):
                 part.print_on(console)
             else:
-                console.print(part, markup=False, highlight=False)
+                console.print(part, style=_COLOURS.get(part.split(":")[0]), markup=False, highlight=False)
 
 
 def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:
