@@ -100,6 +100,8 @@ def shown(path):
     """All that is made of a result's file."""
     found = jaxos4.read_result(path)
     text_of(found)
+    assert found._repr_html_()
+    assert len(found.to_dataframe()) >= len(found.to_dataset()["parameter"])
     print_comparison(Console(file=io.StringIO()), jaxos4.compare_results([found, path]))
     write_flight_page(path.with_suffix(".html"), found)
 
