@@ -5,6 +5,7 @@ from . import (
     analysis as analysis,
     bracket as bracket,
     closed_loop as closed_loop,
+    comparison as comparison,
     design as design,
     errors as errors,
     estimate as estimate,
@@ -66,6 +67,7 @@ from .closed_loop import (
     fly_closed_loop as fly_closed_loop,
     random_references as random_references,
 )
+from .comparison import Comparison as Comparison, compare_results as compare_results
 from .design import (
     Design as Design,
     Designed as Designed,
@@ -114,6 +116,7 @@ from .noise import (
     WhiteNoise as WhiteNoise,
 )
 from .recording import Recording as Recording, join as join
+from .result_file import read_result as read_result
 from .results import RESULTS as RESULTS, result_names as result_names
 from .shooting import (
     InnovationsProblem as InnovationsProblem,

@@ -104,7 +104,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def read_json(path: str | os.PathLike[str], remedy: str, largest: float = _LARGEST) -> Any:
-    """The value in a JSON file; `largest`: of its numbers.
+    """The value in a JSON file. `largest`: of its numbers; if it is given, they must be finite too.
 
     **Raises:** `InputError`, which ends with the remedy, if it is no such file or `check_plain` refuses the value;
     `OSError` if the file cannot be read.
@@ -131,7 +131,10 @@ def _read_text(
 
 
 def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST) -> None:
-    """Refuse, at any depth, a text that is not one printable line, and a finite number beyond `largest`."""
+    """Refuse, at any depth, a text that is not one printable line, and a number beyond `largest`.
+
+    By default, infinity and NaN are allowed.
+    """
     pending = [("", value)]
     while pending:
         place, each = pending.pop()
@@ -142,5 +145,7 @@ def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST
             pending += ((place, part) for part in each)
         elif isinstance(each, str) and not each.isprintable():
             raise InputError(f"{path}: `{shortened(place, 80)}` is not one line of text; {remedy}.")
-        elif isinstance(each, int | float) and largest < abs(each) != math.inf:
+        elif isinstance(each, float) and not math.isfinite(each) and largest == _LARGEST:
+            continue
+        elif isinstance(each, int | float) and not abs(each) <= largest:
             raise InputError(f"{path}: `{shortened(place, 80)}` is beyond {largest:.3g}; {remedy}.")

@@ -2,64 +2,166 @@
 
 import os
 import re
+from collections.abc import Iterator
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
 
 from ._files import read_json
+from .airframe import airframe_from_table
+from .analysis.frequency_response import AxisResponse, FrequencyResponse
+from .analysis.prediction import Predictions
 from .errors import InputError, named, shortened
-from .identification.results import (
-    ChannelFit,
-    Constant,
-    Identification,
-    PredictionSkill,
-    ResultFile,
-    SampleTime,
-    Validation,
-)
+from .identification.results import APART, Constant, Identification, RigidBody
+from .results import NAMES
 
 _NAME = re.compile(r"[\w.() -]{1,80}")
-_REMEDY = "give a file of this version's `jaxos4 estimate --out`"
+_REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
+_EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
 _ROUNDING = 1e-6  # of a correlation
+_MOST_SAMPLES = 1 << 40  # of a flight
+
+_FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
+# The fields of a file: those of an `Identification`, with what has another form there.
+_File = msgspec.defstruct(
+    "_File",
+    [
+        *(
+            (field.name, field.type, _FIELD(default=field.default, default_factory=field.default_factory))
+            for field in msgspec.structs.fields(Identification)
+            if field.name not in APART
+        ),
+        ("constants", dict[str, Constant | float | bool]),
+        ("airframe", dict[str, Any] | None),
+        ("predictions", dict[str, Any] | None, None),
+        ("response", dict[str, dict[str, Any]] | None, None),
+    ],
+    kw_only=True,
+)
 
 
-class _Others(msgspec.Struct, frozen=True):
-    """The fields that no command reads yet: a file in which they are of another kind is no result either."""
+def read_result(path: str | os.PathLike[str]) -> Identification:
+    """Read a file that `jaxos4 estimate --out` wrote.
 
-    rollouts: int = 0
-    cost: float | None = None
-    seconds: float = 0.0
-    constants: dict[str, Constant | float | bool] = {}
-    fit: dict[str, ChannelFit] = {}
-    validation: Validation | None = None
-    noise: dict[str, float] = {}
-    widened: dict[str, float] = {}
-    sample_times: tuple[SampleTime, ...] = ()
-    skill: PredictionSkill | None = None
+    The result is that of `jaxos4.identify`, without `estimate` and `problem`. Files of older versions lack
+    `predictions` and `response`.
 
-
-def result_file(found: Identification | str | os.PathLike[str]) -> ResultFile:
-    """The result of a vehicle, or the one in a file, as `ResultFile.of` reads it.
-
-    **Raises:** `InputError`, one line, also for texts, numbers and correlations that no result has; `OSError` if the
-    file cannot be read.
+    **Raises:** `InputError`, one line, if the file is no result, also for texts, numbers and correlations that no
+    result has; `OSError` if it cannot be read.
     """
-    if isinstance(found, Identification):
-        return ResultFile.of(found.to_dict())
-    value = read_json(found, _REMEDY, _LARGEST)
-    file = ResultFile.of(value, found)
-    with named(found):
+    value = read_json(path, _REMEDY, _LARGEST)
+    with named(path):
         try:
-            msgspec.convert(value, _Others)
+            file = msgspec.convert(value, _File)
         except msgspec.ValidationError as error:
-            raise InputError(f"not a result ({shortened(str(error), 200)}); {_REMEDY}.") from None
-        if strange := [each for each in (file.estimator, *file.parameters, *file.held) if not _NAME.fullmatch(each)]:
-            raise InputError(f"{shortened(strange[0], 40)!r} is no name of an estimator or a parameter; {_REMEDY}.")
-        covariance = np.array(file.covariance)
+            raise InputError(f"not a result ({shortened(' '.join(str(error).split()), 200)}); {_REMEDY}.") from None
+        fields = msgspec.structs.asdict(file)
+        constants, tests = {}, {}
+        for name, each in fields.pop("constants").items():
+            (constants if isinstance(each, Constant) else tests)[name] = each
+        if fields["airframe"] is None:
+            raise InputError(f"{fields['result']}: {_EMPTY}")
+        fields |= {
+            "airframe": airframe_from_table(fields["airframe"]),
+            "rigid_body": RigidBody(constants, tests.pop("consistency_p", None), tests.pop("rigid_body", None)),
+            "is_vehicle": fields["model"] == "flight",
+            "predictions": _predictions(fields["predictions"]),
+            "response": _response(fields["response"]),
+        }
+        found = Identification(**fields)
+        if problem := next(_problems(found, tests), None):
+            raise InputError(f"{problem}; {_AGAIN}")
+    return found
+
+
+def vehicle_result(found: Identification | str | os.PathLike[str]) -> Identification:
+    """The result of a vehicle with an estimate: this one, or the one in a file, as `read_result` reads it.
+
+    **Raises:** `InputError`, one line, if it has no vehicle or no estimate; errors of `read_result`.
+    """
+    given = isinstance(found, Identification)
+    own = found if given else read_result(found)
+    with named("" if given else found):
+        if not own.is_vehicle:
+            which = "only a vehicle (--model flight) can be exported or can predict"
+            raise InputError(f"`model` {shortened(own.model, 40)}: {which}.")
+        if not own.covariance:
+            raise InputError(f"{own.result}: {_EMPTY}")
+    return own
+
+
+def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
+    """What no result has, in words."""
+    if found.result not in NAMES:
+        yield f"`result` {shortened(found.result, 40)}: is not a result code"
+    texts = (found.estimator, *found.parameters, *found.held, *found.verdicts, *found.rigid_body.constants, *tests)
+    if strange := [each for each in texts if not _NAME.fullmatch(each)] or list(tests):
+        yield f"{shortened(strange[0], 40)!r} is no name of an estimator, a parameter or a quantity"
+    if found.covariance is not None:
+        count = len(found.parameters)
+        if [len(row) for row in found.covariance] != count * [count]:
+            yield f"`covariance`: is not one of {count} parameters"
+        covariance = np.array(found.covariance).reshape(count, count)
+        if (np.diag(covariance) < 0).any():
+            yield "`covariance`: a variance is negative"
         std = np.sqrt(np.diag(covariance))
         if (np.abs(covariance) > (1 + _ROUNDING) * np.outer(std, std)).any():
-            raise InputError("`covariance`: a correlation exceeds 1; run `jaxos4 estimate` again.")
-        if not file.provenance.sample_time > 0:
-            raise InputError("`sample_time`: is not positive; run `jaxos4 estimate` again.")
-    return file
+            yield "`covariance`: a correlation exceeds 1"
+    if not all(each > 0 for each in (found.provenance.sample_time, *(x.sample_time for x in found.sample_times))):
+        yield "`sample_time`: is not positive"
+    constants = [found.rigid_body.constants, *(each.constants for each in found.sample_times)]
+    deviations = [row.std for table in constants for row in table.values()]
+    if any(std is not None and std < 0 for std in (*deviations, *(row.std for row in found.parameters.values()))):
+        yield "`std`: is negative"
+    fits = [*found.fit.values(), *(() if found.validation is None else (found.validation.fit or {}).values())]
+    if any(each.level < 0 for each in fits):
+        yield "`level`: is negative"
+    if (skill := found.skill) is not None:
+        table = [each for rate in (skill.p, skill.q, skill.r) for each in msgspec.structs.astuple(rate)]
+        if any(len(column) != len(skill.horizons) for column in table):
+            yield "`skill`: does not have one value for each horizon"
+
+
+def _arrays(kind: type, table: dict[str, Any], place: str) -> dict[str, Any]:
+    """The arrays of a named tuple by name, checked against the shapes in its annotations; a missing number is NaN."""
+    arrays, sizes = {}, {"3": 3}
+    for name, hint in get_type_hints(kind).items():
+        try:
+            array = np.array(table[name], dtype=float)
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"`{place}.{name}`: is not an array of numbers; {_AGAIN}") from None
+        names = getattr(hint, "dim_str", "").split()
+        if array.ndim != len(names) or any(
+            sizes.setdefault(each, size) != size for each, size in zip(names, array.shape, strict=True)
+        ):
+            raise InputError(f"`{place}.{name}`: has another shape than the arrays beside it; {_AGAIN}")
+        arrays[name] = array if names else float(array)
+    return arrays
+
+
+def _predictions(table: dict[str, Any] | None) -> Predictions | None:
+    if table is None:
+        return None
+    arrays = _arrays(Predictions, table, "predictions")
+    start, horizons = arrays["start"], arrays["horizons"]
+    usable = start.size and (start >= 0).all() and (start < _MOST_SAMPLES).all() and (np.diff(start) >= 1).all()
+    if not (usable and horizons.size and (horizons > 0).all() and (start % 1 == 0).all()):
+        raise InputError(f"`predictions`: starts must increase, and horizons be positive; {_AGAIN}")
+    return Predictions(**arrays | {"start": start.astype(int)})
+
+
+def _response(table: dict[str, dict[str, Any]] | None) -> FrequencyResponse | None:
+    if table is None:
+        return None
+    axes = {}
+    for name in FrequencyResponse._fields:
+        arrays = axes[name] = _arrays(AxisResponse, table.get(name, {}), f"response.{name}")
+        frequency = arrays["frequency"]
+        unusable = (arrays["gain"] <= 0) | (arrays["error"] < 0) | (arrays["half_width"] < 0)
+        if not (frequency > 0).all() or not (np.diff(frequency) > 0).all() or unusable.any():
+            raise InputError(f"`response.{name}`: frequencies must increase, gains and errors be positive; {_AGAIN}")
+    if any(not np.array_equal(each["frequency"], axes["roll"]["frequency"]) for each in axes.values()):
+        raise InputError(f"`response`: its axes must have the same frequencies; {_AGAIN}")
+    return FrequencyResponse(**{name: AxisResponse(**arrays) for name, arrays in axes.items()})

@@ -1,7 +1,5 @@
 """Identifications that nobody computed, of a flight and of a vehicle, with everything that a page can show."""
 
-from types import SimpleNamespace
-
 import msgspec
 import numpy as np
 from helpers import CRAZYFLIE
@@ -31,8 +29,7 @@ COLOURED = msgspec.structs.replace(WHITE, percent=81.26, level=4.0, correlation=
 CONSTANTS = {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2"), "J_R": Constant(1e-8, 1e-7, "kg m^2")}
 NOTED = {"Ix": msgspec.structs.replace(CONSTANTS["Ix"], note="if arms and mass are right"), "J_R": CONSTANTS["J_R"]}
 COMMON = {"estimator": "ibss", "result": "successful", "rollouts": 812, "cost": 1234.5, "seconds": 35.4}
-COMMON |= dict.fromkeys(("covariance", "estimate"))
-COMMON |= {"problem": SimpleNamespace(model=SimpleNamespace(airframe=CRAZYFLIE))}
+COMMON |= {"covariance": None, "airframe": CRAZYFLIE}
 VERSIONS = {"airframe": "os4", "version": "0", "jax": "0", "device": "cpu", "precision": "float64"}
 
 VERDICTS = {

@@ -49,9 +49,9 @@ def written(path, title="A flight", **changes):
     return text, words(text)
 
 
-def printed(found):
-    console = Console(width=100, file=io.StringIO())
-    print_identification(console, found)
+def printed(found, *, verbose=True, width=100):
+    console = Console(width=width, file=io.StringIO())
+    print_identification(console, found, verbose=verbose)
     return " ".join(console.file.getvalue().split())
 
 
@@ -230,7 +230,7 @@ def test_the_text_of_a_vehicle(tmp_path):
     doubtful = printed(identified_vehicle(disturbances=gusts, widened={"alpha3": 1.7}, verdicts=WRONG, skill=None))
     says(
         doubtful,
-        *("contradicted: Ix. Ix: Ix is negative; check the arms.", "by the factor: alpha3 1.7."),
+        *("contradicted: Ix.", "Ix: Ix is negative; check the arms.", "by the factor: alpha3 1.7."),
         *("their correlation time: p 1.2 rad/s^2 over 0.1 s.", "white noise of the sensors [rad/s; m/s^2]: p 0.02."),
     )
     assert "Predictions" not in doubtful

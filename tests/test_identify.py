@@ -156,7 +156,7 @@ KEYS = {
         {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit"},
     ),
     "vehicle": (
-        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times"},
+        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times", "predictions", "response"},
         {*SETTINGS, "flights", "validate", "terms", "fitted_seconds", "tested_seconds"},
         {"estimate", "std", "bound", "ci95", "unit", "note"},
     ),
@@ -202,7 +202,7 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     monkeypatch.chdir(vehicle)
     files = ("--out", str(tmp_path / "found.json"), "--report", str(tmp_path / "found.html"))
     logs = ("flight1.csv", "flight2.csv", "--airframe", "airframe.toml", "--terms", ",".join(TERMS))
-    code, page_text, err = run("estimate", *logs, "--sample-time", "0.01", *files)
+    code, page_text, err = run("estimate", *logs, "--sample-time", "0.01", "--verbose", *files)
     assert code == 0, err
     report = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
     assert (report["result"], report["model"]) == ("successful", "flight")
@@ -215,6 +215,8 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     assert all(words in page_text for words in ("inertias", "note: "))
     page = (tmp_path / "found.html").read_text(encoding="utf-8")
     assert all(name in page for name in TRUTH)
+    assert run("report", str(tmp_path / "found.json"), "--out", str(tmp_path / "again.html"))[0] == 0
+    assert (tmp_path / "again.html").read_text(encoding="utf-8") == page
     assert report["provenance"]["terms"] == list(TERMS)
     # The log says that it is of a real vehicle, and the page says that this decided.
     chosen = "flight1.csv has commands, not rotor speeds: taken as a real vehicle's (--model flight)"

@@ -9,10 +9,10 @@ import pytest
 from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle
 from synthetic_study import ESTIMATORS, synthetic_study
 
-from jaxos4 import PublishedOS4
+from jaxos4 import PublishedOS4, compare_results
 from jaxos4.design import Design
 from jaxos4.design.task import Designed
-from jaxos4.report import write_flight_page, write_report
+from jaxos4.report import write_comparison, write_flight_page, write_report
 from jaxos4.report.design_page import write_design
 
 pytestmark = pytest.mark.slow
@@ -96,6 +96,9 @@ def addresses(tmp_path_factory):
     }.items():
         files[name] = folder / f"{name}.html"
         write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")
+    long = [identified_vehicle(provenance={"flights": [f"A_flight_with_a_long_name_{i}.csv"]}) for i in range(4)]
+    files["comparison"] = folder / "comparison.html"
+    write_comparison(files["comparison"], compare_results(long))
     for name, given in DESIGNS.items():
         files[name] = folder / f"{name}.svg"
         write_design(synthetic_design(*given), 0.01, files[name])
@@ -135,7 +138,7 @@ def opened(browser, addresses):
 
 
 @pytest.mark.parametrize("width", [390, 768, 1280])
-@pytest.mark.parametrize("name", ["study", "vehicle", "os4", *DESIGNS])
+@pytest.mark.parametrize("name", ["study", "vehicle", "os4", "comparison", *DESIGNS])
 def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
     page = opened(name, width)
     page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true; })")

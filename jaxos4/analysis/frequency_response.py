@@ -23,6 +23,7 @@ _FEWEST = 4
 # The band in which the model is compared [Hz], and the smallest coherence there. Below, the flight controller's answer
 # to disturbances looks like the vehicle's answer to torque. Above, few vehicles move.
 _LOW, _HIGH, _COHERENT = 4.0, 20.0, 0.6
+_BOUNDLESS = 700.0  # a logarithm whose factor is still a number
 # The coherence is averaged over this many frequencies on either side.
 _AROUND = 2
 # Segments overlap by half: the correlation of their spectra, and that of frequencies 0, 1, 2 steps apart (Hann window).
@@ -48,7 +49,7 @@ class Agreement(NamedTuple):
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval of the ratio."""
-        factor = math.exp(NINETY_FIVE * self.error)
+        factor = math.exp(min(NINETY_FIVE * self.error, _BOUNDLESS))
         return self.ratio / factor, self.ratio * factor
 
 

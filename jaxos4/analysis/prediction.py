@@ -40,6 +40,12 @@ class Predictions(NamedTuple):
     predicted: Float[np.ndarray, "starts horizons 3"]
     measured: Float[np.ndarray, "starts horizons 3"]
 
+    def thinned(self, most: int) -> "Predictions":
+        """At most `most` starts, evenly chosen, with rates to 1e-4 rad/s. What is not finite is NaN."""
+        every = max(-(-self.start.size // most), 1)
+        rates = (np.where(np.isfinite(each), each.round(4), np.nan)[::every] for each in self[2:])
+        return Predictions(self.start[::every], self.horizons, *rates)
+
 
 class Skill(NamedTuple):
     """The skill of predictions, compared with persistence: "the rates stay constant".

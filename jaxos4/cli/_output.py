@@ -120,5 +120,8 @@ def write_folder(texts: dict[str, str], folder: Path) -> None:
 
 
 def write_json(report: dict[str, Any], out: Path) -> None:
-    """Writes a JSON file. A number that is not finite is an error of the program."""
-    write_file(out, json.dumps(report, indent=2, allow_nan=False) + "\n")
+    """Writes a JSON file, each list of numbers on one line. A number that is not finite is an error of the program."""
+    text = json.dumps(report, indent=2, allow_nan=False)
+    # No string has a line break, because JSON escapes it.
+    text = re.sub(r"\[(\n\s+[^][{}\"]*)\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
+    write_file(out, text + "\n")

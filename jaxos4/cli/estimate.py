@@ -51,6 +51,9 @@ def estimate(
     holdout: Annotated[float | None, Option(help="Real vehicle: the share to predict; default: 0.25.")] = None,
     report: Annotated[Path | None, Option(help="Real vehicle: an HTML report to write.")] = None,
     out: options.OutOption = None,
+    verbose: Annotated[
+        bool, Option("--verbose", "-v", help="Real vehicle: all parameters, noise and predictions.")
+    ] = False,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
     check_outputs(*flights, airframe, columns, bracket, network, validate, out=out, report=report)
@@ -82,8 +85,7 @@ def estimate(
             progress=progress,
         )
     notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
-    title = ", ".join(printable(path.name) for path in flights)
-    _publish(_with_command(found, airframe or _OS4, notes), out, report, title=title)
+    _publish(_with_command(found, airframe or _OS4, notes), out, report, verbose=verbose)
 
 
 def _subject(
@@ -124,7 +126,7 @@ def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "
     return msgspec.structs.replace(found, doubts=tuple(doubts), verdicts=verdicts, provenance=provenance)
 
 
-def _publish(found: "Identification", out: Path | None, report: Path | None, *, title: str) -> None:
+def _publish(found: "Identification", out: Path | None, report: Path | None, *, verbose: bool) -> None:
     """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
     from rich.console import Console
 
@@ -133,12 +135,14 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
     console = Console()
     if out is not None:
         write_json(found.to_dict(), out)
-    print_identification(console, found)
+    print_identification(console, found, verbose=verbose)
+    if found.is_vehicle and found.has_answer and not verbose:
+        console.print("--verbose shows all parameters, the noise, and how well rates are predicted", highlight=False)
     if report is not None:
         with stages("drawing"):
             from ..report import write_flight_page
 
-            write_flight_page(report, found, title=title)
+            write_flight_page(report, found)
         console.print(f"report: {report}", markup=False, highlight=False)
     end(found.result)
 

@@ -1,5 +1,6 @@
 """`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
 
+import shlex
 import time
 from functools import partial
 from pathlib import Path
@@ -8,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from ..errors import InputError
+from ..errors import InputError, printable
 from ._options import ESTIMATORS
-from ._output import stages
+from ._output import check_outputs, stages
 
 if TYPE_CHECKING:
     from ..study import Study
@@ -78,27 +79,83 @@ def _connected(address: str):
 
 
 def report(
-    directory: Annotated[Path, Argument(metavar="DIR", help="The folder of a study, with its results.nc.")],
+    source: Annotated[Path, Argument(metavar="SOURCE", help="The folder of a study, or a file of `estimate --out`.")],
+    out: Annotated[Path | None, Option(help="Of a file: the page to write. Default: beside it, as .html.")] = None,
 ) -> None:
-    """Write the report of a study: report.html, and figures/ as SVG."""
+    """Write the report of a study: report.html, and figures/ as SVG; or the page of a result."""
+    page = source.with_suffix(".html") if out is None else out
+    if not source.is_dir():
+        check_outputs(source, out=page)
+    elif out is not None:
+        raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
     with stages("loading the library") as progress:
-        from ..report import write_report
-        from ..study import read_results
+        from ..report import write_flight_page, write_report
 
         progress("reading")
-        dataset = read_results(directory)
-        progress("drawing")
-        page, *figures = write_report(dataset, directory)
+        figures: list[Path] = []
+        if source.is_dir():
+            from ..study import read_results
+
+            dataset = read_results(source)
+            progress("drawing")
+            page, *figures = write_report(dataset, source)
+        else:
+            from ..result_file import read_result
+
+            found = read_result(source)
+            progress("drawing")
+            write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
         typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")
 
 
 def compare(
+    results: Annotated[
+        list[Path] | None,
+        Argument(
+            metavar="[RESULT.json...]", help="Files of `estimate --out` to compare. Without them: all estimators."
+        ),
+    ] = None,
+    page: Annotated[Path | None, Option("--report", help="With results: an HTML page to write.")] = None,
     out: Annotated[Path | None, Option(help="The folder to write. Default: comparison, or comparison-quick.")] = None,
     quick: Annotated[bool, Option("--quick", help="Only body rates, 128 flights and four estimators.")] = False,
 ) -> None:
-    """Compare all estimators on the standard flight at three noise levels: table, figures, report."""
+    """Compare results of repeated flights; or, without results, all estimators on the standard flight."""
+    if results:
+        if quick or out is not None:
+            raise InputError(f"{'--quick' if quick else '--out'}: is for a comparison of estimators; leave it out.")
+        _compare_results(results, page)
+    elif page is not None:
+        raise InputError("--report: is for a comparison of results; give the files of `jaxos4 estimate --out`.")
+    else:
+        _compare_estimators(out, quick=quick)
+
+
+def _compare_results(results: list[Path], page: Path | None) -> None:
+    """Exit code 1 if the results differ."""
+    check_outputs(*results, report=page)
+    with stages("loading the library") as progress:
+        from rich.console import Console
+
+        from ..comparison import compare_results
+        from ..report import print_comparison, write_comparison
+
+        progress("reading")
+        found = compare_results(results)
+        if page is not None:
+            progress("drawing")
+            command = shlex.join(["jaxos4", "compare", *map(str, results), "--report", str(page)])
+            write_comparison(page, found, command=printable(command))
+    print_comparison(Console(), found)
+    if page is not None:
+        typer.echo(f"report: {page}")
+    if found.different:
+        typer.echo("jaxos4: the results differ by more than chance: see the quantities that differ", err=True)
+        raise typer.Exit(1)
+
+
+def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
     with stages("loading the library"):
         from rich.console import Console

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import Airframe, airframe_from_table
+from ..airframe import Airframe
 from ..errors import InputError, named, printable
-from ..identification.results import ResultFile
+from ..identification.results import Identification
 from ..linalg import covariance_root
-from ..result_file import result_file
+from ..result_file import vehicle_result
 from .vehicle import CARRIED, INERTIAS, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
@@ -89,20 +89,19 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.
     """
-    file = result_file(path)
+    file = vehicle_result(path)
     with named(path):
-        airframe = airframe_from_table(file.airframe or {})
         values, estimated, notes = _parts(file)
         negative = [name for name in NOT_NEGATIVE if values.get(name, 0.0) < 0]
         notes += [f"{name}: came out negative, which is impossible; it is 0 here" for name in negative]
-        if not np.isfinite(airframe.max_rotor_speed):
+        if not np.isfinite(file.airframe.max_rotor_speed):
             notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
         drawn = tuple(name for name in estimated if name not in negative)
         places = [list(file.parameters).index(name) for name in drawn]
         found = Identified(
             source=f"{printable(Path(path).name)} ({file.estimator}, {file.model} model, {file.result})",
             result=file.result,
-            airframe=airframe,
+            airframe=file.airframe,
             values=_clipped(values),
             drawn=drawn,
             covariance=np.array(file.covariance)[np.ix_(places, places)],
@@ -124,12 +123,12 @@ def _vehicles_own(name: str) -> str:
     return re.sub(r"_\d+$", "", name)
 
 
-def _parts(file: ResultFile) -> tuple[dict[str, float], list[str], list[str]]:
+def _parts(file: Identification) -> tuple[dict[str, float], list[str], list[str]]:
     """Values by name, the names of those that were estimated, and notes."""
-    rows, notes = file.parameters, []
+    rows, constants, notes = file.parameters, file.rigid_body.constants, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
     for moment, name in INERTIAS.items():
-        if file.constants and moment not in file.constants:
+        if constants and moment not in constants:
             found.pop(name, None)  # the estimate says that this one is not to be trusted
     if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SIGNIFICANT * found["rotor_reaction"][1]:
         del found["rotor_reaction"]

@@ -11,11 +11,10 @@ from jaxtyping import Float, Int
 
 from .._custom_types import as_float
 from ..errors import InputError
-from ..flight import Flight
 from ..identification import Identification
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording import preparation
-from ..recording.pieces import Recording, as_recording
+from ..recording.pieces import Recording, Source, as_recording
 from ..recording.preparation import Prepared
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
@@ -32,7 +31,7 @@ _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
 def predict(
     found: Identification | Vehicle | str | os.PathLike[str],
-    flight: Flight | Recording,
+    flight: Source,
     *,
     horizon: float = 0.5,
     sample_time: float | None = None,
@@ -41,7 +40,7 @@ def predict(
 ) -> FlightPrediction:
     """Predict position, velocity, attitude and body rates from many starts of a flight, with its rotor speeds.
 
-        prediction = jaxos4.predict("found.json", jaxos4.read_flight("flight.csv", airframe))
+        prediction = jaxos4.predict("found.json", "flight.csv")
         prediction.quality["attitude"].error       # by horizon [rad]
 
     A prediction begins with the measured position, velocity and attitude, and with the rates and disturbances that
@@ -56,8 +55,8 @@ def predict(
 
     - `found`: the identification of a vehicle, or the file that `jaxos4 estimate --out` wrote, or what
       `jaxos4.forecast.vehicle_of` makes of one of these.
-    - `flight`: has body rates and attitude at least. Without a velocity, predictions begin with that of dead
-      reckoning, or at rest; what was not measured is not compared.
+    - `flight`: or the path of a log. It has body rates and attitude at least. Without a velocity, predictions begin
+      with that of dead reckoning, or at rest; what was not measured is not compared.
     - `horizon`: how far ahead [s].
     - `sample_time`: the log is averaged to it [s]. Default: that of the fit.
     - `spacing`: the time between two starts [s]; 0: at each sample.
@@ -69,7 +68,8 @@ def predict(
     arguments; `OSError` if `found` cannot be read.
     """
     _check_options(horizon, spacing, seed)
-    vehicle, recording = found if isinstance(found, Vehicle) else vehicle_of(found), as_recording(flight)
+    vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
+    recording = as_recording(flight, airframe=vehicle.model.airframe)
     prepared = _prepare(vehicle, recording, sample_time)
     measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
@@ -80,7 +80,8 @@ def predict(
     begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed)
     ahead = start[:, None] + np.arange(1, steps + 1)
     gravity = float(vehicle.model.airframe.gravity)
-    trained = Measured.of(found.problem.flight) if isinstance(found, Identification) else measured.first_half
+    fitted = found.problem if isinstance(found, Identification) else None
+    trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
     sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(

@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import Parameters
-from ..airframe import airframe_from_table
 from ..errors import InputError, named, printable, shortened
 from ..flight import FORCE_NAMES
 from ..identification.results import Identification
 from ..linalg import covariance_root
 from ..models.terms import TERMS
 from ..models.vehicle import FlightModel
-from ..result_file import result_file
+from ..result_file import vehicle_result
 from ..shooting.gains import LogNoise
 
 _LEAST = 1e-9  # of a noise level, whose logarithm must be finite
@@ -58,16 +57,16 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
 
     **Raises:** `InputError`, one line, if the result has no vehicle or no estimate; `OSError` if it cannot be read.
     """
-    file = result_file(found)
+    file = vehicle_result(found)
     given = isinstance(found, Identification)
     name = f"{file.estimator}, {file.model} model" if given else printable(Path(found).name)
     with named("" if given else found):
-        used, airframe = file.provenance, airframe_from_table(file.airframe or {})
+        used = file.provenance
         if strangers := [term for term in used.terms or () if term not in TERMS]:
             raise InputError(
                 f"the term {shortened(strangers[0], 40)} is not of this version; run `jaxos4 estimate` again."
             )
-        model = FlightModel(airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
+        model = FlightModel(file.airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
         known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
         known |= {row: each.value for row, each in file.held.items()}
         alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))

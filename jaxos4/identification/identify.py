@@ -11,10 +11,10 @@ import numpy as np
 from ..airframe import Airframe
 from ..errors import InputError
 from ..estimate import AbstractEstimator
-from ..flight import CHANNEL_NAMES, Flight
+from ..flight import CHANNEL_NAMES
 from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
-from ..recording.pieces import Recording, as_recordings
+from ..recording.pieces import Source, as_recording, as_recordings
 from .answers import channel_fits
 from .fit import Fit, fit_case
 from .judge import judge
@@ -25,31 +25,29 @@ from .results import Identification, SampleTime, finite_or_none
 from .sample_time import answer_of, fit_at_sample_times
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
 
-Flights = Flight | Recording | Sequence[Flight | Recording]
-
 
 def identify(
-    flights: Flights,
+    flights: Source | Sequence[Source],
     subject: AbstractModel | Airframe,
     *,
     settings: FlightSettings | VehicleSettings | None = None,
     estimator: str | AbstractEstimator | None = None,
     bracket: Intervals = None,
     network: TrainedNetwork | str | os.PathLike[str] | None = None,
-    validate: Flight | Recording | None = None,
+    validate: Source | None = None,
     seed: int = 0,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> Identification:
     """Identify an OS4 model from one flight, or a real vehicle from one or several recordings.
 
-        found = jaxos4.identify(flight, jaxos4.PublishedOS4())
-        found.parameters["alpha3"].ci95
+        found = jaxos4.identify("flight.csv", jaxos4.load_airframe("mine.toml"))
+        print(found.summary())
 
     The noise levels of the sensors are estimated too. `jaxos4 estimate` calls this function.
 
     **Arguments:**
 
-    - `flights`: a `Flight`, a `Recording` (a flight with a name), or several for a vehicle.
+    - `flights`: the path of a log, a `Flight`, a `Recording` (a flight with a name), or several for a vehicle.
     - `subject`: a model in alpha_1..8, such as `PublishedOS4()`, or the `Airframe` of a real vehicle.
     - `settings`: how to look at the flights: `FlightSettings` for a model, `VehicleSettings` for an airframe.
     - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
@@ -57,7 +55,7 @@ def identify(
       for example `"ibss"`.
     - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
     - `network`: for a model, a trained network or its file; without it, an estimator that needs a network trains one.
-    - `validate`: another flight, which is not fitted but predicted.
+    - `validate`: another flight or path, which is not fitted but predicted.
     - `seed`: for training a network.
     - `progress`: called with the name of each stage.
 
@@ -65,10 +63,11 @@ def identify(
 
     **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
     """
-    recordings = as_recordings(flights)
+    own = subject if isinstance(subject, Airframe) else getattr(subject, "airframe", None)
+    recordings = as_recordings(flights, airframe=own)
     if not recordings:
         raise InputError("`flights`: holds no flight; give one.")
-    other = None if validate is None else as_recordings(validate, "validation flight")[0]
+    other = None if validate is None else as_recording(validate, "validation flight", own)
     begin = time.perf_counter()
     common = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other}
     sample_times: tuple[SampleTime, ...] = ()
@@ -78,8 +77,8 @@ def identify(
         choose, method = wanted.sample_time is None, estimator or DEFAULT
         case, fit, sample_times = _fit_vehicle(cases, method, choose=choose, seed=seed, progress=progress)
     else:
-        own = own_settings(FlightSettings, settings)
-        case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
+        asked = own_settings(FlightSettings, settings)
+        case = prepare_flight(recordings, subject, asked, seed=seed, progress=progress, **common)
         fit = fit_case(case, progress=progress)
     judged = judge(case, fit, sample_times, progress=progress)
     return describe(case, fit, judged, sample_times, time.perf_counter() - begin)
@@ -124,6 +123,7 @@ def describe(
         seconds=seconds,
         provenance=msgspec.structs.replace(case.provenance, notes=notes),
         covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
+        airframe=fit.problem.model.airframe,
         estimate=fit.estimate,
         problem=fit.problem,
         is_vehicle=case.is_vehicle,

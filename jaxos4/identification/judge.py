@@ -33,6 +33,8 @@ from .quantities import doubts_of_flight, flight_quantities, vehicle_quantities
 from .results import RigidBody, SampleTime
 from .verdict import CONTRADICTED, Doubt, Quantity, outcome, verdict_of
 
+# Predictions that a result keeps: those of four minutes, 200 kB of a page.
+_MOST_STARTS = 1200
 _OF_YAW = ("alpha7", "alpha8")
 _NOT_LOWEST = Doubt(
     "max_sweeps",
@@ -110,7 +112,7 @@ def _judge_vehicle(case: Case, fit: Fit, sample_times: Sequence[SampleTime], pro
         "rigid_body": body,
         "notes": notes,
         "skill": skill,
-        "predictions": predicted,
+        "predictions": None if predicted is None else predicted.thinned(_MOST_STARTS),
         "response": frequency_response(with_room(fit.problem, case.room), values),
         **_verdicts(fit, quantities, doubts, is_vehicle=True),
     }

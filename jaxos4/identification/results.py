@@ -1,19 +1,24 @@
 """The result of an identification: typed, and as JSON."""
 
 import math
-import os
-from typing import Any, SupportsFloat
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import msgspec
 
-from ..airframe import airframe_table
+from ..airframe import Airframe, airframe_table
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
-from ..errors import InputError, named, shortened
 from ..estimate import Estimate
-from ..results import NAMES, result_names
+from ..results import result_names
 from ..shooting import ShootingProblem
+from .tables import dataframe, dataset, series
 from .verdict import Doubt, Verdict
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+    from ..report import Plots
 
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
 
@@ -194,7 +199,9 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """The parameters of a quadrotor, with what a user needs to judge them. Made by `jaxos4.identify`.
+    """The parameters of a quadrotor, with what a user needs to judge them.
+
+    Made by `jaxos4.identify`, or read from a file by `jaxos4.read_result`.
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
@@ -207,8 +214,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `doubts`: what speaks against the estimate, and how far it would move each quantity.
     - `provenance`: inputs, settings, versions, and notes about the data.
     - `covariance`: of `parameters`; `None` without an answer.
+    - `airframe`: the constants that were not estimated.
     - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the noise levels
-      that were found; not in `to_dict`.
+      that were found. Files do not hold them: `None` if the result was read from one.
 
     Only of a flight of an OS4:
 
@@ -223,24 +231,25 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
-    - `predictions`: the predictions themselves; not in `to_dict`.
-    - `response`: the frequency response with the fitted data; not in `to_dict`. `None` without an answer.
+    - `predictions`: the predictions themselves, at most 1,200 starts.
+    - `response`: the frequency response with the fitted data. `None` without an answer.
     """
 
     estimator: str
     model: str
     result: str
-    rollouts: int
-    cost: float | None
-    seconds: float
+    rollouts: int = 0
+    cost: float | None = None
+    seconds: float = 0.0
     parameters: dict[str, ParameterEstimate]
     rigid_body: RigidBody = RigidBody()
     verdicts: dict[str, Verdict] = {}
     doubts: tuple[Doubt, ...] = ()
     provenance: Provenance
     covariance: list[list[float]] | None
-    estimate: Estimate
-    problem: ShootingProblem
+    airframe: Airframe
+    estimate: Estimate | None = None
+    problem: ShootingProblem | None = None
     is_vehicle: bool
     fit: dict[str, ChannelFit] = {}
     validation: Validation | None = None
@@ -264,6 +273,16 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return self.result not in NO_ANSWER
 
     @property
+    def logs(self) -> tuple[str, ...]:
+        """The names of the flights that were fitted."""
+        return tuple(self.provenance.flights or (self.provenance.flight or "flight",))
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the estimate cannot be trusted, and what to do; one line each."""
+        return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
+
+    @property
     def motor_clock(self) -> str:
         """How late motors are recorded, if `rotor_delay` is clearly negative; else empty."""
         delay = self.parameters.get("rotor_delay")
@@ -274,63 +293,58 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON.
 
-        `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`; `None`
-        without an answer.
+        `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`.
         """
-        apart = {"rigid_body", "estimate", "problem", "is_vehicle", "predictions", "response"}
-        apart |= _OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES
+        apart = APART | (_OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES)
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
-        computed = {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.problem.model.airframe)}
-        return msgspec.to_builtins(fields | computed)
+        fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
+        if self.is_vehicle:
+            fields |= {"predictions": series(self.predictions), "response": series(self.response)}
+        return msgspec.to_builtins(fields)
 
+    def summary(self, *, verbose: bool = False, width: int = 80) -> str:
+        """What `jaxos4 estimate` prints on a terminal of this width [columns]. `verbose`: with all parameters."""
+        from ..report import identification_summary
 
-# Fields that are written of one kind of identification only.
-_OF_FLIGHTS = {"fit", "validation"}
-_OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}
+        return identification_summary(self, verbose=verbose, width=width)
 
+    def __repr__(self) -> str:
+        inertias = "".join(f", {name} = {row.estimate:.4g} kg m^2" for name, row in self.rigid_body.constants.items())
+        return f"<Identification by {self.estimator}, {self.model} model: {self.result}{inertias}; see summary()>"
 
-class ResultFile(msgspec.Struct, frozen=True, kw_only=True):
-    """The fields of `Identification.to_dict` that an export or a prediction needs."""
+    def _repr_html_(self) -> str:
+        """Verdict, physical quantities and reservations, for a notebook."""
+        from ..report import identification_html
 
-    estimator: str
-    model: str
-    result: str
-    parameters: dict[str, ParameterEstimate]
-    provenance: Provenance
-    covariance: list[list[float]] | None
-    held: dict[str, HeldParameter] = {}
-    doubts: tuple[Doubt, ...] = ()
-    disturbances: dict[str, Disturbance] = {}
-    constants: dict[str, Any]
-    airframe: dict[str, Any] | None
+        return identification_html(self)
 
     @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why the estimate cannot be trusted, and what to do; one line each."""
-        return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
+    def plot(self) -> "Plots":
+        """Figures on one axis each, such as `found.plot.rates()`; see `jaxos4.report.Plots`."""
+        from ..report import Plots
 
-    @classmethod
-    def of(cls, found: Any, name: str | os.PathLike[str] = "") -> "ResultFile":
-        """The result of a vehicle, from `Identification.to_dict` or from the values of a file called `name`.
+        return Plots(self)
 
-        **Raises:** `InputError`, one line, if it is no result, has no vehicle or no estimate, or is not of this
-        version.
+    def to_dataframe(self) -> "pd.DataFrame":
+        """Constants, parameters and held parameters as a pandas DataFrame, one row each by name.
+
+        Columns: `kind`, `unit`, `estimate`, `std`, `low` and `high` (the 95 % interval), `bound`, `note`.
+
+        **Raises:** `InputError` if pandas is not installed.
         """
-        remedy, again = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
-        with named(name):
-            try:
-                own = msgspec.convert(found, cls)
-            except msgspec.MsgspecError as error:
-                what = " ".join(str(error).split())[:200]
-                raise InputError(f"not a result ({what}); {remedy}.") from None
-            if own.model != "flight":
-                which = "only a vehicle (--model flight) can be exported or can predict"
-                raise InputError(f"`model` {shortened(own.model, 40)}: {which}.")
-            if own.result not in NAMES:
-                raise InputError(f"`result` {shortened(own.result, 40)}: is not a result code; {again}")
-            if not own.covariance or own.airframe is None:
-                raise InputError(f"{own.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
-            rows, count = own.covariance, len(own.parameters)
-            if [len(row) for row in rows] != count * [count] or any(row[i] < 0 for i, row in enumerate(rows)):
-                raise InputError(f"`covariance`: is not one of {count} parameters; {again}")
-            return own
+        return dataframe(self)
+
+    def to_dataset(self) -> "xr.Dataset":
+        """Parameters, covariance, predictions and response as an xarray Dataset.
+
+        Dimensions: `parameter`, `other` (the same names), `start` [s], `horizon` [s], `rate`, `axis`, `frequency` [Hz].
+
+        **Raises:** `InputError` if xarray is not installed.
+        """
+        return dataset(self)
+
+
+APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", "predictions", "response"}
+"""Fields that a file holds in another form, or not at all."""
+_OF_FLIGHTS = {"fit", "validation"}  # and those of a vehicle: written of this kind only
+_OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}

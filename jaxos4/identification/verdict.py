@@ -3,7 +3,7 @@
 A doubt counts against a quantity by how far the quantity would move if the doubt were true.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -145,17 +145,34 @@ def _reason(doubt: Doubt, name: str) -> str:
 
 def headline(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
     """The quantities by their status, then each reason with the quantities that it concerns, then mere notes."""
-    lines, reasons = [], {}
+    return [*statuses(verdicts), *reasons(verdicts, doubts)]
+
+
+def statuses(verdicts: dict[str, Verdict], tabled: Collection[str] = ()) -> list[str]:
+    """The quantities by their status. `tabled`: those whose value stands in a table, and not here."""
+    lines = []
     for status in STATUSES:
         shown = {name: verdict for name, verdict in verdicts.items() if verdict.status == status}
-        said = [f"{name} {verdict.value}" if verdict.trusted else name for name, verdict in shown.items()]
-        lines += [f"{status}: {'; '.join(map(str.strip, said))}."] * bool(said)
-        for name, verdict in shown.items():
-            for reason in verdict.reasons:
-                reasons.setdefault(reason, []).append(name)
-    lines += [f"{', '.join(names)}: {reason}." for reason, names in reasons.items()]
+        said = [
+            f"{name} {verdict.value}".strip() if verdict.trusted and name not in tabled else name
+            for name, verdict in shown.items()
+        ]
+        lines += [f"{status}: {(', ' if tabled else '; ').join(said)}."] * bool(said)
+    return lines
+
+
+def reasons(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
+    """Each reason with the quantities that it concerns, then mere notes."""
+    concerned: dict[str, list[str]] = {}
+    for status in STATUSES:
+        for name, verdict in verdicts.items():
+            for reason in verdict.reasons if verdict.status == status else ():
+                concerned.setdefault(reason, []).append(name)
     notes = [doubt for doubt in doubts if all(weight(doubt, name) == IDENTIFIED for name in verdicts)]
-    return [*lines, *(f"note: {doubt}. It moves nothing." for doubt in notes if verdicts)]
+    return [
+        *(f"{', '.join(names)}: {reason}." for reason, names in concerned.items()),
+        *(f"note: {doubt}. It moves nothing." for doubt in notes if verdicts),
+    ]
 
 
 def outcome(search: str, required: Sequence[str], verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> str:

@@ -1,14 +1,16 @@
 """Flights as recordings, and their pieces: cut, averaged, joined, divided into measurements to fit and to predict."""
 
 import math
+import os
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
-from ..logs import FORMATS, Recording as Recording, Table
+from ..logs import FORMATS, Recording as Recording, Table, read_recording
 from ..logs.sampling import averages, speeds_within
 
 # Sample times that differ by less than this share are equal.
@@ -16,6 +18,10 @@ _EQUAL_STEPS = 1e-6
 # Length of a block that is held out [s]: each part of a flight then has blocks of both kinds.
 _BLOCK = 5.0
 _ROUNDING = 1e-9  # of sums of shares
+
+
+Source = Flight | Recording | str | os.PathLike[str] | Any
+"""A flight, the path of a log, or its arrays as `jaxos4.read_log` takes them."""
 
 
 class Stretch(NamedTuple):
@@ -35,20 +41,29 @@ class Stretch(NamedTuple):
 
 
 def as_recordings(
-    flights: Flight | Recording | Sequence[Flight | Recording], name: str = "flight"
+    flights: Source | Sequence[Source], name: str = "flight", airframe: Airframe | None = None
 ) -> tuple[Recording, ...]:
-    """One or several flights as recordings. A flight without a name is called `name`; several are numbered from 1."""
-    every = (flights,) if isinstance(flights, Flight | Recording) else tuple(flights)
-    return tuple(as_recording(each, f"{name} {i + 1}" if len(every) > 1 else name) for i, each in enumerate(every))
+    """One or several flights as recordings. A flight without a name is called `name`; several are numbered from 1.
+
+    `airframe`: of logs that are read, see `jaxos4.read_log`.
+    """
+    single = isinstance(flights, Recording | str) or not isinstance(flights, Sequence)
+    every = [flights] if single else cast(Sequence[Any], flights)
+    names = [f"{name} {i + 1}" if len(every) > 1 else name for i in range(len(every))]
+    return tuple(as_recording(each, one, airframe) for each, one in zip(every, names, strict=True))
 
 
-def as_recording(flight: Flight | Recording, name: str = "flight") -> Recording:
+def as_recording(flight: Source, name: str = "flight", airframe: Airframe | None = None) -> Recording:
     """A flight as a recording of this name, without impossible values. A recording stays as it is.
 
-    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible.
+    A path, or arrays by their names, are read as a log of this `airframe`.
+
+    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible, or if a log cannot be used.
     """
     if isinstance(flight, Recording):
         return flight
+    if not isinstance(flight, Flight):
+        return read_recording(flight, airframe)
     found = Recording.of(flight, name)
     columns = {"t": found.time, **dict(zip(CHANNEL_NAMES, found.channels.T, strict=True))}
     table = Table(name, columns, first_row=None).without_impossible()

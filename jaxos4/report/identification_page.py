@@ -4,6 +4,7 @@ import json
 import math
 import os
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,12 +16,15 @@ from matplotlib.ticker import MultipleLocator
 from .._files import check_writable, write_file
 from ..airframe import Airframe
 from ..analysis.frequency_response import FrequencyResponse
-from ..analysis.inertia import CenterOfMass, center_of_mass
+from ..analysis.inertia import CenterOfMass
 from ..analysis.prediction import Predictions, decisive_horizon
+from ..errors import printable
+from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Constant, Identification, SampleTime
-from ..identification.verdict import headline
+from ..identification.verdict import headline, reasons
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
+from .identification_text import quantity_rows
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
 
@@ -30,21 +34,25 @@ _INERTIAS = ("Ix", "Iy", "Iz")
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
 # The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
-_HIGHEST, _GAINS = 40.0, (0.2, 5.0)
+HIGHEST, GAINS = 40.0, (0.2, 5.0)
+_WIDEST = 50.0  # the logarithm of a factor that no figure shows
 _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 0.2, "hspace": 0.6}
 _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 
 
-def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str) -> None:
-    """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
+def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
+    """Writes the page of an identification, completely or not at all.
+
+    It shows what the result's file holds, so that a result that was read makes the same page. `title`: by default the
+    names of the logs.
+
+    **Raises:** `OSError` if the page cannot be written.
+    """
     check_writable(path)
     look, used = styles([found.estimator])[found.estimator], found.provenance
-    airframe, count = found.problem.model.airframe, len(found.parameters)
-    values = np.array([math.nan if row.estimate is None else row.estimate for row in found.parameters.values()])
-    covariance = np.zeros((count, count)) if found.covariance is None else np.asarray(found.covariance)
-    center = [x for x in center_of_mass(tuple(found.parameters), values, covariance, airframe) if math.isfinite(x.std)]
+    center = centers_of_mass(found)
     with drawing():
-        figures = {"vehicle": vehicle(airframe, found.rigid_body.constants, center, look)}
+        figures = {"vehicle": vehicle(found.airframe, found.rigid_body.constants, center, look)}
         if found.sample_times:
             figures["sample-times"] = inertias_by_sample_time(found.sample_times, used.sample_time, look)
         if found.response is not None:
@@ -56,7 +64,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         drawings = {name: draw(figure, name) for name, figure in figures.items()}
     text = render(
         "identification.html.j2",
-        title=title,
+        title=title or ", ".join(printable(Path(name).name) for name in found.logs),
         found=found,
         verdict=verdict(found),
         headline=headline(found.verdicts, found.doubts),
@@ -74,6 +82,13 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         ],
     )
     write_file(path, text)
+
+
+def identification_html(found: Identification) -> str:
+    """Verdict, physical quantities and reservations, for a notebook."""
+    rows = zip(*quantity_rows(physical_quantities(found)), strict=True)
+    lines = [*reasons(found.verdicts, found.doubts), *(f"note: {note}" for note in found.provenance.notes)]
+    return render("summary.html.j2", verdict=verdict(found), rows=list(rows), lines=lines)
 
 
 def verdict(found: Identification) -> str:
@@ -110,7 +125,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
     (x, y), distances = positions.T, np.linalg.norm(positions[:, None] - positions, axis=2)
     radius = 0.42 * distances[distances > 0].min()
     for i, spin in enumerate(np.asarray(airframe.rotor_spins)):
-        end = 1 - 0.25 * radius / math.hypot(x[i], y[i])  # leaves room for the number
+        end = 1 - 0.25 * radius / max(math.hypot(x[i], y[i]), radius)  # leaves room for the number
         above.plot([0, -end * y[i]], [0, end * x[i]], color=FAINT, linewidth=3, zorder=1)
         above.add_patch(Circle((-y[i], x[i]), radius, facecolor=PAPER, edgecolor=INK, linewidth=1.1))
         turn = np.radians(np.linspace(200, 200 + 280 * spin, 60))
@@ -171,11 +186,12 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     A frequency without a clear response is drawn faintly.
     """
     figure, panels = grid(9, columns=3, height=1.9)
-    top = min(_HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
+    top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
     for row, (name, axis) in enumerate(found._asdict().items()):
         gain, phase, coherence = panels[3 * row : 3 * row + 3]
         degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
-        bands = axis.gain * np.exp([-axis.half_width, axis.half_width]), degrees + np.array([-spread, spread])
+        factor = np.exp(np.minimum(axis.half_width, _WIDEST))
+        bands = np.array([axis.gain / factor, axis.gain * factor]), degrees + np.array([-spread, spread])
         for panel, values, band, model in zip((gain, phase), (axis.gain, degrees), bands, (1.0, 0.0), strict=True):
             panel.plot(axis.frequency, values, color=FAINT, linewidth=0.8)
             low, high = np.where(axis.clear, band, np.nan)
@@ -185,7 +201,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
         coherence.plot(axis.frequency, axis.coherence, color=look.color)
         coherence.axhline(0.6, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[1])
         gain.set_yscale("log")
-        gain.set_ylim(_GAINS)
+        gain.set_ylim(GAINS)
         ticks_at(gain.yaxis, _GAIN_TICKS)
         phase.set_ylim(-180, 180)
         phase.yaxis.set_major_locator(MultipleLocator(90))

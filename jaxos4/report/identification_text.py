@@ -1,35 +1,79 @@
 """An identification as text, for a terminal."""
 
+import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 
 from ..estimators import ESTIMATORS
+from ..identification.physical import PhysicalQuantity, physical_quantities
 from ..identification.results import COLOURED, Identification
-from ..identification.verdict import headline
+from ..identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED, reasons, statuses
 from ..results import NINETY_FIVE
 from .text import Listing
 
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
 
+# Of the lines that begin with a verdict, on terminals that have colours.
+_COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
+
 Section = Iterator[str | Listing]
 
 
-def print_identification(console: Console, found: Identification) -> None:
-    """Prints verdicts, notes, parameters, moments of inertia and the quality of the fit; or why there is no answer."""
-    of_kind = (_held, _inertias, _of_vehicle) if found.is_vehicle else (_fit, _inertias, _validation)
-    for section in (_notes, _parameters, *of_kind, _summary) if found.has_answer else (_notes, _failure):
+def print_identification(console: Console, found: Identification, *, verbose: bool = False) -> None:
+    """Prints verdicts, physical quantities, reservations and notes; or why there is no answer.
+
+    `verbose`: also of a vehicle all parameters, the noise, and the quality of predictions. An OS4's are printed always.
+    """
+    sections = [_verdicts, _quantities, _reasons, _notes]
+    if not found.is_vehicle:
+        sections = [_verdicts, _reasons, _notes, _parameters, _fit, _inertias, _validation]
+    elif verbose:
+        sections += [_parameters, _held, _inertias, _of_vehicle]
+    for section in (*sections, _summary) if found.has_answer else (_notes, _failure):
         for part in section(found):
             if isinstance(part, Listing):
                 part.print_on(console)
             else:
-                console.print(part, markup=False, highlight=False)
+                console.print(part, style=_COLOURS.get(part.split(":")[0]), markup=False, highlight=False)
+
+
+def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:
+    """What `print_identification` prints on a terminal of this width [columns]."""
+    text = io.StringIO()
+    print_identification(Console(width=width, file=text, force_jupyter=False), found, verbose=verbose)
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+
+
+def quantity_rows(rows: Sequence[PhysicalQuantity]) -> tuple[list[tuple[str, ...]], list[str]]:
+    """The cells of physical quantities (name, estimate, interval, unit), and a note on each."""
+    cells, notes = [], []
+    for row in rows:
+        low, high = row.ci95
+        unit = "" if row.unit == "1" else row.unit
+        cells.append((row.name, f"{row.value:.4g}", f"{low:.4g} to {high:.4g}", unit))
+        status = "" if row.verdict is None or row.trusted else row.verdict.status
+        notes.append("; ".join(filter(None, (status, row.condition))))
+    return cells, notes
+
+
+def _verdicts(found: Identification) -> Section:
+    yield from statuses(found.verdicts, {row.judged for row in physical_quantities(found)} if found.is_vehicle else ())
+
+
+def _quantities(found: Identification) -> Section:
+    cells, notes = quantity_rows(physical_quantities(found))
+    if cells:
+        yield Listing(("quantity", "estimate", "95 % interval", "unit"), cells, ("estimate",), notes)
+
+
+def _reasons(found: Identification) -> Section:
+    yield from reasons(found.verdicts, found.doubts)
 
 
 def _notes(found: Identification) -> Section:
-    yield from headline(found.verdicts, found.doubts)
     yield from (f"note: {note}" for note in found.provenance.notes)
     if found.motor_clock:
         yield f"note: {found.motor_clock} (rotor_delay)"

@@ -1,0 +1,328 @@
+"""A result read from its file is the one that was found: the same page, numbers and words; and results compared."""
+
+import io
+import json
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import pytest
+from helpers import CRAZYFLIE, refused
+from hypothesis import given, settings, strategies as st
+from matplotlib.figure import Figure
+from rich.console import Console
+from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
+from test_doors import STRANGE, in_one_line, nodes
+from test_report import stands_alone, words
+
+import jaxos4
+from jaxos4.cli._output import write_json
+from jaxos4.errors import InputError
+from jaxos4.identification.results import Constant, Disturbance, RigidBody
+from jaxos4.identification.verdict import Verdict
+from jaxos4.report import print_comparison, print_identification, write_flight_page
+
+FULL = {
+    "sample_times": SAMPLE_TIMES,
+    "covariance": [[1.0, 0.0], [0.0, 4.0]],
+    "widened": {"alpha3": 1.7},
+    "disturbances": {"p": Disturbance(1.2, "rad/s^2", 0.1, 0.02, 0.01)},
+}
+
+
+def written(found, path):
+    write_json(found.to_dict(), path)
+    return jaxos4.read_result(path)
+
+
+def text_of(found):
+    console = Console(width=80, file=io.StringIO())
+    print_identification(console, found, verbose=True)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("found", [identified_vehicle(**FULL), identified_flight()], ids=["vehicle", "os4"])
+def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
+    again = written(found, tmp_path / "found.json")
+    assert (again.estimate, again.problem) == (None, None)
+    assert again.to_dict() == found.to_dict()
+    assert text_of(again) == text_of(found)
+    assert written(again, tmp_path / "again.json").to_dict() == found.to_dict()
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "found.json").read_bytes()
+
+
+def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path):
+    found = identified_vehicle(**FULL)
+    write_flight_page(tmp_path / "fresh.html", found)
+    write_json(found.to_dict(), tmp_path / "found.json")
+    code, out, err = run("report", "found.json")
+    assert (code, err) == (0, "")
+    assert out.startswith("found.html: ")
+    assert (tmp_path / "found.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
+    assert run("report", "found.json", "--out", "other.html")[0] == 0
+    assert (tmp_path / "other.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
+    refused(run("report", "found.json", "--out", "found.json"), "would overwrite an input")
+    write_json(identified_flight().to_dict(), tmp_path / "os4.json")
+    assert run("report", "os4.json")[0] == 0
+    assert "<title>flight.csv</title>" in (tmp_path / "os4.html").read_text(encoding="utf-8")
+    (tmp_path / "study").mkdir()
+    refused(run("report", "study", "--out", "page.html"), "--out: study is a folder")
+
+
+def test_a_file_of_an_older_version_has_a_page_without_the_figures_that_it_lacks(tmp_path):
+    found = identified_vehicle()
+    table = {
+        name: each for name, each in found.to_dict().items() if name not in ("predictions", "response", "verdicts")
+    }
+    (tmp_path / "old.json").write_text(json.dumps(table))
+    old = jaxos4.read_result(tmp_path / "old.json")
+    assert (old.predictions, old.response, old.verdicts) == (None, None, {})
+    write_flight_page(tmp_path / "old.html", old)
+    assert "Measured and predicted" not in (tmp_path / "old.html").read_text(encoding="utf-8")
+
+
+def test_predictions_in_a_file_are_few_and_on_short_lines(tmp_path):
+    many = synthetic_predictions(4000).thinned(1000)
+    np.testing.assert_array_equal(many.start, synthetic_predictions(4000).start[::4])
+    np.testing.assert_allclose(many.predicted, synthetic_predictions(4000).predicted[::4], atol=5.1e-5)
+    found = identified_vehicle(predictions=synthetic_predictions(4000).thinned(1200))
+    written(found, tmp_path / "found.json")
+    assert (tmp_path / "found.json").stat().st_size < 5e5
+    write_flight_page(tmp_path / "found.html", found)
+    assert (tmp_path / "found.html").stat().st_size < 6e5
+    assert '"horizons": [0.1, 0.248, 0.5]' in (tmp_path / "found.json").read_text()
+
+
+def shown(path):
+    """All that is made of a result's file."""
+    found = jaxos4.read_result(path)
+    text_of(found)
+    assert found._repr_html_()
+    assert len(found.to_dataframe()) >= len(found.to_dataset()["parameter"])
+    print_comparison(Console(file=io.StringIO()), jaxos4.compare_results([found, path]))
+    write_flight_page(path.with_suffix(".html"), found)
+
+
+WRONG = [
+    (("predictions", "start", 1), 5, "`predictions`: starts must increase"),
+    (("predictions", "start", 0), -1, "`predictions`: starts must increase"),
+    (("predictions", "horizons", 0), -1.0, "`predictions`"),
+    (("predictions", "measured", 0), [], "`predictions.measured`"),
+    (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
+    (("response", "roll", "phase"), [1.0], "`response.roll.phase`: has another shape"),
+    (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),
+    (("response", "yaw"), {}, "`response.yaw.frequency`: is not an array"),
+    (("skill", "horizons"), [0.1], "`skill`"),
+    (("constants", "Ix", "std"), -1.0, "`std`: is negative"),
+    (("constants", "other"), 1.0, "'other' is no name"),
+    (("sample_times", 0, "sample_time"), 0.0, "`sample_time`: is not positive"),
+    (("cost",), float("nan"), "`cost`"),
+    (("airframe", "mass"), -1.0, "`mass` must be"),
+    (("result",), "unheard", "`result` unheard"),
+]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"), WRONG, ids=lambda x: ".".join(map(str, x)) if isinstance(x, tuple) else ""
+)
+def test_what_no_result_has_is_named(run, tmp_path, place, value, said):
+    table = identified_vehicle(**FULL).to_dict()
+    holder = table
+    for key in place[:-1]:
+        holder = holder[key]
+    holder[place[-1]] = value
+    (tmp_path / "found.json").write_text(json.dumps(table))
+    refused(run("report", "found.json"), "found.json: ", said)
+    assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
+
+
+# In Python
+
+
+def test_a_result_shows_itself(tmp_path):
+    found = identified_vehicle(**FULL)
+    assert len(repr(found)) < 200
+    assert repr(found).startswith("<Identification by ibss, flight model: successful, Ix = 1.733e-05 kg m^2")
+    lines = found.summary().splitlines()
+    assert max(map(len, lines)) <= 80
+    place = [
+        next(i for i, line in enumerate(lines) if line.startswith(said)) for said in ("identified: ", "Ix ", "Iz: ")
+    ]
+    assert place == sorted(place)  # verdict, quantities, reservations
+    assert place[1] < 5
+    assert "alpha3" not in found.summary()
+    assert "alpha3" in found.summary(verbose=True)
+    assert any(line.startswith("Ix") and line.endswith("if arms and mass are right") for line in wide(found))
+    shown = found._repr_html_()
+    assert "What was asked is identified: Ix." in shown
+    assert "1.733e-05" in shown
+    evil = identified_vehicle(verdicts={"Ix": Verdict("contradicted", "", ("<script>",))})
+    assert "<script>" not in evil._repr_html_()
+
+
+def test_verdicts_have_colours_on_a_terminal_alone():
+    shown = {"force_terminal": True, "color_system": "standard", "no_color": False}
+    for options, begin in ((shown, "\x1b[32midentified: "), ({"force_terminal": False}, "identified: ")):
+        console = Console(width=80, file=io.StringIO(), **options)
+        print_identification(console, identified_vehicle())
+        assert console.file.getvalue().startswith(begin)
+
+
+def wide(found):
+    lines = found.summary(width=120).splitlines()
+    assert max(map(len, lines)) <= 120
+    return lines
+
+
+def test_a_result_as_tables():
+    found = identified_vehicle(**FULL)
+    table = found.to_dataframe()
+    assert list(table.index) == ["Ix", "J_R", "alpha3", "alpha6", "alpha1"]
+    assert table.loc["alpha3", ["kind", "estimate", "low", "bound"]].tolist() == ["parameter", 57712.3, 56708.8, 130.0]
+    assert np.isnan(table.loc["alpha6", "estimate"])
+    assert table.loc["alpha1", "kind"] == "held"
+    data = found.to_dataset()
+    assert data["covariance"].sel(parameter="alpha6", other="alpha6") == 4.0
+    np.testing.assert_array_equal(data["predicted"], found.predictions.predicted)
+    np.testing.assert_allclose(data["start"], 0.004 * found.predictions.start)
+    np.testing.assert_array_equal(data["gain"].sel(axis="pitch"), found.response.pitch.gain)
+    assert set(identified_flight().to_dataset().data_vars) == {"estimate", "std", "low", "high"}
+
+
+@pytest.mark.parametrize(("package", "method"), [("pandas", "to_dataframe"), ("xarray", "to_dataset")])
+def test_a_missing_package_is_named(monkeypatch, package, method):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=f"the package {package} is missing"):
+        getattr(identified_vehicle(), method)()
+
+
+def test_figures_are_on_one_axis_each():
+    found, ax = identified_vehicle(), Figure().add_subplot()
+    assert found.plot.rates("q", horizon=0.1, ax=ax) is ax
+    measured, predicted = (np.asarray(line.get_ydata()) for line in ax.lines)
+    np.testing.assert_allclose(np.delete(measured, 80), found.predictions.measured[:, 0, 1])
+    np.testing.assert_allclose(np.delete(predicted, 80), found.predictions.predicted[:, 0, 1])
+    assert np.isnan(measured[80])  # between the stretches
+    np.testing.assert_allclose(np.delete(ax.lines[0].get_xdata(), 80), 0.004 * found.predictions.start + 0.1)
+    bars = found.plot.inertias(ax=Figure().add_subplot())
+    assert [label.get_text() for label in bars.get_xticklabels()] == ["Ix"]
+    assert bars.lines[1].get_ydata() == [1.733e-5]
+    gain = found.plot.response("pitch", ax=Figure().add_subplot())
+    np.testing.assert_array_equal(gain.lines[0].get_ydata(), found.response.pitch.gain)
+    empty = identified_flight()
+    for wrong, said in (
+        (lambda: found.plot.rates("x"), "`rate`: must be one of p, q, r"),
+        (empty.plot.rates, "no predictions"),
+        (empty.plot.response, "no frequency response"),
+    ):
+        with pytest.raises(InputError, match=said):
+            wrong()
+
+
+def test_identify_takes_paths(tmp_path):
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=1.0, dt=0.01), dt=0.01)
+    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
+    jaxos4.write_flight(flight, tmp_path / "flight.csv")
+    found = [
+        jaxos4.identify(source, model, estimator="equation-error", validate=tmp_path / "flight.csv")
+        for source in (tmp_path / "flight.csv", str(tmp_path / "flight.csv"), [tmp_path / "flight.csv"])
+    ]
+    assert len({json.dumps(each.to_dict()["parameters"]) for each in found}) == 1
+    assert found[0].provenance.flight == str(tmp_path / "flight.csv")
+    assert found[0].validation.flight == str(tmp_path / "flight.csv")
+    with pytest.raises(InputError, match="there is no such file"):
+        jaxos4.identify(tmp_path / "none.csv", model)
+
+
+# Comparison
+
+
+def of_inertias(ix, std=2e-7, **changes):
+    """A result with this Ix, and an Iy and a Iz that are the same in all results."""
+    table = {"Ix": Constant(ix, std, "kg m^2"), "Iy": Constant(1.7e-5, 2e-7, "kg m^2")}
+    return identified_vehicle(rigid_body=RigidBody(table), verdicts={}, **changes)
+
+
+AGREE = (1.66e-5, 1.69e-5, 1.64e-5)
+
+
+@pytest.fixture
+def files(tmp_path):
+    for i, ix in enumerate((*AGREE, 1.9e-5)):
+        write_json(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}).to_dict(), tmp_path / f"{i}.json")
+    return [f"{i}.json" for i in range(4)]
+
+
+def test_three_results_that_agree_are_pooled_and_one_that_does_not_is_named(run, tmp_path, files):
+    code, out, err = run("compare", *files[:3])
+    assert (code, err) == (0, "")
+    assert out.startswith("The results agree in all 2 quantities")
+    agree = jaxos4.compare_results([tmp_path / name for name in files[:3]])
+    ix, iy = agree.quantities
+    errors = (np.array(AGREE) - np.mean(AGREE)) / 2e-7
+    assert ix.value == pytest.approx(np.mean(AGREE))
+    assert ix.chi2 == pytest.approx(errors @ errors)
+    assert ix.p == pytest.approx(np.exp(-ix.chi2 / 2))  # chi-squared with two degrees of freedom
+    widened = max(1.0, np.sqrt(ix.chi2 / 2))
+    assert ix.std == pytest.approx(2e-7 / np.sqrt(3) * widened)
+    assert iy.std == pytest.approx(2e-7 / np.sqrt(3))
+    assert (agree.different, iy.p) == ((), pytest.approx(1.0))
+    code, out, err = run("compare", *files, "--report", "page.html")
+    assert code == 1
+    assert err == "jaxos4: the results differ by more than chance: see the quantities that differ\n"
+    assert "differ by more than chance in 1 of 2 quantities: Ix (p = " in " ".join(out.split())
+    assert "3.json" in out
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    stands_alone(page)
+    assert all(said in words(page) for said in ("Ix (p = ", "1.90e-5", "differ", "3.json"))
+    (different,) = jaxos4.compare_results([tmp_path / name for name in files]).different
+    assert different.name == "Ix"
+
+
+def test_what_a_verdict_refuses_is_shown_and_does_not_count(tmp_path):
+    refusing = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
+    results = [of_inertias(ix) for ix in AGREE]
+    wrong = msgspec.structs.replace(of_inertias(9e-5), verdicts=refusing, result="implausible")
+    found = jaxos4.compare_results([*results, wrong])
+    assert found.quantities[0].used == (True, True, True, False)
+    assert found.quantities[0].value == pytest.approx(np.mean(AGREE))
+    console = Console(width=80, file=io.StringIO())
+    print_comparison(console, found)
+    assert "not counted: contradicted" in console.file.getvalue()
+    assert "not to be trusted as a whole" in console.file.getvalue()
+
+
+def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):
+    refused(run("compare", "0.json"), "two results or more")
+    refused(run("compare", "--report", "page.html"), "--report: is for a comparison of results")
+    refused(run("compare", *files, "--quick"), "--quick: is for a comparison of estimators")
+    write_json(identified_flight().to_dict(), tmp_path / "os4.json")
+    refused(run("compare", "0.json", "os4.json"), "os4.json: is of the published model")
+    heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, jnp.asarray(0.03))
+    other = of_inertias(1.66e-5, airframe=heavy)
+    notes = jaxos4.compare_results([of_inertias(1.66e-5), other]).notes
+    assert any("airframes differ in `mass`" in note for note in notes)
+    assert any("flight.csv was fitted in several results" in note for note in notes)
+
+
+def test_a_damaged_result_ends_in_one_line(tmp_path):
+    path = tmp_path / "found.json"
+    few = identified_vehicle(**FULL, predictions=synthetic_predictions(6)).to_dict()
+    tables = [json.dumps(few), json.dumps(identified_flight().to_dict())]
+
+    @given(data=st.data())
+    @settings(max_examples=25)
+    def law(data):
+        tree = json.loads(data.draw(st.sampled_from(tables)))
+        for _ in range(data.draw(st.integers(1, 3))):
+            places = list(nodes(tree))
+            holder, key = places[data.draw(st.integers(0, len(places) - 1))]
+            holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(STRANGE))))
+        path.write_text(json.dumps(tree), encoding="utf-8")
+        in_one_line(shown, path)
+
+    law()
