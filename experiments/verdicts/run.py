@@ -142,7 +142,7 @@ FAULTS = {
     "impossible speeds": Fault(impossible, (40.0, 19.0, 5.0), "are impossible"),
     "noisy motors": Fault(noisy, (0.3, 1.0, 3.0), ""),
     "short": Fault(shortened, (2.0, 4.0, 6.0), "s were fitted"),
-    "rare motors": Fault(thinned, (5.0, 10.0, 20.0), "too rarely"),
+    "rare motors": Fault(thinned, (5.0, 10.0, 20.0), "more rarely"),
 }
 CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL)}
 CASES |= {f"{name} {size:g}": ("gusts", fault, size) for name, fault in FAULTS.items() for size in fault.sizes}
