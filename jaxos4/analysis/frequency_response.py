@@ -112,7 +112,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     rates over the sample time, less what the model says about these rates: in the input, that would bring the gyro's
     noise to both sides. If the rates are means, the input is averaged over the same times.
 
-    The flight controller answers disturbances, so in a ratio of spectra the vehicle seems to answer 20 to 30 % too
+    The flight controller answers disturbances, so in a ratio of spectra the vehicle seems to answer 25 to 40 % too
     strongly. Here the output is predicted from the past (`response`): what remains of it is new, so that no controller
     has answered it yet. A fit of the same flight has been compared with these data: a ratio other than 1 shows that
     the model is wrong, a ratio of 1 does not show that it is right.
