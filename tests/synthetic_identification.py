@@ -92,9 +92,9 @@ def synthetic_response() -> FrequencyResponse:
     def axis(ratio: float, share: float) -> AxisResponse:
         error = np.sqrt((1 - share * coherence) / (share * coherence * 80))
         flat = np.full(frequency.size, ratio)
-        return AxisResponse(frequency, flat, 0.01 * frequency, share * coherence, error, 2 * error, 41.0)
+        return AxisResponse(frequency, flat, 0.01 * frequency, share * coherence, np.diag(error**2), 41.0)
 
-    return FrequencyResponse(axis(1.25, 1.0), axis(0.5, 0.9), axis(1.0, 0.3))
+    return FrequencyResponse(axis(1.25, 1.0), axis(0.5, 0.9), axis(1.0, 0.03))
 
 
 def synthetic_predictions(starts=160) -> Predictions:

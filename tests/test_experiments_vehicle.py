@@ -66,6 +66,39 @@ def test_effects(report_of, plot):  # noqa: F811
         assert abs(case["summary"]["thrust"]["mean"]) < 0.05
 
 
+def test_verdicts(report_of, capsys):  # noqa: F811
+    """Good and spoiled flights are judged, and counted."""
+    cases = {"gusts": None, "force clipped 0.8": True}
+    report = report_of("verdicts", flights=1, duration=16.0, cases=list(cases))
+    rows = {row["case"]: row for row in report["rows"]}
+    assert {name: row["named"] for name, row in rows.items()} == cases
+    good, clipped = (rows[name]["Ix"] for name in cases)
+    assert good["status"].startswith("identified")
+    assert abs(good["error"]) < 3 * good["std"]
+    assert clipped["error"] < -0.1
+    assert clipped["status"] == "contradicted"
+    assert "spoiled flights" in capsys.readouterr().out
+    assert report_of("verdicts", flights=1, duration=16.0, cases=list(cases)) == report
+
+
+def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
+    random = np.random.default_rng(0)
+    states = random.normal(0, 0.2, (500, 12))
+    flight = jaxos4.recording.Recording(0.004 * np.arange(500), random.uniform(1e3, 2e3, (500, 4)), states)
+    flight = flight._replace(specific_force=states[:, :3] + [0.0, 0.0, 9.8])
+    spoiled = {name: fault.spoil(flight, fault.sizes[0]) for name, fault in load("verdicts").FAULTS.items()}
+    np.testing.assert_allclose(spoiled["gyro scale"].states[:, [7, 9, 11]], states[:, [7, 9, 11]] / 2)
+    np.testing.assert_allclose(
+        spoiled["gyro early"].states[:400, 7], np.interp(flight.time + 0.05, flight.time, states[:, 7])[:400]
+    )
+    np.testing.assert_allclose(spoiled["turned"].states[:, 7], np.cos(np.pi / 6) * states[:, 7] + states[:, 9] / 2)
+    assert np.abs(spoiled["gyro clipped"].states[:, 7]).max() == np.abs(states[:, 7]).max() / 2
+    tilted = spoiled["earth's axes"].specific_force
+    np.testing.assert_allclose(np.linalg.norm(tilted, axis=1), np.linalg.norm(flight.specific_force, axis=1))
+    assert len(spoiled["short"].time) == 500
+    assert len(np.unique(spoiled["rare motors"].omega[:, 0])) == 100
+
+
 def test_sample_times(report_of):  # noqa: F811
     """Every sample time has the same answer, within its interval."""
     report = report_of("sample_times", flights=2, sample_times=[0.004, 0.016], duration=16.0)

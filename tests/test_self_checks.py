@@ -130,7 +130,7 @@ FAULTS = {
     "gyro early": (late(RATES, -0.03), ["gyro is recorded", "early"], INERTIAS, True),
     "force late": (late(range(3), 0.03, force=True), ["accelerometer is recorded"], INERTIAS | {"thrust"}, True),
     "gyro clipped": (clipped("states", P, 0.3), ["clipped"], {"Ix"}, True),
-    "force clipped": (clipped("specific_force", AZ, 0.9), ["clipped"], {"thrust"}, False),
+    "force clipped": (clipped("specific_force", AZ, 0.9), ["clipped"], INERTIAS | {"thrust"}, False),
     "turned": (turned(20), ["mounted at an angle about the vertical axis"], INERTIAS, True),
     "turned back": (turned(-30), ["mounted at an angle about the vertical axis"], INERTIAS, True),
     "tilted": (tilted(40), ["not along its z axis"], {"thrust"}, True),

@@ -1,7 +1,6 @@
 """A check of a fit without parameters: the frequency response from modelled to measured angular acceleration."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,31 +11,30 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Parameters, as_float
 from ..flight import RATES
-from ..models.state import Rates
+from ..models.state import Forcing, Rates
 from ..results import NINETY_FIVE
 from ..shooting import ShootingProblem
 
-# Length of a segment [s]: its inverse is the resolution in frequency [Hz].
-_SEGMENT = 1.0
-# With fewer averages there are no errors.
-_FEWEST = 4
-# The band in which the model is compared [Hz], and the smallest coherence there. Below, the flight controller's answer
-# to disturbances looks like the vehicle's answer to torque. Above, few vehicles move.
-_LOW, _HIGH, _COHERENT = 4.0, 20.0, 0.6
+# How far apart frequencies are [Hz].
+_RESOLUTION = 1.0
+# The regression's memory [s]: as long as the flight controller's answer. A longer one finds the same, less precisely.
+_MEMORY, _FEWEST_LAGS = 0.1, 4
+# The regression needs so many samples for each unknown.
+_SAMPLES = 8
+# The band in which the model is compared [Hz], and the largest error of a clear gain there. Few vehicles move above.
+_LOW, _HIGH, _UNCLEAR = 4.0, 20.0, 0.5
+# Of the regression, as a share of the sum of squares.
+_RIDGE = 1e-13
 _BOUNDLESS = 700.0  # a logarithm whose factor is still a number
-# The coherence is averaged over this many frequencies on either side.
-_AROUND = 2
-# Segments overlap by half: the correlation of their spectra, and that of frequencies 0, 1, 2 steps apart (Hann window).
-_OVERLAP, _NEIGHBOURS = 1 / 6, (1.0, 4 / 9, 1 / 36)
 
 
 class Agreement(NamedTuple):
     """The measured response divided by the model's: its geometric mean over frequencies with a clear response.
 
-    Each frequency weighs as much as the coherence around it.
+    Each frequency weighs as much as is known about the response there.
 
     - `ratio`: 1 if the model is right, 2 if the vehicle answers twice as strongly as the model says. NaN: no part of
-      the band has a coherence above 0.6.
+      the band has a clear response.
     - `error`: standard deviation of the ratio's logarithm.
     - `low`, `high`: the first and the last frequency that counted [Hz].
     """
@@ -59,45 +57,45 @@ class AxisResponse(NamedTuple):
     - `frequency`: [Hz].
     - `gain`: measured over modelled angular acceleration.
     - `phase`: of the measured before the modelled one [rad]. A measured response that comes late has a negative phase.
-    - `coherence`: the share of the measured response that depends linearly on the modelled one, 0 to 1.
-    - `error`: standard deviation of the gain's logarithm, and of the phase [rad].
-    - `half_width`: of the 95 % interval of the gain, as a share of the gain, and of the phase [rad].
-    - `averages`: how many independent segments of the flight were averaged.
+    - `coherence`: the power of the modelled acceleration, as a share of itself and the disturbance's, 0 to 1. It does
+      not depend on the gain.
+    - `covariance`: of the gain's logarithm at each pair of frequencies.
+    - `averages`: how many seconds were compared, over the inverse of the resolution in frequency.
     """
 
     frequency: Float[np.ndarray, " frequencies"]
     gain: Float[np.ndarray, " frequencies"]
     phase: Float[np.ndarray, " frequencies"]
     coherence: Float[np.ndarray, " frequencies"]
-    error: Float[np.ndarray, " frequencies"]
-    half_width: Float[np.ndarray, " frequencies"]
+    covariance: Float[np.ndarray, "frequencies frequencies"]
     averages: float
 
     def agreement(self, low: float = _LOW, high: float = _HIGH) -> Agreement:
         """How strongly the vehicle answers compared with the model, from `low` to `high` [Hz]."""
-        clear = self.clear & np.isfinite(self.error) & (self.frequency >= low) & (self.frequency <= high)
+        clear = self.clear & (self.frequency >= low) & (self.frequency <= high)
         if not clear.any():
             return Agreement(*[math.nan] * 4)
-        frequency, error = self.frequency[clear], self.error[clear]
-        apart = np.rint(np.abs(frequency[:, None] - frequency) / self.frequency[0]).astype(int)
-        correlation = np.append(_NEIGHBOURS, 0.0)[np.minimum(apart, len(_NEIGHBOURS))]
-        # Not the frequency's own coherence: by chance, a gain that is too large comes with one that is too large.
-        weight = self._smoothed[clear] / self._smoothed[clear].sum()
-        ratio = math.exp(weight @ np.log(self.gain[clear]))
-        deviation = math.sqrt((weight * error) @ correlation @ (weight * error))
-        return Agreement(ratio, deviation, float(frequency[0]), float(frequency[-1]))
+        frequency, gain = self.frequency[clear], self.gain[clear]
+        # By the error of the gain and not of its logarithm: that would prefer gains that are too large by chance.
+        weight = 1 / np.square(gain * self.error[clear])
+        weight /= weight.sum()
+        deviation = math.sqrt(weight @ self.covariance[np.ix_(clear, clear)] @ weight)
+        return Agreement(math.exp(weight @ np.log(gain)), deviation, float(frequency[0]), float(frequency[-1]))
+
+    @property
+    def error(self) -> Float[np.ndarray, " frequencies"]:
+        """Standard deviation of the gain's logarithm, and about that of the phase [rad]."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def half_width(self) -> Float[np.ndarray, " frequencies"]:
+        """Half of the 95 % interval of the gain, as a share of the gain, and of the phase [rad]."""
+        return NINETY_FIVE * self.error
 
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
-        """Where the coherence exceeds 0.6, as the mean over five frequencies: one can pass by chance."""
-        return np.isfinite(self.coherence) & (self._smoothed > _COHERENT)
-
-    @property
-    def _smoothed(self) -> Float[np.ndarray, " frequencies"]:
-        """The mean coherence of five frequencies."""
-        kernel, known = np.ones(2 * _AROUND + 1), np.isfinite(self.coherence)
-        total, count = (np.convolve(x, kernel)[_AROUND:-_AROUND] for x in (np.where(known, self.coherence, 0.0), known))
-        return total / np.maximum(count, 1)
+        """Where the gain is known to half of the model's, whatever the gain."""
+        return self.gain * self.error < _UNCLEAR
 
 
 class FrequencyResponse(NamedTuple):
@@ -113,32 +111,26 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
 
     The input is the model's p', q', r' from the rotor speeds, at rates of 0. The output is the difference of measured
     rates over the sample time, less what the model says about these rates: in the input, that would bring the gyro's
-    noise to both sides. Spectra are averaged over segments of 1 s that overlap by half (Welch 1967), in all stretches
-    in which p, q and r were measured.
+    noise to both sides. If the rates are means, the input is averaged over the same times.
 
-    **In closed loop** the response is biased where disturbances dominate: at low frequencies the flight controller
-    answers a disturbance by torque against it, and at high ones it feeds back gyro noise. The vehicle then seems to
-    answer torque too weakly, with high coherence. Therefore `agreement` begins at 4 Hz. A fit of the same flight can
-    have the same bias: a ratio other than 1 shows that the model is wrong, a ratio of 1 does not show that it is right.
+    The flight controller answers disturbances, so in a ratio of spectra the vehicle seems to answer 25 to 40 % too
+    strongly. Here the output is predicted from the past (`response`): what remains of it is new, so that no controller
+    has answered it yet. A fit of the same flight has been compared with these data: a ratio other than 1 shows that
+    the model is wrong, a ratio of 1 does not show that it is right.
 
     **Arguments:** a problem, and the parameters of a fit.
-
-    Errors are those of Gaussian signals with this coherence (Bendat and Piersol, Random Data, section 9.2).
     """
     rates = np.asarray(problem.flight.states)[:, RATES]
     dt = float(problem.flight.dt)
     known = ~np.isnan(rates.sum(axis=1))
-    modelled = modelled_acceleration(problem, parameters)
-    caused = np.asarray(_modelled(problem, as_float(parameters), as_float(np.zeros(rates.shape))))
-    measured = np.diff(rates, axis=0) / dt - (modelled - caused)
-    usable = known[1:] & known[:-1] & np.isfinite(modelled).all(axis=1)
+    caused, damped = map(
+        np.asarray, _parts(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0)))
+    )
+    measured = np.diff(rates, axis=0) / dt - damped
+    usable = known[1:] & known[:-1] & np.isfinite(caused).all(axis=1)
     if problem.flight.stretch is not None:
         usable &= np.diff(np.asarray(problem.flight.stretch)) == 0
-    length = max(round(_SEGMENT / dt / 2) * 2, 8)
-    # As many segments as fit into each usable run of samples, overlapping by half.
-    runs = np.flatnonzero(np.diff(np.concatenate([[0], usable.astype(np.int8), [0]]))).reshape(-1, 2).tolist()
-    begins = [at for begin, end in runs for at in range(begin, end - length + 1, length // 2)]
-    return FrequencyResponse(*(response(caused[:, i], measured[:, i], begins, length, dt) for i in range(3)))
+    return FrequencyResponse(*(response(caused[:, i], measured[:, i], usable, dt) for i in range(3)))
 
 
 def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[np.ndarray, "steps 3"]:
@@ -161,27 +153,68 @@ def _modelled(
     return jnp.stack(problem.model.angular_acceleration(middle, forcing, tuple(parameters)), axis=1)
 
 
+@eqx.filter_jit
+def _parts(
+    problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
+) -> tuple[Float[Array, "steps 3"], Float[Array, "steps 3"]]:
+    """The model's change of the measured rates over each step [rad/s^2]: by the rotors, and by the rates."""
+    every = jnp.arange(rates.shape[0])[None]
+    forcing = problem.model.mean_forcing(problem.flight.inputs, parameters, every)
+    forcing = jax.tree.map(lambda leaf: leaf[0], forcing)
+
+    def at(rates: Array, forcing: Forcing) -> Array:
+        return jnp.stack(problem.model.angular_acceleration(Rates(*rates.T), forcing, tuple(parameters)), axis=1)
+
+    caused, still = at(jnp.zeros_like(rates), forcing)[:-1], jnp.zeros_like(rates)
+    middle, begins = (rates[1:] + rates[:-1]) / 2, jax.tree.map(lambda leaf: leaf[:-1], forcing)
+    by_rates = at(middle, begins) - caused
+    if forcing.early is not None:  # the mean over a sample lacks what the torque makes at its end
+        early = at(still, forcing.early._replace(recording=forcing.recording, velocity=forcing.velocity))
+        caused += (early[1:] - early[:-1]) / 2
+    return caused, by_rates
+
+
 def response(
-    u: Float[np.ndarray, " samples"], y: Float[np.ndarray, " samples"], begins: Sequence[int], length: int, dt: float
+    u: Float[np.ndarray, " samples"], y: Float[np.ndarray, " samples"], usable: Bool[np.ndarray, " samples"], dt: float
 ) -> AxisResponse:
-    """The frequency response from u to y, averaged over segments of `length` samples from `begins` on.
+    """The frequency response from u to y, in closed loop too.
 
-    **Arguments:** signals with one sample every `dt` [s], and segments that overlap by half.
+    A regression predicts y - u from its own past, A(z) (y - u) = B(z) u + e with white noise e, so that the response is
+    1 + B / A (the direct method, Ljung, System Identification, section 13.5). A controller that answers e within its
+    sample biases the first coefficient of B. So the errors contain what changes without this coefficient.
+
+    **Arguments:** signals with one sample every `dt` [s], and which of them are `usable`.
     """
-    from scipy.special import stdtrit  # slow to import
+    lags = max(round(_MEMORY / dt), _FEWEST_LAGS)
+    frequency = np.arange(_RESOLUTION, 0.4 / dt, _RESOLUTION)
+    rows = np.flatnonzero(np.convolve(usable, np.ones(lags + 1))[: usable.size] > lags + 0.5)
+    if rows.size < _SAMPLES * (2 * lags + 2):
+        nothing = np.full(frequency.size, np.nan)
+        return AxisResponse(frequency, nothing, nothing, nothing, np.diag(nothing), 0.0)
+    before = rows[:, None] - np.arange(lags + 1)
+    off, shift = y - u, np.exp(-2j * np.pi * dt * np.outer(frequency, np.arange(lags + 1)))
 
-    window = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
-    rows = np.asarray(begins, dtype=int)[:, None] + np.arange(length)
-    parts = (x[rows] - x[rows].mean(axis=1, keepdims=True) for x in (u, y))
-    # Neither the mean nor the Nyquist frequency.
-    a, b = (np.fft.rfft(window * part)[:, 1 : length // 2] for part in parts)
-    uu, yy, uy = (x.sum(axis=0) for x in (np.abs(a) ** 2, np.abs(b) ** 2, a.conj() * b))
-    averages = len(begins) / (1 + 2 * _OVERLAP**2)
-    freedom = 2 * (averages - 1) if averages >= _FEWEST else math.nan
-    with np.errstate(all="ignore"):
-        found = uy / uu
-        coherence = np.minimum(np.abs(uy) ** 2 / (uu * yy), 1.0)
-        error = np.sqrt((1 - coherence) / (coherence * freedom))
-    half_width = float(stdtrit(freedom, 0.975)) * error
-    frequency = np.arange(1, length // 2) / (length * dt)
-    return AxisResponse(frequency, np.abs(found), np.angle(found), coherence, error, half_width, averages)
+    def regression(first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The logarithm of the response, its derivatives times the standard deviations, and the disturbance's power."""
+        regressors = np.hstack([off[before[:, 1:]], u[before[:, first:]], np.ones((rows.size, 1))])
+        products = regressors.T @ regressors
+        # An input that hardly moves tells nothing.
+        products += _RIDGE * np.trace(products) * np.eye(len(products))
+        found = np.linalg.solve(products, regressors.T @ off[rows])
+        variance = np.square(off[rows] - regressors @ found).sum() / (rows.size - found.size)
+        a, b = 1 - shift[:, 1:] @ found[:lags], shift[:, first:] @ found[lags:-1]
+        slopes = np.hstack([(b / a**2)[:, None] * shift[:, 1:], shift[:, first:] / a[:, None]]) / (1 + b / a)[:, None]
+        root = np.linalg.cholesky(variance * np.linalg.inv(products)[:-1, :-1])
+        return np.log(1 + b / a), slopes @ root, variance / np.abs(a) ** 2
+
+    (whole, spread, disturbed), (late, *_) = regression(0), regression(1)
+    answered = np.real(late - whole)
+    caused = np.real(np.einsum("fi,ij,fj->f", shift.conj(), np.cov(u[before].T), shift)) / (lags + 1)
+    return AxisResponse(
+        frequency,
+        np.exp(np.real(whole)),
+        np.imag(whole),
+        caused / (caused + disturbed),
+        np.real(spread) @ np.real(spread).T + np.outer(answered, answered),
+        rows.size * dt * _RESOLUTION,
+    )

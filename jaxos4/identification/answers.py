@@ -138,7 +138,8 @@ def vehicle_constants(fit: Fit) -> RigidBody:
     shared = scale * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
     covariance += shared[:, None] * shared
     constants, thrust = {}, "mass" if gains else "thrust_coefficient"
-    notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and drag are right"}
+    drag = f"the drag coefficient {float(model.airframe.drag_coefficient):.3g}"
+    notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and {drag} are right"}
     for name, row in INVERSE.items():
         if known[row] and alpha[row] > 0:
             std = float(np.sqrt(covariance[row, row])) / alpha[row] ** 2

@@ -199,7 +199,6 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
             panel.plot(axis.frequency, np.where(axis.clear, values, np.nan), color=look.color)
             panel.axhline(model, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
         coherence.plot(axis.frequency, axis.coherence, color=look.color)
-        coherence.axhline(0.6, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[1])
         gain.set_yscale("log")
         gain.set_ylim(GAINS)
         ticks_at(gain.yaxis, _GAIN_TICKS)

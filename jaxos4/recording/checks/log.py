@@ -11,7 +11,8 @@ from .finding import INERTIAS, Finding
 
 _UNIFORM = 0.05  # of the step; resampled logs are far below
 _UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
-_QUANTITIES = dict(zip(("p", "q", "r"), INERTIAS, strict=True)) | {"az": "thrust"}
+# Clipped thrust seems weaker, and moments of inertia are proportional to it.
+_QUANTITIES = {"p": ("Ix",), "q": ("Iy",), "r": ("Iz",), "az": ("thrust", *INERTIAS)}
 
 
 def uneven_time(evidence: Evidence) -> Finding | None:
@@ -63,7 +64,7 @@ def clipped_values(evidence: Evidence) -> Finding | None:
         "a sensor is clipped at the end of its range; these values count as not measured",
         ", ".join(each),
         "fly gentler, or set a larger range of the sensor",
-        tuple(_QUANTITIES[name] for name in found if name in _QUANTITIES),
+        tuple(dict.fromkeys(quantity for name in found for quantity in _QUANTITIES.get(name, ()))),
         many,
     )
 

@@ -1,0 +1,250 @@
+"""Which verdicts are right? Good flights with the effects of real ones, and flights that are spoiled as real logs are.
+
+The good flights, and the airframe that is given, are those of `closed_loop/effects.py`. Each fault spoils the flights
+`gusts` in three sizes, alone. Ix and Iy are judged. A quantity is *identified* with or without a reservation, and
+*wrong* if it is off by more than three standard deviations or 12 %. An answer is *right* if its 95 % interval holds the
+truth. A cause is right if the faults of the table below are named as they are, wherever the answer says so.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import typer
+from rich.console import Console
+
+import jaxos4
+from jaxos4.errors import InputError
+from jaxos4.flight import ANGLES, RATES
+from jaxos4.recording import Recording
+from jaxos4.recording.velocity import rotations_to_body
+from jaxos4.results import NINETY_FIVE
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "closed_loop"), str(Path(__file__).resolve().parents[1])]
+
+from effects import ALL, EFFECTS, flights_of
+from fits import continued, given_airframe, write_report
+from run import VEHICLE
+from shared import table_of
+
+TRUTHS = dict(zip(("Ix", "Iy"), VEHICLE.inertia.tolist(), strict=False))
+SURE, FAR = 3.0, 0.12  # an answer beyond either is wrong: standard deviations, and share of the truth
+FORCE = slice(12, 15)  # of the channels
+
+
+class Fault(NamedTuple):
+    """`spoil`: makes a spoiled recording of a good one and a size. `cause`: words of the right cause; empty: none."""
+
+    spoil: Callable[[Recording, float], Recording]
+    sizes: tuple[float, ...]
+    cause: str
+
+
+def changed(recording: Recording, channels: np.ndarray) -> Recording:
+    """The recording with other states and specific force."""
+    return recording._replace(states=channels[:, :12], specific_force=channels[:, FORCE])
+
+
+def scaled(columns: np.ndarray) -> Callable[[Recording, float], Recording]:
+    """Some channels have another scale."""
+
+    def spoil(recording: Recording, size: float) -> Recording:
+        channels = recording.channels.copy()
+        channels[:, columns] *= size
+        return changed(recording, channels)
+
+    return spoil
+
+
+def late(columns: np.ndarray) -> Callable[[Recording, float], Recording]:
+    """Some channels are recorded late by `size` [s]; negative: early."""
+
+    def spoil(recording: Recording, size: float) -> Recording:
+        channels = recording.channels.copy()
+        for i in columns:
+            channels[:, i] = np.interp(recording.time - size, recording.time, channels[:, i])
+        return changed(recording, channels)
+
+    return spoil
+
+
+def clipped(column: int) -> Callable[[Recording, float], Recording]:
+    """The range of a sensor ends at this share of its largest value."""
+
+    def spoil(recording: Recording, size: float) -> Recording:
+        channels = recording.channels.copy()
+        end = size * np.nanmax(np.abs(channels[:, column]))
+        channels[:, column] = np.clip(channels[:, column], -end, end)
+        return changed(recording, channels)
+
+    return spoil
+
+
+def turned(recording: Recording, degrees: float) -> Recording:
+    """Gyro and accelerometer are mounted at an angle about z."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    channels = recording.channels.copy()
+    for x, y in ((RATES[0], RATES[1]), (12, 13)):
+        channels[:, [x, y]] = channels[:, [x, y]] @ np.array([[cos, -sin], [sin, cos]])
+    return changed(recording, channels)
+
+
+def along_the_earth(recording: Recording, size: float) -> Recording:
+    """Specific force is along the axes of the earth; `size`: the share of the turn."""
+    channels = recording.channels.copy()
+    turns = rotations_to_body(*(size * channels[:, ANGLES]).T)
+    channels[:, FORCE] = np.einsum("tji,tj->ti", turns, channels[:, FORCE])
+    return changed(recording, channels)
+
+
+def impossible(recording: Recording, size: float) -> Recording:
+    """Two impossible rotor speeds: 60 and `size` times the mean."""
+    omega = recording.omega.copy()
+    omega[[len(omega) // 3, len(omega) // 2], 3] = np.array([60.0, size]) * omega[:, 3].mean()
+    return recording._replace(omega=omega)
+
+
+def noisy(recording: Recording, size: float) -> Recording:
+    """White noise of the motors, as a share of their changes from sample to sample."""
+    change = np.mean(np.median(np.abs(np.diff(recording.omega, axis=0)), axis=0))
+    noise = np.random.default_rng(0).normal(0.0, size * change, recording.omega.shape)
+    return recording._replace(omega=np.maximum(recording.omega + noise, 0.0))
+
+
+def shortened(recording: Recording, seconds: float) -> Recording:
+    """The first seconds of a flight."""
+    rows = recording.time <= recording.time[0] + seconds
+    force = None if recording.specific_force is None else recording.specific_force[rows]
+    time, omega, states = (x[rows] for x in (recording.time, recording.omega, recording.states))
+    return recording._replace(time=time, omega=omega, states=states, specific_force=force)
+
+
+def thinned(recording: Recording, every: float) -> Recording:
+    """Motors are logged once in so many samples."""
+    rows = np.arange(len(recording.omega)) // int(every) * int(every)
+    return recording._replace(omega=recording.omega[rows])
+
+
+FAULTS = {
+    "gyro scale": Fault(scaled(RATES), (0.5, 0.8, 1.25), "the attitude turns"),
+    "time scale": Fault(lambda r, size: r._replace(time=size * r.time), (2.0, 1.25, 0.8), "the attitude turns"),
+    "attitude scale": Fault(scaled(ANGLES), (0.5, 0.8, 1.25), "the attitude turns"),
+    "attitude late": Fault(late(ANGLES), (0.2, 0.1, 0.05), "attitude is recorded"),
+    "gyro clipped": Fault(clipped(int(RATES[0])), (0.5, 0.65, 0.8), "is clipped"),
+    "force clipped": Fault(clipped(14), (0.9, 0.85, 0.8), "is clipped"),
+    "gyro early": Fault(late(RATES), (-0.05, -0.03, -0.02), "gyro is recorded"),
+    "force late": Fault(late(np.array([12, 13, 14])), (0.05, 0.03, 0.02), "accelerometer is recorded"),
+    "turned": Fault(turned, (30.0, 20.0, 10.0), "at an angle about the vertical axis"),
+    "earth's axes": Fault(along_the_earth, (1.0,), "along the axes of the earth"),
+    "impossible speeds": Fault(impossible, (40.0, 19.0, 5.0), "are impossible"),
+    "noisy motors": Fault(noisy, (0.3, 1.0, 3.0), ""),
+    "short": Fault(shortened, (2.0, 4.0, 6.0), "s were fitted"),
+    "rare motors": Fault(thinned, (5.0, 10.0, 20.0), "more rarely"),
+}
+CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL)}
+CASES |= {f"{name} {size:g}": ("gusts", fault, size) for name, fault in FAULTS.items() for size in fault.sizes}
+
+
+def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> dict:
+    """The row of one flight. Errors and standard deviations are shares of the truth."""
+    begin, recording = time.perf_counter(), Recording.of(flight, "flight")
+    row: dict = {"flight": i, "result": "refused"}
+    try:
+        found = jaxos4.identify(
+            recording if fault is None else fault.spoil(recording, size), given_airframe(VEHICLE, i)
+        )
+    except InputError as error:
+        causes = [str(error)]
+    else:
+        row["result"], constants = found.result, found.rigid_body.constants
+        causes = [*map(str, found.doubts), *(r for v in found.verdicts.values() for r in v.reasons)]
+        causes += found.provenance.notes
+        for name, truth in TRUTHS.items():
+            if name in constants:
+                value = constants[name]
+                row[name] = {"error": value.estimate / truth - 1, "std": value.std / truth}
+                row[name]["status"] = found.verdicts[name].status
+        if found.response is not None:
+            agreements = {axis: one.agreement() for axis, one in found.response._asdict().items()}
+            row["response"] = {axis: [x.ratio, x.error] for axis, x in agreements.items() if np.isfinite(x.ratio)}
+    named = None if fault is None or not fault.cause else any(fault.cause in cause for cause in causes)
+    return row | {"named": named, "causes": causes, "seconds": time.perf_counter() - begin}
+
+
+def counts(rows: list[dict]) -> dict[str, int]:
+    """How many answers for Ix and Iy there are, and how many are right, or wrong, of each kind."""
+    found = dict.fromkeys(("answers", "identified", "far", "identified and wrong", "refused and right"), 0)
+    for row in rows:
+        for name in TRUTHS:
+            found["answers"] += 1
+            if name not in row:
+                continue
+            off, trusted = abs(row[name]["error"]), row[name]["status"].startswith("identified")
+            wide = off > SURE * row[name]["std"]
+            found["identified"] += trusted
+            found["far"] += trusted and (wide or off > FAR)
+            found["identified and wrong"] += trusted and wide
+            found["refused and right"] += not trusted and off < NINETY_FIVE * row[name]["std"]
+    return found
+
+
+def share(part: int, whole: int) -> str:
+    """A share with its Monte-Carlo error, of at least half an event [%]."""
+    if not whole:
+        return ""
+    p = np.clip(part / whole, 0.5 / whole, 1 - 0.5 / whole)
+    return f"{100 * part / whole:.0f} +- {100 * np.sqrt(p * (1 - p) / whole):.1f}"
+
+
+def print_tables(report: dict) -> None:
+    """A line for each case, and how often the intervals of the frequency response hold 1 in good flights."""
+    headings = "flights", "identified [%]", "beyond 3 std [%]", "3 std or 12 % [%]", "refused, right [%]", "named [%]"
+    table = table_of("verdicts of Ix and Iy", ("case", *headings))
+    groups = {name: [r for r in report["rows"] if r["case"] == name] for name in CASES}
+    groups |= {
+        "good flights": [r for r in report["rows"] if CASES[r["case"]][1] is None],
+        "spoiled flights": [r for r in report["rows"] if CASES[r["case"]][1] is not None],
+    }
+    for name, rows in groups.items():
+        if rows:
+            n, known = counts(rows), [r["named"] for r in rows if r["named"] is not None]
+            parts = [n[each] for each in ("identified", "identified and wrong", "far", "refused and right")]
+            shares = [share(part, n["answers"]) for part in parts]
+            table.add_row(name, str(len(rows)), *shares, share(sum(known), len(known)))
+    Console(width=140).print(table)
+    table = table_of("frequency response of good flights", ("axis", "flights", "mean log gain", "interval holds 1 [%]"))
+    for axis in ("roll", "pitch", "yaw"):
+        every = [r["response"][axis] for r in groups["good flights"] if axis in r.get("response", {})]
+        logs, errors = np.log([x for x, _ in every]), np.array([x for _, x in every])
+        if every:
+            held = int((np.abs(logs) < NINETY_FIVE * errors).sum())
+            table.add_row(axis, str(len(every)), f"{logs.mean():.3f}", share(held, len(every)))
+    Console(width=140).print(table)
+
+
+def main(
+    flights: Annotated[int, typer.Option(help="Number of flights of each case.")] = 20,
+    cases: Annotated[list[str], typer.Option(help="The cases.")] = tuple(CASES),
+    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Random seed of references, gusts, noise and effects.")] = 48,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+) -> None:
+    """Count right and wrong verdicts for each effect, and for each fault in three sizes."""
+    report = continued(out, {"duration": duration, "seed": seed}, "rows")
+    done = {(row["case"], row["flight"]) for row in report["rows"]}
+    flown = {kind: flights_of(kind, flights, duration, seed) for kind in {CASES[name][0]: None for name in cases}}
+    for i in range(flights):  # an interrupted report has about as many flights of each case
+        for name in cases:
+            kind, fault, size = CASES[name]
+            flight = flown[kind][i]
+            if flight is not None and (name, i) not in done:
+                report["rows"].append({"case": name} | judged(flight, i, fault, size))
+                write_report(out, report)
+    print_tables(report)
+
+
+if __name__ == "__main__":
+    typer.run(main)
