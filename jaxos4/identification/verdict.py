@@ -125,7 +125,8 @@ def verdict_of(name: str, quantity: Quantity, doubts: Sequence[Doubt], tolerance
     causes[RESERVED] += quantity.reservations
     if quantity.missing and not causes[MISSING]:
         causes[MISSING].append(quantity.missing)
-    known = f"it is known to {quantity.spread:.0%} only; fly longer, or with more motion"
+    motion = {"Ix": "roll", "Iy": "pitch", "Iz": "yaw"}.get(name, "motion")
+    known = f"it is known to {quantity.spread:.0%} only; fly more {motion}, or longer"
     if quantity.spread > tolerance.unknown:
         causes[MISSING].append(known)
     elif quantity.spread > tolerance.vague:
