@@ -159,7 +159,7 @@ def _response(table: dict[str, dict[str, Any]] | None) -> FrequencyResponse | No
     for name in FrequencyResponse._fields:
         arrays = axes[name] = _arrays(AxisResponse, table.get(name, {}), f"response.{name}")
         frequency = arrays["frequency"]
-        unusable = (arrays["gain"] <= 0) | (arrays["error"] < 0) | (arrays["half_width"] < 0)
+        unusable = (arrays["gain"] <= 0) | (np.diagonal(arrays["covariance"]) < 0)
         if not (frequency > 0).all() or not (np.diff(frequency) > 0).all() or unusable.any():
             raise InputError(f"`response.{name}`: frequencies must increase, gains and errors be positive; {_AGAIN}")
     if any(not np.array_equal(each["frequency"], axes["roll"]["frequency"]) for each in axes.values()):
