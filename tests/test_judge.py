@@ -12,7 +12,8 @@ import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.identification.answers import overwhelmed
 from jaxos4.identification.doubts import doubts_of, vibration
-from jaxos4.identification.fit import Fit, disagreement, parts_of
+from jaxos4.identification.fit import Fit
+from jaxos4.identification.jackknife import disagreement, parts_of
 from jaxos4.identification.results import (
     Constant,
     Disturbance,
