@@ -111,7 +111,7 @@ def test_a_motor_is_its_equation():
         omega = jnp.asarray(np.repeat(commands, finer, axis=0))
         rows = jnp.arange(omega.shape[0])
         part = Part(jnp.asarray(dt / finer), rows, 0 * rows, 0 * rows + rows.size - 1, jnp.zeros(4))
-        return np.abs(np.asarray(jax.jit(driven)(omega, motor, part).begin[::finer, 0]) / 500 - exact).max()
+        return np.abs(np.asarray(eqx.filter_jit(driven)(omega, motor, part).begin[::finer, 0]) / 500 - exact).max()
 
     u = commands[0, 0] / 500
     w, exact = 2 * u / (0.7 + np.sqrt(0.49 + 1.2 * u)), []
