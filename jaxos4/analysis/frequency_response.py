@@ -197,14 +197,14 @@ def response(
     def regression(first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The logarithm of the response, its derivatives times the standard deviations, and the disturbance's power."""
         regressors = np.hstack([off[before[:, 1:]], u[before[:, first:]], np.ones((rows.size, 1))])
-        products = regressors.T @ regressors
+        sizes, directions = np.linalg.eigh(regressors.T @ regressors)
         # An input that hardly moves tells nothing.
-        products += _RIDGE * np.trace(products) * np.eye(len(products))
-        found = np.linalg.solve(products, regressors.T @ off[rows])
+        inverse_root = directions / np.sqrt(np.maximum(sizes, 0) + _RIDGE * sizes.sum())
+        found = inverse_root @ (inverse_root.T @ (regressors.T @ off[rows]))
         variance = np.square(off[rows] - regressors @ found).sum() / (rows.size - found.size)
         a, b = 1 - shift[:, 1:] @ found[:lags], shift[:, first:] @ found[lags:-1]
         slopes = np.hstack([(b / a**2)[:, None] * shift[:, 1:], shift[:, first:] / a[:, None]]) / (1 + b / a)[:, None]
-        root = np.linalg.cholesky(variance * np.linalg.inv(products)[:-1, :-1])
+        root = np.sqrt(variance) * inverse_root[:-1]
         return np.log(1 + b / a), slopes @ root, variance / np.abs(a) ** 2
 
     (whole, spread, disturbed), (late, *_) = regression(0), regression(1)
