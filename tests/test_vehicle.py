@@ -1,6 +1,7 @@
 """Vehicles in closed loop: every search of the innovations finds the same answer, with honest intervals."""
 
 import functools
+import types
 
 import equinox as eqx
 import jax
@@ -160,7 +161,8 @@ def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
     )
     assert found.estimate.seed is not None
     assert any("its network was trained for these flights in" in note for note in found.provenance.notes or ())
-    assert (found.successful, newton.successful) == (True, True)
+    # Four seconds are too short for moments of inertia that can be trusted.
+    assert found.result == newton.result == "unidentifiable"
     for name, row in newton.parameters.items():
         if row.estimate is not None:
             assert abs(found.parameters[name].estimate - row.estimate) < 0.05 * row.std, name
@@ -208,7 +210,7 @@ def poorly_known():
     flight, airframe = (lane(part, 0) for part in flown(1.0, 1.0))
     problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
     recording = np.zeros(flight.time.shape[0], int)
-    nothing = dict.fromkeys(("model", "held_out", "provenance"))
+    nothing = dict.fromkeys(("model", "held_out")) | {"provenance": types.SimpleNamespace(fitted_seconds=60.0)}
     case = Case(problem, problem.problem, jaxos4.FilterError(), "filter-error", recording=recording, **nothing)
     return case, fit_case(case)
 

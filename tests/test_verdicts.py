@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, standard_flight
@@ -144,7 +145,8 @@ def halved(states):
 
 @pytest.mark.parametrize("channels", ["rates", "all"])
 def test_an_os4_flight_whose_rates_are_halved_is_contradicted(channels):
-    flight, settings = standard_flight(), jaxos4.FlightSettings(channels=channels)
+    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(standard_flight(), key=jax.random.key(0))
+    settings = jaxos4.FlightSettings(channels=channels)
     good = jaxos4.identify(flight, jaxos4.PublishedOS4(), settings=settings)
     assert good.successful
     assert good.verdicts["rigid body"].status == IDENTIFIED

@@ -84,6 +84,10 @@ def report(
 ) -> None:
     """Write the report of a study: report.html, and figures/ as SVG; or the page of a result."""
     page = source.with_suffix(".html") if out is None else out
+    if not source.exists():
+        raise InputError(
+            f"{source}: is not there; give the folder of a `jaxos4 study`, or a file of `jaxos4 estimate --out`."
+        )
     if not source.is_dir():
         check_outputs(source, out=page)
     elif out is not None:

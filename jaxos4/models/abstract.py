@@ -123,9 +123,9 @@ class AbstractModel(eqx.Module):
     def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
         """The output of noise-free sensors: the states in cascade order, then the specific force along `force_axes`."""
 
+    @abc.abstractmethod
     def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> "ByRecording | None":
         """The model of one recording, if several in a row have parameters of their own. `stretch`: see `Flight`."""
-        del stretch
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -50,6 +50,10 @@ class AbstractOS4(AbstractModel):
         scaled = np.isin(np.arange(8), (2, 5, 7))
         return jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0) * DEFAULT_HALF_WIDTH
 
+    def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> None:
+        """None: no recording has parameters of its own."""
+        del stretch
+
     @property
     def force_axes(self) -> tuple[int, ...]:
         """None: the OS4 has no accelerometer."""
