@@ -8,6 +8,7 @@ import struct
 import zlib
 
 import numpy as np
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
@@ -113,6 +114,28 @@ def outcome(read, path):
     assert np.abs(np.diff(time) - dt).max() <= 1e-5 * dt + 4 * np.spacing(np.abs(time).max())
     assert all(note.isprintable() for note in notes)
     return flight
+
+
+ACCIDENTS = st.lists(
+    st.tuples(
+        st.sampled_from(["cut", "flip", "flip", "insert", "drop", "zeros"]), st.floats(0, 1), st.integers(0, 999)
+    ),
+    max_size=4,
+)
+
+
+def survives_damage(read, path, content, *, examples):
+    """Up to four accidents in the bytes of a log, written to `path`: a flight, or one line. Without any: a flight."""
+    path.write_bytes(content)
+    assert isinstance(outcome(read, path), Flight)
+
+    @given(accidents=ACCIDENTS)
+    @settings(max_examples=examples)
+    def law(accidents):
+        path.write_bytes(damaged(content, accidents))
+        outcome(read, path)
+
+    law()
 
 
 def damaged(content, accidents):

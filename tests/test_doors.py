@@ -20,10 +20,9 @@ import test_logs_blackbox as blackbox
 import xarray as xr
 from helpers import refused
 from hypothesis import given, settings, strategies as st
-from recorded_logs import blackbox_csv, damaged, table_csv
+from recorded_logs import ACCIDENTS, blackbox_csv, damaged, table_csv
 from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
-from test_logs_readers import ACCIDENTS
 
 from jaxos4._files import read_toml
 from jaxos4.airframe import load_airframe

@@ -6,26 +6,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from hypothesis import given, settings
 from recorded_logs import (
     FRD,
     RPM,
     attitude,
     check,
-    damaged,
     force,
-    outcome,
     position,
     rates,
     speeds,
+    survives_damage,
     table_csv,
     velocity,
 )
 from scipy.spatial.transform import Rotation
-from test_logs_readers import ACCIDENTS
 
 from jaxos4.errors import InputError
-from jaxos4.flight import Flight
 from jaxos4.logs import log_format, read_log, read_recording
 
 pytest.importorskip("rosbags", reason="reading a ROS bag needs rosbags")
@@ -242,20 +238,9 @@ def test_what_a_bag_lacks_is_said(bagged, tmp_path, save):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_bag(kind, bagged, tmp_path):
-    """Up to four accidents in the bytes of a short bag: a flight, or one line."""
     content = bag(tmp_path / f"short.{kind}", kind, topics(T[:25], T[:25])).read_bytes()
-    path = tmp_path / "damaged"
 
     def read(path):
         return read_log(path, columns={"columns": MAP})
 
-    path.write_bytes(content)
-    assert isinstance(outcome(read, path), Flight)
-
-    @given(accidents=ACCIDENTS)
-    @settings(max_examples=40)
-    def law(accidents):
-        path.write_bytes(damaged(content, accidents))
-        outcome(read, path)
-
-    law()
+    survives_damage(read, tmp_path / "damaged", content, examples=40)
