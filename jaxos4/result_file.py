@@ -93,7 +93,7 @@ def vehicle_result(found: Identification | str | os.PathLike[str]) -> Identifica
 
 
 def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
-    """What no result has, in words."""
+    """The faults of a table that no result has, in words."""
     if found.result not in NAMES:
         yield f"`result` {shortened(found.result, 40)}: is not a result code"
     texts = (found.estimator, *found.parameters, *found.held, *found.verdicts, *found.rigid_body.constants, *tests)

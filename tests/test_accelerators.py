@@ -29,7 +29,7 @@ STATES = np.zeros((LANES, len(OMEGA), 12))
 
 @pytest.fixture
 def foreign(monkeypatch):
-    """What the program of a function of these arguments calls beside XLA's own operations."""
+    """The calls in the program of a function of these arguments, beside XLA's own operations."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
 
     def calls(function, *arguments):

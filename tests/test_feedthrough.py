@@ -1,4 +1,4 @@
-"""What a controller answers within a sample: input innovations, and the likelihood given them."""
+"""The answer of a controller within a sample: input innovations, and the likelihood given them."""
 
 import equinox as eqx
 import jax

@@ -16,13 +16,10 @@ from .results import Constant, Disturbance, ParameterEstimate, PredictionSkill, 
 from .sample_time import moved
 from .verdict import PREDICTIONS, TOLERANCE, Doubt, Move, Tolerance
 
-# Doubts need this many standard deviations.
-_SURE = 3.0
 # All mass at the rotors would make the squared radius of gyration that of the rotors; a heavy centre, this share of it.
 _HEAVIEST, _LIGHTEST = 1.5, 0.01
 # Aerodynamic moments may look like a gyroscopic coupling of this size (alpha1, alpha4, alpha7).
 _COUPLING = 0.25
-_CONSISTENT = 1e-3
 # Innovations that correlate more than this bias filter error more than its intervals say. Longer samples [s] than the
 # second figure would hide the motion with the vibration.
 _VIBRATION, _LONGEST_SAMPLE = 0.4, 0.008
@@ -41,7 +38,7 @@ _TORQUES: Moves = dict.fromkeys((*INVERSE, "thrust"))
 
 
 def doubts_of_log(findings: Sequence[Finding]) -> Iterator[Doubt]:
-    """What the logs show, as contradictions or as reservations."""
+    """The findings in the logs, as contradictions or as reservations."""
     for finding in findings:
         result = "implausible" if finding.contradicted else "successful"
         yield Doubt(result, f"{finding.cause} ({finding.size})", finding.remedy, dict.fromkeys(finding.quantities))
@@ -107,7 +104,7 @@ def contradicted(
         if parameter.contradiction is None or parameter.name not in found:
             continue
         value, std = found[parameter.name]
-        why = parameter.contradiction(value, _SURE * std)
+        why = parameter.contradiction(value, TOLERANCE.sure * std)
         if why is not None:
             own: Moves = dict.fromkeys([owner[parameter.name]] if parameter.name in owner else [])
             others = _TORQUES if parameter.scales_torque else follow(parameter.name, usual)
@@ -119,8 +116,8 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
     limit = float(airframe.mass) * reach
     for name, row in constants.items():
         largest, least = _HEAVIEST * limit * (2 if name == "Iz" else 1), _LIGHTEST * limit
-        beyond = row.estimate - _SURE * row.std > largest
-        if beyond or row.estimate + _SURE * row.std < least:
+        beyond = row.estimate - TOLERANCE.sure * row.std > largest
+        if beyond or row.estimate + TOLERANCE.sure * row.std < least:
             limit_passed = f"more than the {largest:.2g}" if beyond else f"less than the {least:.2g}"
             scale = "`drag_coefficient`" if name == "Iz" else "`thrust_coefficient`, `max_rotor_speed`"
             yield _implausible(
@@ -131,7 +128,7 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
     for axis, one in constants.items() if len(constants) == len(INVERSE) else ():
         (second, two), (third, three) = (each for each in constants.items() if each[0] != axis)
         excess = one.estimate - two.estimate - three.estimate
-        if excess > _SURE * np.sqrt(one.std**2 + two.std**2 + three.std**2) + 0.05 * one.estimate:
+        if excess > TOLERANCE.sure * np.sqrt(one.std**2 + two.std**2 + three.std**2) + 0.05 * one.estimate:
             remedy = (
                 "if `drag_coefficient` is a guess, measure it; else fly more yaw"
                 if axis == "Iz"
@@ -202,14 +199,14 @@ def _turns(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator
     opposite = False
     for name, axis, inertia in (("alpha3", "roll", "Ix"), ("alpha6", "pitch", "Iy"), ("alpha8", "yaw", "Iz")):
         value, std = found.get(name, (0.0, 0.0))
-        if value + _SURE * std < 0:
+        if value + TOLERANCE.sure * std < 0:
             opposite = True
             yield _implausible(
                 f"{name} = {value:.3g} is negative: {axis} answers the rotors with the opposite sign",
                 "check `rotor_positions` and `rotor_spins`, and the axes of the log",
                 {inertia: None},
             )
-        elif value <= _SURE * std and axis != "yaw":
+        elif value <= TOLERANCE.sure * std and axis != "yaw":
             yield Doubt(
                 "unidentifiable",
                 f"{axis} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
@@ -227,11 +224,11 @@ def _turns(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator
     variance[[0, 3, 6]] += _COUPLING**2
     variance[[1, 4]] = np.inf  # they need the inertia of the rotors too
     p_value, without_yaw = (_p_value(model, alpha, variance, unknown) for unknown in ([], [7]))
-    if p_value < _CONSISTENT:
+    if p_value < TOLERANCE.consistent:
         yield _implausible(
             f"alpha1, alpha4 and alpha7 contradict the inertias of alpha3, alpha6 and alpha8 (p = {p_value:.1g})",
             "check the axes and signs of the gyro, `rotor_positions` and `drag_coefficient`",
-            _ALL if without_yaw < _CONSISTENT else {"Iz": None},
+            _ALL if without_yaw < TOLERANCE.consistent else {"Iz": None},
         )
 
 
@@ -246,14 +243,14 @@ def _p_value(model: CorrectedOS4, alpha: np.ndarray, variance: np.ndarray, unkno
 def _unseen(found: Found, log_step: float, follow: Consequences) -> Iterator[Doubt]:
     """A lag or delay of the rotors that the log is too slow to show. `log_step`: its longest sample [s]."""
     lag, error = found.get("rotor_lag", (np.inf, 0.0))
-    if -_SURE * error <= lag < log_step - _SURE * error:
+    if -TOLERANCE.sure * error <= lag < log_step - TOLERANCE.sure * error:
         yield _implausible(
             f"rotor_lag = {lag:.2g} s is shorter than a sample of the log, {log_step:.2g} s",
             "log faster, or leave out the term `motor` or `lag`",
             {**follow("rotor_lag", log_step), "motors": None},
         )
     delay, error = found.get("rotor_delay", (0.0, 0.0))
-    if abs(delay) - _SURE * error > _LONGEST_DELAY:
+    if abs(delay) - TOLERANCE.sure * error > _LONGEST_DELAY:
         how = "late" if delay < 0 else "early"
         yield _implausible(
             f"rotor_delay = {delay:.2g} s: motors are recorded {1e3 * abs(delay):.0f} ms {how}, more than any rotor",

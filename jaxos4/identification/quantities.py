@@ -12,8 +12,6 @@ from .fit import PRIOR_NOTE, Fit
 from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
 from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Doubt, Quantity
 
-# Doubts need this many standard deviations, or a probability below this one, to exceed chance.
-_SURE, _CONSISTENT = 3.0, 1e-3
 # Notes about a parameter that are reservations, and how they read there.
 _READ = {"came out negative": "came out negative, which is impossible", "outside its bracket": "is outside its bracket"}
 _BELOW_ONE = ("alpha1", "alpha4", "alpha7")
@@ -56,7 +54,7 @@ def _interval(row: Constant) -> str:
 
 
 def _notes(rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:
-    """What rests on a bracket, lies outside it, or is at its limit."""
+    """Notes on parameters that rest on a bracket, lie outside it, or are at their limit."""
     found = [f"{name} {said}" for name, row in rows.items() for note, said in _READ.items() if note in row.note]
     for name in rows:
         if shares[name] > TOLERANCE.prior:
@@ -94,21 +92,21 @@ def flight_quantities(table: dict[str, ParameterEstimate], body: RigidBody) -> d
 def doubts_of_flight(
     table: dict[str, ParameterEstimate], body: RigidBody, findings: Sequence[Finding]
 ) -> Iterator[Doubt]:
-    """What speaks against the alphas of an OS4."""
+    """The doubts about the alphas of an OS4."""
     every = dict.fromkeys((*table, RIGID_BODY))
     for finding in findings:
         yield Doubt("implausible", f"{finding.cause} ({finding.size})", finding.remedy, every)
     gyro = "check the scale, the axes and the signs of the gyro, and the time stamps"
     for name in _BELOW_ONE:
         row = table[name]
-        if row.estimate is not None and row.std is not None and abs(row.estimate) - _SURE * row.std > 1:
+        if row.estimate is not None and row.std is not None and abs(row.estimate) - TOLERANCE.sure * row.std > 1:
             cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as that of every rigid body"
             yield Doubt("implausible", cause, gyro, {name: None, RIGID_BODY: None})
     rotor = body.constants.get("J_R")
-    if rotor is not None and rotor.estimate + _SURE * rotor.std < 0:
+    if rotor is not None and rotor.estimate + TOLERANCE.sure * rotor.std < 0:
         cause = f"J_R = {rotor.estimate:.3g} kg m^2 is negative"
         yield Doubt("implausible", cause, "check `rotor_spins`, and which rotor is which", {RIGID_BODY: None})
-    if body.consistency_p is not None and body.consistency_p < _CONSISTENT:
+    if body.consistency_p is not None and body.consistency_p < TOLERANCE.consistent:
         cause = f"the alphas are not those of one rigid body (p = {body.consistency_p:.1g})"
         yield Doubt("implausible", cause, f"{gyro}; or use another `subject`", {RIGID_BODY: None})
     elif body.is_rigid_body is False:

@@ -303,7 +303,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return msgspec.to_builtins(fields)
 
     def summary(self, *, verbose: bool = False, width: int = 80) -> str:
-        """What `jaxos4 estimate` prints on a terminal of this width [columns]. `verbose`: with all parameters."""
+        """The text of `jaxos4 estimate` on a terminal of this width [columns]. `verbose`: with all parameters."""
         from ..report import identification_summary
 
         return identification_summary(self, verbose=verbose, width=width)

@@ -148,9 +148,9 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) 
     most = _SEGMENTS * max(recordings // _FEW_RECORDINGS, 1)
     segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
-    padded = with_room(shooting, capacity_of(room.fitted.time.shape[0]))
-    passed = _input_innovations(shooting, capacity_of(room.fitted.time.shape[0]))
-    return InnovationsProblem(padded, segments=segments, least_noise=least_noise, input_innovations=passed)
+    capacity = capacity_of(room.fitted.time.shape[0])
+    padded, inputs = with_room(shooting, capacity), _input_innovations(shooting, capacity)
+    return InnovationsProblem(padded, segments=segments, least_noise=least_noise, input_innovations=inputs)
 
 
 def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.ndarray, "samples feedthroughs 3"] | None:

@@ -32,7 +32,7 @@ class Move(msgspec.Struct, frozen=True):
 
 
 class Doubt(msgspec.Struct, frozen=True):
-    """What speaks against an estimate.
+    """A reason not to trust an estimate, or a part of it.
 
     - `result`: the name of the result code to which it leads if it refuses the moments of inertia; `"successful"`: it
       only makes a reservation.
@@ -61,6 +61,7 @@ class Tolerance(msgspec.Struct, frozen=True):
     - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
       of it, these are not identified. Segments last 1.25 s, and the jackknife compares at least four parts.
     - `prior`: the share of the information about a parameter that its bracket may give without a reservation.
+    - `sure`, `consistent`: what exceeds chance: so many standard deviations, or a probability below the second.
     """
 
     share: float = 0.05
@@ -69,6 +70,8 @@ class Tolerance(msgspec.Struct, frozen=True):
     unknown: float = 0.4
     seconds: float = 10.0
     prior: float = 0.25
+    sure: float = 3.0
+    consistent: float = 1e-3
 
 
 TOLERANCE = Tolerance()

@@ -199,7 +199,7 @@ def _decoded(path: Path) -> _Log:
 
 
 def _layout(body: bytes) -> tuple[int, int, str, np.dtype | None, dict[str, float]]:
-    """Of a message FMT: the number, length and name of the messages that it describes, and their layout.
+    """The number, length and name of the messages that a message FMT describes, and their layout.
 
     The layout is `None` if it is not known. Last, by field, the unit of its last digit; 0 for a text.
     """

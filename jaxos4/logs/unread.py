@@ -20,7 +20,7 @@ _KINDS = {
 
 
 def unread_kind(begin: bytes) -> str:
-    """What a file is by its first bytes, and what to do, if no reader takes it; empty if it may be a CSV."""
+    """The kind of a file by its first bytes, and what to do with it; empty if it may be a CSV."""
     return next(
         (f"is {what}; {remedy}" for magic, (what, remedy) in _KINDS.items() if re.match(magic, begin, re.DOTALL)), ""
     )

@@ -98,7 +98,7 @@ class FlightModel(AbstractModel):
 
     @property
     def quantities(self) -> dict[str, list[str]]:
-        """What the terms describe together, each with its parameters, without biases; see `Term.quantity`."""
+        """The quantities that the terms describe, each with its parameters, without biases; see `Term.quantity`."""
         found: dict[str, list[str]] = {}
         for term, _, parameter in self._table:
             if term.quantity and parameter.force_axis is None:

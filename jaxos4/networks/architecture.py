@@ -73,7 +73,7 @@ ARCHITECTURES = {
     "mlp": (GatedPerceptron, ("width", "depth")),
     "cmac": (CMAC, ("tilings", "cells")),
 }
-"""What corrects the linear map, by name: the class, and the settings that are its arguments."""
+"""The corrections of the linear map by name: the class, and the settings that are its arguments."""
 
 
 class Regressor(eqx.Module):

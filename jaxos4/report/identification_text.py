@@ -41,7 +41,7 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
 
 
 def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:
-    """What `print_identification` prints on a terminal of this width [columns]."""
+    """The text of `print_identification` on a terminal of this width [columns]."""
     text = io.StringIO()
     print_identification(Console(width=width, file=text, force_jupyter=False), found, verbose=verbose)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())

@@ -1,4 +1,4 @@
-"""What a controller answers within a sample.
+"""The answer of a controller within a sample.
 
 A sample of filter error may last longer than the controller takes to answer. Then the torque in the sample holds
 answers to the noise of what is measured in it, so torque and innovation correlate, and a likelihood that takes this
@@ -26,7 +26,7 @@ def input_innovations(
     *,
     memory: float = 0.1,
 ) -> Float[np.ndarray, "samples feedthroughs 3"]:
-    """What the past does not tell of the torque within each sample, about each axis, with a mean square of 1.
+    """The part of the torque within each sample that the past does not tell, about each axis, of mean square 1.
 
     A linear regression on the samples before, of the torque and the rate about the same axis. Of the parts of a sample,
     `FEEDTHROUGHS` combinations are left, in which most of the rest lies. 0 at the beginning of a stretch.

@@ -311,15 +311,15 @@ class InnovationsProblem(AbstractProblem):
             problem = dataclasses.replace(problem, model=each.model)
             places = jnp.asarray(each.places)[self.cut.recording].T
         model = problem.model
-        passed = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
-        passed = jnp.pad(passed, ((0, 0), (0, 0), (0, problem.columns.size - passed.shape[2]), (0, 0)))
+        inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
+        inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, problem.columns.size - inputs.shape[2]), (0, 0)))
         settings = {"dt": self.flight.dt, "window": self.window, "rows": self.cut.rows}
         settings |= {"forcing_parameters": model.forcing_parameters}
 
         def at(parameters: Parameters, noise: LogNoise, feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
-            data = observed, passed, forcing, own, noise, tuple(feedthrough.T), tuple(self.passed.T)
+            data = observed, inputs, forcing, own, noise, tuple(feedthrough.T), tuple(self.passed.T)
             functions = problem.advance, problem.average, model.observe
             return innovate(functions, *data, forcing_tangents=tangents, **settings)
 

@@ -27,7 +27,7 @@ Products = Complex[np.ndarray, "frequencies 6 6"]
 
 
 class Response(msgspec.Struct, frozen=True):
-    """What roll and pitch acceleration and vertical force answer to the rotors, at 2 to 15 Hz.
+    """The answer of roll and pitch acceleration and vertical force to the rotors, at 2 to 15 Hz.
 
     - `turning`: the matrix from roll and pitch torque to roll and pitch acceleration [1/(kg m^2)].
     - `delays`: of gyro and accelerometer after the rotors, and of the gyro after the accelerometer [s].
