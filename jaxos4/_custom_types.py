@@ -21,8 +21,6 @@ RotorSpeeds = Float[Array, "samples 4"]
 Key = PRNGKeyArray
 Numeric = Array | np.ndarray
 
-LARGEST = 2**31 - 1  # of the integers in single precision
-
 
 def as_float(x: ArrayLike) -> Array:
     """Convert to a strongly typed array of the default float type, so that equal shapes share one compiled program."""
@@ -93,8 +91,8 @@ def integer(name: str, least: int, *, static: bool = False) -> Callable[[Any], A
             value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
-        if value > LARGEST:
-            raise ValueError(f"`{name}` must be at most {LARGEST}, got {value}.")
+        if value > (most := 2**31 - 1):  # of the integers in single precision
+            raise ValueError(f"`{name}` must be at most {most}, got {value}.")
         return value if static else _constant(value, int)
 
     return convert

@@ -24,8 +24,6 @@ ALTERNATING_SPINS = (1.0, -1.0, 1.0, -1.0)
 
 GUESS = "guess"
 """In an airframe's file, instead of `inertia`, `drag_coefficient` or `rotor_inertia`: guessed from mass and rotors."""
-# In units of m r^2, m r^2 and r b, for rotors at the distance r: those of published quadrotors are within 40 %.
-_GUESSED_INERTIA, _GUESSED_ROTOR_INERTIA, _GUESSED_DRAG = (0.3, 0.3, 0.5), 1e-3, 0.1
 
 
 class Airframe(eqx.Module):
@@ -171,10 +169,10 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
         weight = constants["mass"] * constants.get("gravity", GRAVITY)
         constants["thrust_coefficient"] = np.asarray(weight / (4 * constants.pop("hover_speed").item() ** 2))
     square = (constants["rotor_positions"] ** 2).sum(axis=1).mean()
-    guesses = {
-        "inertia": constants["mass"] * square * np.asarray(_GUESSED_INERTIA),
-        "drag_coefficient": constants["thrust_coefficient"] * np.sqrt(square) * _GUESSED_DRAG,
-        "rotor_inertia": constants["mass"] * square * _GUESSED_ROTOR_INERTIA,
+    guesses = {  # the constants of published quadrotors are within 40 %
+        "inertia": constants["mass"] * square * np.array([0.3, 0.3, 0.5]),
+        "drag_coefficient": constants["thrust_coefficient"] * np.sqrt(square) * 0.1,
+        "rotor_inertia": constants["mass"] * square * 1e-3,
     }
     airframe = Airframe(**constants | {name: guesses[name] for name in guessed})
     inertia, mixer = np.asarray(airframe.inertia), np.asarray(airframe.mixer)

@@ -3,14 +3,17 @@
 import contextlib
 from collections.abc import Iterator
 
-_LONGEST = 5000  # characters of a message: a path alone may have 4096
-
 
 class InputError(ValueError):
-    """A file or an argument cannot be used. The message is one printable line, whatever a file put into it."""
+    """A file or an argument cannot be used. The message is one printable line, whatever a file put into it.
+
+    `longest`: in characters; a path alone may have 4096.
+    """
+
+    longest = 5000
 
     def __init__(self, message: str):
-        super().__init__(_middle_cut(printable(message), _LONGEST))
+        super().__init__(_middle_cut(printable(message), self.longest))
 
 
 class TrainingError(RuntimeError):

@@ -16,10 +16,6 @@ from .airframe import Airframe
 
 AXES = ("roll", "pitch", "yaw")
 STANDARD_TONES = ((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), (0.5, 0.9, 1.7))
-DOUBLET = (1.0, -1.0)
-STEP_3211 = (0.8, 0.8, 0.8, -1.2, -1.2, 1.1, -1.1)
-TAPER = 0.2
-_CHIRP = (0.6, 3.0)  # [Hz]
 
 Amplitude = float | Sequence[float] | Float[Numeric, "3"]
 
@@ -70,7 +66,7 @@ def doublet(airframe: Airframe, *, duration: float = 5.0, dt: float = 0.01, ampl
 
     **Raises:** as `multisine`, and if the duration is too short.
     """
-    return _pulses(airframe, DOUBLET, 0.3, duration, dt, amplitude)
+    return _pulses(airframe, (1.0, -1.0), 0.3, duration, dt, amplitude)
 
 
 def step3211(airframe: Airframe, *, duration: float = 5.0, dt: float = 0.01, amplitude: Amplitude = 1.0) -> RotorSpeeds:
@@ -79,7 +75,7 @@ def step3211(airframe: Airframe, *, duration: float = 5.0, dt: float = 0.01, amp
     Heights of 0.8, 1.2, 1.1 and 1.1 end at rest: 3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 = 0. The angle is then amplitude x
     0.296 s.
     """
-    return _pulses(airframe, STEP_3211, 0.1, duration, dt, amplitude)
+    return _pulses(airframe, (0.8, 0.8, 0.8, -1.2, -1.2, 1.1, -1.1), 0.1, duration, dt, amplitude)
 
 
 def chirp(
@@ -94,13 +90,14 @@ def chirp(
     **Raises:** as `multisine`, and if an axis gets less than one cycle.
     """
     intervals = _intervals(duration, dt)
-    _check_frequencies("dt", _CHIRP, dt)
+    ends = 0.6, 3.0  # [Hz]
+    _check_frequencies("dt", ends, dt)
     samples = intervals // len(AXES)
     span = (samples - 1) * dt
-    if span * sum(_CHIRP) / 2 < 1:
-        least = len(AXES) * (2 / sum(_CHIRP) + 2 * dt)
+    if span * sum(ends) / 2 < 1:
+        least = len(AXES) * (2 / sum(ends) + 2 * dt)
         raise ValueError(f"`duration` must be at least {least:.3g} s for one cycle on each axis, got {duration:g} s.")
-    sine, frequency = _sweep(samples, span, _CHIRP)
+    sine, frequency = _sweep(samples, span, ends)
     angle = np.pad(sine / (2 * math.pi * frequency), 1)
     rate = np.diff(angle) / dt
     shape = np.diff(rate) / dt / np.abs(rate).max()
@@ -174,26 +171,22 @@ def _check_frequencies(name: str, frequencies: Sequence[float], dt: float) -> No
         raise ValueError(f"`{name}`: frequencies must lie between 0 and half the sample rate, {most:g} Hz, got {got}.")
 
 
-# Pulses of a reference last about 0.3 periods of the controlled vehicle's attitude [s]. Each is as high as the others.
-_WIDTH = 0.3
-_REFERENCE_PULSES = (("doublet", DOUBLET), ("3211", (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)))
-_VERTICAL_TONES = (0.4, 0.8, 1.2)
-_SWEPT = (0.2, 3.0)
-
-
 def standard_references(
     samples: int, dt: float, largest: Float[np.ndarray, "4"]
 ) -> dict[str, Float[np.ndarray, "samples 4"]]:
     """Multisine, doublet, 3-2-1-1 and chirp as references for a controller.
 
-    References are as `fly_closed_loop` takes them. A multisine excites them at once, the others in turn.
+    References are as `fly_closed_loop` takes them. A multisine excites them at once, the others in turn. Pulses last
+    0.3 s, about 0.3 periods of the controlled vehicle's attitude, and all are of one height.
 
     - `largest`: the largest value of each. References are 0 if a shape does not fit into the time.
     """
     time = dt * np.arange(samples)[:, None]
-    sines = [np.sin(2 * math.pi * time * np.asarray(some)).sum(axis=1) for some in (*STANDARD_TONES, _VERTICAL_TONES)]
-    swept, _ = _sweep(max(samples // 4, 1), samples // 4 * dt, _SWEPT)
-    pulses = {name: np.repeat([*heights, 0.0], max(round(_WIDTH / dt), 1)) for name, heights in _REFERENCE_PULSES}
+    vertical = 0.4, 0.8, 1.2  # [Hz]
+    sines = [np.sin(2 * math.pi * time * np.asarray(some)).sum(axis=1) for some in (*STANDARD_TONES, vertical)]
+    swept, _ = _sweep(max(samples // 4, 1), samples // 4 * dt, (0.2, 3.0))
+    heights = {"doublet": [1, -1, 0], "3211": [1, 1, 1, -1, -1, 1, -1, 0]}
+    pulses = {name: np.repeat(np.array(each, float), max(round(0.3 / dt), 1)) for name, each in heights.items()}
     shapes = {"multisine": np.stack(sines, axis=1)}
     for name, parts in ({name: (once, -once) for name, once in pulses.items()} | {"chirp": (swept,)}).items():
         shapes[name] = _in_turn(parts, samples, 4, [slot % 4 for slot in range(samples // len(parts[0]))])
@@ -214,8 +207,11 @@ def _in_turn(shapes: Sequence[np.ndarray], samples: int, columns: int, slots: Se
 
 
 def _sweep(samples: int, span: float, frequencies: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """A sine whose frequency rises linearly in `span` seconds, faded in and out; and the frequency at each sample."""
+    """A sine whose frequency rises linearly in `span` seconds; and the frequency at each sample.
+
+    It is faded in and out over a fifth of the time each.
+    """
     share, (first, last) = np.linspace(0, 1, samples), frequencies
     phase = 2 * math.pi * span * (first * share + (last - first) * share**2 / 2)
-    fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / TAPER, 0, 1)) ** 2
+    fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / 0.2, 0, 1)) ** 2
     return fade * np.sin(phase), first + (last - first) * share

@@ -12,7 +12,7 @@ import jaxos4
 from jaxos4 import design
 from jaxos4.design import Envelope
 from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
-from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
+from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.design.task import CRITERIA, criterion_of
 from jaxos4.study import load_study
 from jaxos4.study.cell import fleet_of
@@ -111,7 +111,7 @@ def test_a_designed_input_tells_more_than_the_standard_inputs(speeds):
 
 
 def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(speeds):
-    others, designed, limits = drawn(BRACKET, jax.random.key(77), VEHICLES), speeds.designed, speeds.task
+    others, designed, limits = drawn(BRACKET, jax.random.key(77), speeds.task.vehicles), speeds.designed, speeds.task
     states = fly_finely(MODEL, others, jnp.asarray(designed.inputs), jnp.asarray(DT, float))
     shares = limits.envelope.shares(designed.inputs, states, float(DT))
     assert max(shares.values()) <= 1

@@ -18,7 +18,7 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.design import Design
-from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
+from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.models import MODELS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -51,7 +51,7 @@ def designed(model: jaxos4.AbstractModel, channels: str, width: float, duration:
 def excess(model: jaxos4.AbstractModel, found: Design, width: float, seed: int) -> float:
     """The largest share of a limit that other vehicles from the bracket use, at a tenth of the step."""
     bracket = jaxos4.Bracket.around(model.alpha, width * np.asarray(model.half_width))
-    others = drawn(bracket, jax.random.key(seed + 1000), VEHICLES)
+    others = drawn(bracket, jax.random.key(seed + 1000), found.task.vehicles)
     states = fly_finely(model, others, jnp.asarray(found.designed.inputs), jnp.asarray(DT))
     return max(found.task.envelope.shares(found.designed.inputs, states, DT).values())
 

@@ -7,13 +7,6 @@ from jaxtyping import Float, Int
 from ..shooting import ROUNDING
 from .evaluation import Evaluation
 
-# Correlations of residuals are computed up to this many samples apart, and in a short flight up to half of it.
-_LAGS = 25
-# Residuals below this share of a channel's largest value are rounding errors, in double precision.
-_ROUNDING = 1e-9
-# A channel with fewer measurements than this has no diagnostics.
-_FEWEST = 3
-
 
 class Diagnostics(eqx.Module):
     """Residuals of each simulated channel, in cascade order: p, q, r, then phi, theta, psi, then x, vx, y, vy, z, vz.
@@ -54,18 +47,20 @@ class Diagnostics(eqx.Module):
 def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diagnostics:
     """Diagnostics of the residuals of one flight, evaluated at the answer of a fit.
 
-    `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom.
+    `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom. Correlations are those
+    of residuals up to 25 samples apart, in a short flight up to half of it.
     """
     from scipy.special import gammainc, gammaincc  # slow to import, and few need it
 
-    lags = min(_LAGS, evaluation.measured.shape[0] // 2)
+    lags = min(25, evaluation.measured.shape[0] // 2)
     problem, feasible = evaluation.problem, evaluation.feasible
     # A diverged trajectory counts as nothing measured.
     measured = ~np.isnan(evaluation.measured) & feasible
     errors, values = (np.where(measured, x, 0.0) for x in (evaluation.errors, evaluation.measured))
     sigma, count, squares = evaluation.sigma, measured.sum(axis=0), np.square(errors).sum(axis=0)
-    most, known, largest = np.maximum(count, 1), count >= _FEWEST, np.abs(values).max(axis=0)
-    rounding = max(_ROUNDING, ROUNDING * float(np.finfo(np.asarray(problem.sigma).dtype).eps))
+    most, known, largest = np.maximum(count, 1), count >= 3, np.abs(values).max(axis=0)
+    # Residuals below this share of a channel's largest value are rounding errors.
+    rounding = max(1e-9, ROUNDING * float(np.finfo(np.asarray(problem.sigma).dtype).eps))
     trivial = ~known | (sigma * np.abs(errors).max(axis=0) <= rounding * largest)
 
     unknowns = problem.windows * problem.free_size + (evaluation.parameters.size if fitted else 0)

@@ -18,12 +18,6 @@ from ..linalg import covariance_of_shared
 from ..models.state import CHANNELS
 from ..shooting import FASTEST, ShootingProblem, padded
 
-_THETA = 4  # the place of the pitch angle in cascade order
-# Residuals are taken as correlated over lags up to this share of the flight.
-_LAGS = 0.1
-# The covariance of a window's residuals is estimated from at least so many windows, each of at most so many residuals.
-_MANY_WINDOWS, _LARGEST_WINDOW = 20, 4000
-
 Spread = Float[np.ndarray, "parameters parameters"]
 
 
@@ -51,7 +45,8 @@ class Evaluation(NamedTuple):
         states = self.predicted[:, : self.problem.size]
         if not np.isfinite(states).all() or (np.abs(states[:, : CHANNELS["rates"]]) >= FASTEST).any():
             return False
-        return states.shape[1] <= _THETA or bool((np.abs(states[:, _THETA]) < np.pi / 2).all())
+        theta = states[:, 4:5]  # in cascade order; none if only rates are simulated
+        return bool((np.abs(theta) < np.pi / 2).all())
 
     @property
     def sigma(self) -> Float[np.ndarray, " columns"]:
@@ -169,6 +164,8 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     too. The residuals are taken as the noise. They lack slow noise that the fit explained as motion. A flight must
     therefore be many times longer than the correlation time of the noise.
 
+    The noise is taken as stationary, or, of at least 20 windows with at most 4,000 residuals each, as that of a window.
+
     **Arguments:** the flight, evaluated at the answer of a fit.
 
     **Returns:** the covariance; infinite if the trajectory diverges or nothing was measured.
@@ -187,7 +184,7 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     moves = np.swapaxes(jacobian, 1, 2) @ sensitivity
     index, within = evaluation.problem.cut()
     errors, measured = (x[index] * within[:, :, None] for x in (evaluation.errors, measured.astype(float)))
-    if len(index) >= _MANY_WINDOWS and moves.shape[1] <= _LARGEST_WINDOW:
+    if len(index) >= 20 and moves.shape[1] <= 4000:
         return _window_by_window(errors.reshape(len(index), -1), measured.reshape(len(index), -1), moves)
     return _stationary(errors[within], measured[within], moves.reshape(*errors.shape, count)[within])
 
@@ -195,7 +192,8 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
 def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
     """The covariance for stationary noise: R(t, s) depends on t - s only. The first axis of all arrays is time.
 
-    Bartlett's weights make the sum over lags positive. Sums over lags are products of spectra.
+    Residuals are taken as correlated over lags up to a tenth of the flight. Bartlett's weights make the sum over lags
+    positive. Sums over lags are products of spectra.
     """
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
@@ -206,7 +204,7 @@ def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> 
 
     lag = np.minimum(np.arange(length), length - np.arange(length))
     pairs = np.maximum(np.round(products(measured)), 1) / (1 - np.minimum(lag, samples - 1) / samples)[:, None, None]
-    weights = np.maximum(1 - lag / (_LAGS * samples), 0.0)
+    weights = np.maximum(1 - lag / (0.1 * samples), 0.0)
     spectrum = np.fft.rfft(weights[:, None, None] * products(errors) / pairs, axis=0)
     slopes = np.fft.rfft(moves, length, axis=0)
     density = np.swapaxes(np.conj(slopes), 1, 2) @ spectrum @ slopes

@@ -1,5 +1,7 @@
 """Which parameters a flight can identify, and for each of the others the reason why not."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,10 +11,7 @@ from ..bracket import Bracket, is_identifiable
 from ..results import NINETY_FIVE
 from .evaluation import Evaluation, evaluate, inverse
 
-Values = Float[np.ndarray, " parameters"]
-
-# Smallest share of a weakly determined direction for a parameter to be named as a partner.
-_PARTNER = 0.2
+PerParameter = Float[np.ndarray, " parameters"]
 
 
 class Identifiability(eqx.Module):
@@ -25,13 +24,16 @@ class Identifiability(eqx.Module):
     - `eigenvalues`: of the information in units of half-widths, in increasing order. Below 1 the flight contains less
       information about that direction than the bracket.
     - `directions`: the eigenvectors in half-widths, one in each column.
+    - `partner`: the smallest share of a weakly determined direction with which a parameter is named as a partner.
     """
 
-    nominal: Values
-    half_width: Values
-    std: Values
-    std_alone: Values
-    eigenvalues: Values
+    partner: ClassVar[float] = 0.2
+
+    nominal: PerParameter
+    half_width: PerParameter
+    std: PerParameter
+    std_alone: PerParameter
+    eigenvalues: PerParameter
     directions: Float[np.ndarray, "parameters parameters"]
 
     @property
@@ -45,7 +47,7 @@ class Identifiability(eqx.Module):
         return is_identifiable(self.std_alone, self.half_width)  # pyright: ignore[reportReturnType]
 
     @property
-    def noise_limit(self) -> Values:
+    def noise_limit(self) -> PerParameter:
         """The largest noise, in multiples of sigma, at which the 95 % interval of the nominal value excludes 0."""
         return np.abs(self.nominal) / (NINETY_FIVE * self.std)
 
@@ -71,7 +73,7 @@ class Identifiability(eqx.Module):
         vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
         weakest = vectors[:, np.argmax(np.abs(vectors[i]))]
         share = np.abs(weakest) / np.abs(weakest).max()
-        return [j for j in range(len(share)) if j != i and share[j] > _PARTNER] or [int(np.argsort(share)[-2])]
+        return [j for j in range(len(share)) if j != i and share[j] > self.partner] or [int(np.argsort(share)[-2])]
 
 
 def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability:

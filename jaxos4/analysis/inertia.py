@@ -14,10 +14,6 @@ from ..airframe import Airframe
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from .evaluation import inverse, unit_eigen
 
-# Gauss-Newton steps. They converge fast, because the alphas are nearly linear in the constants over their errors.
-_STEPS = 20
-# The fit starts at the reciprocals of alpha3, 6, 8 if they are within this factor of the airframe's inertia.
-_FAR = 100.0
 # The definitions below Eq. (13): alpha_i = (_OFFSET + _NUMERATOR @ constants)_i / constants[_DENOMINATOR_i], with
 # J_R in multiples of the model's gyroscopic factor.
 _DENOMINATOR = np.array([0, 0, 0, 1, 1, 1, 2, 2])
@@ -106,9 +102,13 @@ def _alphas(constants: np.ndarray) -> np.ndarray:
 
 
 def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The constants, the curvature of the cost, and the weighted residuals."""
+    """The constants, the curvature of the cost, and the weighted residuals.
+
+    It starts at the reciprocals of alpha3, 6, 8 if they are within a factor of 100 of the airframe's inertia. 20 steps
+    are enough, because the alphas are nearly linear in the constants over their errors.
+    """
     first = 1 / alpha[..., [2, 5, 7]]
-    first = np.where((first > inertia / _FAR) & (first < _FAR * inertia), first, inertia)
+    first = np.where((first > inertia / 100) & (first < 100 * inertia), first, inertia)
     rotor = (alpha[..., 1] * first[..., 0] + alpha[..., 4] * first[..., 1]) / 2
     constants = np.concatenate([first, rotor[..., None]], axis=-1)
 
@@ -119,7 +119,7 @@ def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) ->
         residuals = (whiten @ (alpha - predicted)[..., None])[..., 0]
         return slopes, np.swapaxes(slopes, -1, -2) @ slopes, residuals
 
-    for _ in range(_STEPS):
+    for _ in range(20):
         slopes, curvature, residuals = linearised(constants)
         gradient = np.swapaxes(slopes, -1, -2) @ residuals[..., None]
         constants = constants + (inverse(curvature) @ gradient)[..., 0]

@@ -19,15 +19,10 @@ from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
-from .sensors import Motion, Sense, Signals, log
+from .sensors import BodyMotion, Sense, Signals, log
 from .settings import ClosedLoop, PerAxis
 
 References = Float[Array, "samples 4"]
-
-# The controller tilts the thrust no further than this to carry the weight: the cosine of 60 degrees.
-_STEEPEST = 0.5
-# The time between two steps of a random reference [s].
-_HOLD = 0.5
 
 
 def random_references(
@@ -35,7 +30,8 @@ def random_references(
 ) -> References:
     """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
 
-    Accelerations come in pairs of opposite sign. So the vehicle gains little vertical velocity, as in a real flight.
+    Each steps every half second, one after another. Accelerations come in pairs of opposite sign. So the vehicle gains
+    little vertical velocity, as in a real flight.
 
     **Arguments:**
 
@@ -51,7 +47,7 @@ def random_references(
     if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
         raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
     time = dt * np.arange(round(duration / dt) + 1)
-    steps = (time[:, None] / _HOLD + np.arange(4) / 4).astype(int)
+    steps = (time[:, None] / 0.5 + np.arange(4) / 4).astype(int)
     flown = (time >= 1) & (time <= duration - 1)
     return _levels(key, steps, int(steps[-1, -1]) + 1, flown[:, None] * np.asarray(amplitude, dtype=float))
 
@@ -139,7 +135,7 @@ class _Vehicle(NamedTuple):
         drag, flapping = ((), ()) if air is None else ((*air.drag, air.inflow), tuple(air.flapping))
         return cls(alpha_scalars(ix, iy, iz, rotor), rotor / iz, gravity, tuple(loop.damping), drag, flapping)
 
-    def cascade(self, state: Motion, forcing: _Acting, parameters: None) -> Motion:
+    def cascade(self, state: BodyMotion, forcing: _Acting, parameters: None) -> BodyMotion:
         """The derivative of the motion: Newton and Euler in the body's axes."""
         p, q, r = state.rates
         turning = CorrectedOS4().angular_acceleration(state.rates, forcing.rotors, self.alpha)
@@ -148,7 +144,7 @@ class _Vehicle(NamedTuple):
         turning = turning._replace(r=turning.r - self.reaction * forcing.spin_up)
         attitude = attitude_rates(state.rates, state.attitude)
         if state.velocity is None or forcing.wind is None:
-            return Motion(turning, attitude, None)
+            return BodyMotion(turning, attitude, None)
         (u, v, w), (wind_x, wind_y, _) = state.velocity, forcing.wind
         along = Rates(self.flapping[0] * (v - wind_y), self.flapping[1] * (u - wind_x), jnp.zeros_like(u))
         turning = jax.tree.map(jnp.add, turning, along)
@@ -159,7 +155,7 @@ class _Vehicle(NamedTuple):
             y - self.gravity * cos_theta * sin_phi - r * u + p * w,
             z - self.gravity * cos_theta * cos_phi - p * v + q * u,
         )
-        return Motion(turning, attitude, moving)
+        return BodyMotion(turning, attitude, moving)
 
     def specific_force(self, velocity: Vector | None, forcing: _Acting) -> Vector:
         """The specific force along the body's axes [m/s^2]: thrust, gust, and drag through the air."""
@@ -182,10 +178,10 @@ class _Drawn(NamedTuple):
     own: Float[Array, "*runs 3"] | None
 
 
-class _State(NamedTuple):
+class _Carry(NamedTuple):
     """What a run of the controller leaves to the next. Row k + 1 of `commands` is that of run k."""
 
-    motion: Motion
+    motion: BodyMotion
     speeds: Float[Array, "4"]
     integral: PerAxis
     commands: Float[Array, "rows 4"]
@@ -224,8 +220,8 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         rotors = Forcing(roll, pitch, yaw, thrust / airframe.mass, residual)
         return _Acting(rotors, spin_up, tuple(gust), None if wind is None else tuple(wind))
 
-    def run(state: _State, row):
-        (motion, speeds, integral, commands, signals), (k, reference, drawn) = state, row
+    def run(carry: _Carry, row):
+        (motion, speeds, integral, commands, signals), (k, reference, drawn) = carry, row
         blown, error = (drawn.gusts, drawn.winds), drawn.noise
         weak, nothing = 1 - loop.sag * k / (runs - 1), jnp.zeros(())
         now = acting(weak, jnp.square(speeds), nothing, nothing, *jax.tree.map(lambda ends: ends[0], blown))
@@ -254,17 +250,17 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         (later, speeds), means = jax.lax.scan(step, (motion, speeds), (jnp.arange(steps), *middle))
         mean = means.mean(axis=0)
         signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)
-        omega = command if loop.logged == "commands" else state.speeds
-        return _State(later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
+        omega = command if loop.logged == "commands" else carry.speeds
+        return _Carry(later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
 
     weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())
     hover, _ = _speeds(allocation, jnp.zeros(3), weight, airframe.max_rotor_speed)
     velocity = None if loop.air is None else (zero, zero, zero)
-    motion = Motion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
+    motion = BodyMotion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
     still = jnp.zeros(9).at[8].set(vehicle.gravity)
     signals = None if sense is None else Signals(still, still, jnp.zeros(4))
     commands = jnp.broadcast_to(motor.command(hover), (runs + 1, 4))
-    first = _State(motion, hover, jnp.zeros(3), commands, signals)
+    first = _Carry(motion, hover, jnp.zeros(3), commands, signals)
     inputs = jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), _draw(loop, key, runs, steps, h)
     return log(loop, dt, jax.lax.scan(run, first, inputs)[1], log_key)
 
@@ -282,7 +278,7 @@ def _control(
     airframe = loop.airframe
     error = loop.attitude_gain * (reference[:3] - attitude) - seen
     demand = loop.rate_gain * error + integral
-    upright = jnp.maximum(jnp.cos(attitude[0]) * jnp.cos(attitude[1]), _STEEPEST)
+    upright = jnp.maximum(jnp.cos(attitude[0]) * jnp.cos(attitude[1]), loop.steepest)
     thrust = as_float(airframe.mass * (reference[3] + airframe.gravity) / upright)
     inertia = as_float(airframe.inertia) if loop.controller_inertia is None else loop.controller_inertia
     speeds, saturated = _speeds(allocation, inertia * demand, thrust, airframe.max_rotor_speed)

@@ -14,10 +14,8 @@ from ..simulation import until_failure
 from ..trigonometry import sincos
 from .settings import ClosedLoop, PerAxis, Sensors
 
-_IMPOSSIBLE = 1e6  # what a sensor logs when it fails
 
-
-class Motion(NamedTuple):
+class BodyMotion(NamedTuple):
     """Body rates [rad/s], attitude [rad], and the velocity along the body's axes [m/s]; `None`: not simulated."""
 
     rates: Rates
@@ -68,7 +66,7 @@ class Sense(NamedTuple):
         return Signals(raw, filtered, signals.angles), jnp.where(self.own, filtered[3:6], filtered[:3])
 
 
-def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, Motion, Array, Array, Array], key: Key) -> Flight:
+def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Array, Array], key: Key) -> Flight:
     """The log up to the first sample at which the vehicle pitches to 90 degrees or a number is not finite.
 
     `logged`: rotor speeds, motion, body rates, attitude and specific force in each run of the controller.
@@ -113,7 +111,7 @@ def _lossy(sensors: Sensors, rates: Array, specific: Array, key: Key) -> tuple[A
     measured = jnp.concatenate([rates, specific], axis=1)
     draw = jax.random.uniform(bad_key, measured.shape)
     beyond = jnp.append(jnp.sort(draw.ravel()), 1.0)[sensors.bad_samples.astype(int)]
-    measured = jnp.where(draw < beyond, _IMPOSSIBLE, measured)
+    measured = jnp.where(draw < beyond, sensors.impossible, measured)
     lost = jax.random.uniform(lost_key, (len(measured), 2)) < sensors.dropouts
     measured = jnp.where(jnp.repeat(lost, 3, axis=1), jnp.nan, measured)
     return measured[:, :3], measured[:, 3:]

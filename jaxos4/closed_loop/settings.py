@@ -4,6 +4,8 @@ Flights share one program if they have the same `log_every` and `logged`, and al
 `sensors`: all other settings are data.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +57,7 @@ class Sensors(eqx.Module):
     - `speed_noise`, `speed_step`: standard deviation and rounding step of the logged rotor speeds or commands [rad/s].
     - `clock_offset`: delay of the logged rotors behind the gyro [s]; negative: the rotors are logged earlier.
     - `dropouts`: the shares of samples that gyro and accelerometer lose (NaN), independently.
-    - `bad_samples`: the number of impossible values, 1e6, at random places of gyro and accelerometer.
+    - `bad_samples`: the number of values `impossible` at random places of gyro and accelerometer.
     - `velocity_noise`: standard deviation of the measured velocity [m/s]. `None`: not measured. Needs `ClosedLoop.air`.
     - `controller_gyro_noise`: `None`: the controller answers the body rates of the log. A number: it answers the true
       rates with white noise of its own with this standard deviation [rad/s], behind a filter with the time constant
@@ -63,6 +65,8 @@ class Sensors(eqx.Module):
 
     **Raises:** `ValueError` that names the setting.
     """
+
+    impossible: ClassVar[float] = 1e6
 
     gyro_vibration: Scalar = eqx.field(converter=setting("gyro_vibration"), default=0.0)
     force_vibration: Scalar = eqx.field(converter=setting("force_vibration"), default=0.0)
@@ -107,8 +111,9 @@ class ClosedLoop(eqx.Module):
     - `sensors`: vibration, filters, clocks, losses, and a gyro of the controller's own. `None`: white noise is all.
 
     The controller: attitude error x `attitude_gain` is the wanted body rate. A PI controller of the body rate makes the
-    wanted angular acceleration. Torque is that x `controller_inertia`. The thrust carries the weight. A rotor that
-    would have to be slower than 0 or faster than its maximum saturates, and the integrators then stop.
+    wanted angular acceleration. Torque is that x `controller_inertia`. The thrust carries the weight, up to a tilt of
+    60 degrees, whose cosine is `steepest`. A rotor that would have to be slower than 0 or faster than its maximum
+    saturates, and the integrators then stop.
 
     - `attitude_gain` [1/s], `rate_gain` [1/s], `integral_gain` [1/s^2]: for each axis.
     - `controller_inertia`: Ix, Iy, Iz that the controller knows [kg m^2]; the true ones by default.
@@ -117,6 +122,8 @@ class ClosedLoop(eqx.Module):
 
     **Raises:** `ValueError` that names the setting.
     """
+
+    steepest: ClassVar[float] = 0.5
 
     airframe: Airframe
     rotor_lag: Scalar = eqx.field(converter=setting("rotor_lag"), default=0.05)

@@ -3,8 +3,8 @@
 from ..excitation import standard_references as standard_references
 from .envelope import Envelope as Envelope
 from .fleet import model_of as model_of
-from .references import References as References, design_references as design_references
-from .rotor_speeds import RotorSpeeds as RotorSpeeds, design_input as design_input
+from .references import design_references as design_references
+from .rotor_speeds import design_input as design_input
 from .task import (
     AbstractTask as AbstractTask,
     Design as Design,

@@ -1,7 +1,7 @@
 """Vehicles in closed loop that fly references through gusts, and what filter error can learn from their flights."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ from ..shooting.innovations import NOISE_PRECISION
 from ..shooting.sums import joined
 from .envelope import Envelope, hover_squares
 from .rotor_speeds import drawn
-from .task import Inputs
+from .task import Series
 
 LANES = 64
 """The number of flights in a batch. All batches share one program."""
@@ -32,16 +32,6 @@ LANES = 64
 INERTIAS = ("Ix", "Iy", "Iz")
 # The place of the alpha that is torque over each moment of inertia.
 _INVERSE = [PARAMETER_NAMES.index(name) for name in ("alpha3", "alpha6", "alpha8")]
-# Disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2]: less changes nothing.
-_LEAST = 1e-3
-# Physics steps in a sample: twice as many as `fly_closed_loop` takes by default.
-_SUBSTEPS = 8
-# Rotors turn at least with this share of the speed in hover, and at most with this multiple if no maximum is known.
-_SLOWEST, _FASTEST = 0.1, 2.0
-# Gusts alone use at most this share of a limit that is not given.
-_GUSTS = 0.8
-# So many vehicles fly in still air: gusts carry a vehicle without a position controller away, whatever its references.
-_STILL = 16
 
 
 def model_of(loop: ClosedLoop) -> FlightModel:
@@ -71,11 +61,16 @@ def batch_of(loop: ClosedLoop, in_gusts: np.ndarray | None = None, **values: Flo
 
 
 @eqx.filter_jit
-def fly_batch(loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt: Scalar, key: Key) -> Flight:
-    """Fly a batch. Velocity and position are integrals of measured attitude and specific force."""
+def fly_batch(
+    loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt: Scalar, key: Key, substeps: int = 8
+) -> Flight:
+    """Fly a batch. Velocity and position are integrals of measured attitude and specific force.
+
+    `substeps`: of the physics in a sample, twice as many as `fly_closed_loop` takes by default.
+    """
 
     def one(loop: ClosedLoop, references: References, key: Key) -> Flight:
-        flight = fly_closed_loop(loop, references, dt=dt, key=key, substeps=_SUBSTEPS)
+        flight = fly_closed_loop(loop, references, dt=dt, key=key, substeps=substeps)
         vertical = flight.channels[:, -1]
         nothing = jnp.zeros_like(vertical)
         force = jnp.stack(to_earth(Attitude(*flight.states[:, ANGLES].T), (nothing, nothing, vertical)), axis=1)
@@ -93,7 +88,22 @@ class Fleet(eqx.Module):
       Some fly in still air. Only they show velocity and distance.
     - `model`, `parameters`: of the filters, which know the true parameters, gusts and noise of `loop`.
     - `prior`: the information of the bracket, of which the half-widths are standard deviations.
+
+    The same for all fleets:
+
+    - `still`: so many vehicles fly in still air, because gusts carry a vehicle without a position controller away,
+      whatever its references.
+    - `least_gust`: disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2].
+    - `slowest`, `fastest`: rotors turn at least with this share of the speed in hover, and at most with this multiple
+      if no maximum is known.
+    - `gust_share`: gusts alone use at most this share of a limit that is not given.
     """
+
+    still: ClassVar[int] = 16
+    least_gust: ClassVar[float] = 1e-3
+    slowest: ClassVar[float] = 0.1
+    fastest: ClassVar[float] = 2.0
+    gust_share: ClassVar[float] = 0.8
 
     loop: ClosedLoop
     loops: ClosedLoop
@@ -109,7 +119,7 @@ class Fleet(eqx.Module):
         inertia = 1 / np.asarray(drawn(bracket, key, LANES))[:, _INVERSE]
         if not (np.isfinite(inertia).all() and (inertia > 0).all()):
             raise InputError("`bracket`: alpha3, alpha6 and alpha8 must be positive.")
-        loops = batch_of(loop, np.arange(LANES) >= _STILL, inertia=inertia, force_noise=np.zeros(LANES))
+        loops = batch_of(loop, np.arange(LANES) >= cls.still, inertia=inertia, force_noise=np.zeros(LANES))
         model, prior = model_of(loop), jnp.asarray(1 / np.square(np.asarray(bracket.half_width)))
         delay = loop.rotor_delay if loop.logged == "commands" else 0.0
         known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": delay}
@@ -156,7 +166,7 @@ class Fleet(eqx.Module):
         that of each channel about the parameters. A controller answers gusts, so the errors of both are correlated.
         """
         loop, count = self.loop, self.parameters.shape[0]
-        strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), _LEAST)
+        strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), self.least_gust)
 
         def one(omega: Array, states: Array, force: Array | None) -> tuple[Array, Array]:
             flight = Flight(flights.time[0], omega, states, specific_force=force, commanded=flights.commanded)
@@ -172,23 +182,23 @@ class Fleet(eqx.Module):
 
         return jax.vmap(one)(flights.omega, flights.states, flights.specific_force)
 
-    def _fly(self, references: Inputs) -> tuple[np.ndarray, np.ndarray, float]:
+    def _fly(self, references: Series) -> tuple[np.ndarray, np.ndarray, float]:
         """Rotor speeds, states and sample time; velocity and distance only of vehicles in still air."""
         every = jnp.broadcast_to(jnp.asarray(references), (LANES, *references.shape))
         flights = fly_batch(self.loops, every, as_float(self.dt), self.key)
         states = np.array(flights.states)
         if np.isfinite(states).all():  # no vehicle turned over
-            states[_STILL:, :, [*POSITION, *VELOCITY]] = 0
+            states[self.still :, :, [*POSITION, *VELOCITY]] = 0
         return np.asarray(flights.omega), states, self.dt
 
-    def envelope(self, references: Inputs, limits: Mapping[str, float]) -> Envelope:
+    def envelope(self, references: Series, limits: Mapping[str, float]) -> Envelope:
         """The limits that these references need, with some replaced. Limits of rotors are those of the airframe.
 
         Raises `InputError` for a limit that is not positive, or if a vehicle turns over or cannot hover.
         """
         airframe, hover = self.loop.airframe, float(self.loop.airframe.hover_speed)
-        slowest = _SLOWEST * hover
-        fastest = float(airframe.max_rotor_speed) if airframe.has_full_scale else _FASTEST * hover
+        slowest = self.slowest * hover
+        fastest = float(airframe.max_rotor_speed) if airframe.has_full_scale else self.fastest * hover
         rotors = {"slowest": slowest, "fastest": fastest, "slew": (fastest - slowest) / self.dt}
         unknown = Envelope(**rotors, **dict.fromkeys(("angle", "rate", "velocity", "distance"), 1.0))
         hover_squares(airframe, unknown.limited(limits))
@@ -199,17 +209,17 @@ class Fleet(eqx.Module):
         needed, still = (Envelope.of(*flown) for flown in flights)
         own = {}
         for name in ("angle", "rate"):  # roll and pitch may do the same
-            alone = np.asarray(getattr(still, name)) / _GUSTS
+            alone = np.asarray(getattr(still, name)) / self.gust_share
             roll, pitch, yaw = np.maximum(np.asarray(getattr(needed, name)), alone)
             own[name] = np.array([max(roll, pitch), max(roll, pitch), yaw])
         return needed.limited(rotors | own | dict(limits))
 
-    def uses(self, references: Inputs, envelope: Envelope) -> dict[str, float]:
+    def uses(self, references: Series, envelope: Envelope) -> dict[str, float]:
         """The largest share of each limit that a vehicle uses. A controller has no limit of slew."""
         shares = envelope.shares(*self._fly(references))
         return {name: share for name, share in shares.items() if name != "slew"}
 
-    def bounds(self, references: Mapping[str, Inputs]) -> dict[str, Float[np.ndarray, " parameters"]]:
+    def bounds(self, references: Mapping[str, Series]) -> dict[str, Float[np.ndarray, " parameters"]]:
         """The bounds of the airframe's vehicle after a flight with each of several references, in gusts."""
         names = list(references)
         order = np.arange(LANES) % len(names)

@@ -19,17 +19,10 @@ from ..flight import ANGLES, RATES
 from . import task
 from .envelope import Envelope, Uses
 from .fleet import INERTIAS, LANES, Fleet, batch_of, fly_batch, model_of
-from .task import Coefficients, Designed, Flown
+from .task import Coefficients, Designed, Flown, Search
 
-_LARGEST_ANGLE, _LARGEST_ACCELERATION = 1.0, 5.0
-# References that need too much are reduced: to about this share of a limit, so often, each time not below this factor.
-_TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
-# A parameter counts as excited if its bound is below this share of the bracket's standard deviation.
-_LITTLE = 0.9
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
 _SMALL = np.array([0.02, 0.02, 0.02, 0.2])
-# In a batch of tones, at least this many flights hover in gusts instead.
-_GUSTY = 8
 # Times in periods at which the search looks, about eight for each cycle of the fastest tone.
 _POINTS = np.arange(200) / 200
 
@@ -42,8 +35,11 @@ class Tones(NamedTuple):
 
     @classmethod
     def up_to(cls, bandwidth: float, samples: int, dt: float) -> "Tones":
-        """As many as fit into a batch, up to a bandwidth [Hz]: the references of a long flight repeat."""
-        most = (LANES - 1 - _GUSTY) // 2
+        """As many as fit into a batch, up to a bandwidth [Hz]: the references of a long flight repeat.
+
+        At least eight flights of the batch hover in gusts instead.
+        """
+        most = (LANES - 1 - 8) // 2
         period = (samples - 1) // max(math.ceil(samples * dt * bandwidth / most), 1)
         return cls(period, max(min(math.floor(bandwidth * period * dt + 1e-9), most), 1))
 
@@ -60,7 +56,7 @@ def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
 def _response(
     fleet: Fleet, envelope: Envelope, largest: Float[np.ndarray, "4"], tones: Tones, samples: int, key: Key
 ) -> dict[str, Any]:
-    """The fields `base`, `added` and `signals` of `References`: each tone is flown once in still air, by the simulator.
+    """The fields `base`, `added` and `signals` of `ReferenceTask`: each tone is flown once in still air.
 
     For small tones the vehicle is linear. So the information of a sum of tones is the sum of their informations.
 
@@ -96,7 +92,7 @@ def _response(
     return {"base": jnp.asarray(base / unit), "added": jnp.asarray(relative * each / unit), "signals": signals}
 
 
-class References(task.AbstractTask):
+class ReferenceTask(task.AbstractTask):
     """References for a controller. The targets are Ix, Iy and Iz; a coefficient of 1 is a tone of the largest value.
 
     - `scale`: the moments of inertia [kg m^2]. `unexcited`: almost the standard deviations of the bracket.
@@ -105,10 +101,21 @@ class References(task.AbstractTask):
     - `signals`: the angles and rates of an axis by a unit of the coefficients of its reference, cosines first, as a
       share of the part of the limit that gusts leave; by the name of the limit.
     - `largest`: the largest value of each reference. `basis`: the tones at the points of a period.
+
+    The same for all tasks:
+
+    - `target`: references that need too much are reduced to about this share of a limit, with at most so many
+      `reductions`, each by a factor that is at least `least_step`.
+    - `little`: a parameter counts as excited if its bound is below this share of the bracket's standard deviation.
     """
 
     kind: ClassVar[str] = "references"
     vehicles: ClassVar[int] = LANES
+    target: ClassVar[float] = 0.995
+    reductions: ClassVar[int] = 8
+    least_step: ClassVar[float] = 0.7
+    little: ClassVar[float] = 0.9
+    search: ClassVar[Search] = Search(starts=8, first=0.85, steps=80)
 
     envelope: Envelope
     scale: Float[Numeric, "3"]
@@ -145,7 +152,7 @@ class References(task.AbstractTask):
         basis = _parts(self.tones.turns(np.arange(self.samples) / self.tones.period))
         inputs = with_largest(basis @ coefficients.reshape(4, -1).T, np.asarray(self.largest))
         uses, factor, still = self.fleet.uses(inputs, self.envelope), 1.0, None
-        for _ in range(_MOST_REDUCTIONS):
+        for _ in range(self.reductions):
             if max(uses.values()) <= 1:
                 break
             still = still or self.fleet.uses(0 * inputs, self.envelope)
@@ -154,8 +161,8 @@ class References(task.AbstractTask):
                 if still[name] >= 1:
                     raise _too_gusty(name)
                 if share > 1:  # the share beyond that of gusts grows about linearly with the references
-                    steps.append((_TARGET - still[name]) / (share - still[name]))
-            factor *= max(min(steps), _LEAST_STEP)
+                    steps.append((self.target - still[name]) / (share - still[name]))
+            factor *= max(min(steps), self.least_step)
             uses = self.fleet.uses(factor * inputs, self.envelope)
         if max(uses.values()) > 1:
             raise InputError("no references keep the limits; give weaker gusts, or wider limits.")
@@ -197,7 +204,8 @@ def design_references(
     **Arguments:**
 
     - `loop`: the vehicle, its controller, its gusts and its sensors.
-    - `angle`: the largest reference of roll, pitch and yaw [rad]. `acceleration`: the largest vertical one [m/s^2].
+    - `angle`: the largest reference of roll, pitch and yaw [rad], at most 1. `acceleration`: the largest vertical one
+      [m/s^2], at most 5.
     - `limits`: some limits of an `Envelope`, by name, but not `slew`. The others are those that 3-2-1-1 references with
       the same largest values need; those of rotor speeds are the airframe's.
     - `bracket`: of a `FlightModel`; by default the model's.
@@ -205,7 +213,7 @@ def design_references(
 
     **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
     """
-    for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
+    for name, value, most in (("angle", angle, 1.0), ("acceleration", acceleration, 5.0)):
         if not 0 < value <= most:
             raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
     if "slew" in (limits or {}):
@@ -219,10 +227,10 @@ def design_references(
     envelope = fleet.envelope(standard_references(samples, dt, largest)["3211"], limits or {})
     tones = Tones.up_to(bandwidth, samples, dt)
     progress("flying tones")
-    references = References(
+    references = ReferenceTask(
         envelope=envelope,
         scale=np.asarray(loop.airframe.inertia),
-        unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
+        unexcited=ReferenceTask.little * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
         largest=largest,
         basis=as_float(_parts(tones.turns(_POINTS))),
@@ -234,7 +242,7 @@ def design_references(
         criterion=criterion,
         **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )
-    return task.solve(references, (8, 0.85, 80), compare=compare, key=key, progress=progress)
+    return task.solve(references, references.search, compare=compare, key=key, progress=progress)
 
 
 def _too_gusty(name: str) -> InputError:

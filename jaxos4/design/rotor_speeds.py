@@ -12,12 +12,12 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
-from .._custom_types import Key, Numeric, Parameters, RotorSpeeds as Speeds, Scalar, as_float
+from .._custom_types import Key, Numeric, Parameters, RotorSpeeds, Scalar, as_float
 from ..airframe import Airframe
 from ..bracket import Bracket
 from ..errors import InputError, named
 from ..excitation import EXCITATIONS, multisine
-from ..flight import Inputs as Rotors
+from ..flight import Inputs
 from ..linalg import covariance_of_shared
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State, unstack
@@ -25,26 +25,13 @@ from ..noise import SENSOR_SIGMA
 from ..simulation import euler_step, simulate
 from . import task
 from .envelope import Envelope, Uses, hover_squares
-from .task import Coefficients, Designed, Flown, Inputs
+from .task import Coefficients, Designed, Flown, Search, Series
 
-# Vehicles that must stay within the envelope, and the finer step at which they are flown.
-VEHICLES, FINER = 200, 10
-# The number of vehicles that keep the limits during the search; at the end all of them do.
-_LIMITED = 64
-# The number of vehicles over which the criterion is averaged.
-_DRAWS = 4
-# The share of a limit that an input uses at most: other vehicles from the bracket may need a little more.
-_TARGET, _PRECISION = 0.95, 1e-3
-_MOST_CORRECTIONS, _MOST_AMPLIFIED, _FAR = 5, 100.0, 10.0
-# The amplitude of tones below this frequency [Hz] is that at this frequency: angles would allow almost none.
-_SLOWEST = 0.3
-# The searches begin with about half of the envelope: a coefficient of 1 alone uses all of it.
-_PLAN = (4, 0.17, 40)
-# Squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
-_LEAST = 1e-6
+# At the end, vehicles are flown with so many steps in a sample.
+_FINER = 10
 
 
-class RotorSpeeds(task.AbstractTask):
+class RotorSpeedTask(task.AbstractTask):
     """Rotor speeds for which angular and vertical accelerations are sums of cosines.
 
     The frequencies are the multiples of 1 / (2 duration) up to a bandwidth. Such cosines can make every input of this
@@ -60,10 +47,31 @@ class RotorSpeeds(task.AbstractTask):
       criterion is averaged.
     - `weights`: 1 / sigma of each channel, in cascade order.
     - `start_is_known`: whether the flight starts exactly at rest.
+
+    The same for all tasks:
+
+    - `limited`: the number of vehicles that keep the limits during the search; at the end all of them do.
+    - `averaged`: the number of vehicles over which the criterion is averaged.
+    - `target`: the share of a limit that an input uses at most, because other vehicles from the bracket may need a
+      little more. It is met to the relative `precision` of the amplitude, with at most so many `corrections`.
+    - `amplified`: an input is multiplied by at most about this. `far`: the largest share of a limit that counts.
+    - `slowest_tone`: tones of a lower frequency [Hz] have the amplitude of this one: angles would allow almost none.
+    - `least`: squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
+    - `search`: begins with about half of the envelope, because a coefficient of 1 alone uses all of it.
     """
 
     kind: ClassVar[str] = "rotor speeds"
-    vehicles: ClassVar[int] = VEHICLES
+    vehicles: ClassVar[int] = 200
+    limited: ClassVar[int] = 64
+    averaged: ClassVar[int] = 4
+    target: ClassVar[float] = 0.95
+    precision: ClassVar[float] = 1e-3
+    corrections: ClassVar[int] = 5
+    amplified: ClassVar[float] = 100.0
+    far: ClassVar[float] = 10.0
+    slowest_tone: ClassVar[float] = 0.3
+    least: ClassVar[float] = 1e-6
+    search: ClassVar[Search] = Search(starts=4, first=0.17, steps=40)
 
     envelope: Envelope
     scale: Float[Numeric, " parameters"]
@@ -85,10 +93,10 @@ class RotorSpeeds(task.AbstractTask):
 
     write = staticmethod(task.write_input)
 
-    def _omega(self, coefficients: Coefficients) -> Speeds:
+    def _omega(self, coefficients: Coefficients) -> RotorSpeeds:
         """The rotor speeds [rad/s]."""
         acceleration = self.tones @ (self.amplitudes * coefficients.reshape(self.amplitudes.shape)).T
-        return jnp.sqrt(jnp.maximum(self.hover + acceleration @ self.action.T, _LEAST))
+        return jnp.sqrt(jnp.maximum(self.hover + acceleration @ self.action.T, self.least))
 
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
@@ -105,14 +113,14 @@ class RotorSpeeds(task.AbstractTask):
         """See `AbstractTask`."""
         omega = self._omega(coefficients)
         fly = jax.vmap(lambda a: simulate(self.model, a, omega, dt=self.dt).states)
-        return self.envelope.uses(omega, fly(self.fleet[:_LIMITED]), self.dt)
+        return self.envelope.uses(omega, fly(self.fleet[: self.limited]), self.dt)
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`."""
         return self._within_limits(np.asarray(self._omega(as_float(coefficients))))
 
-    def _within_limits(self, inputs: Inputs) -> Flown:
-        """The input with the largest amplitude that all vehicles can fly, also at a tenth of the sample time."""
+    def _within_limits(self, inputs: Series) -> Flown:
+        """The input with the largest amplitude that all vehicles can fly, also with finer steps than samples."""
         hover = np.asarray(self.hover)
 
         def flown(factor: float, finer: int = 1) -> Flown:
@@ -122,22 +130,22 @@ class RotorSpeeds(task.AbstractTask):
             return omega, dict(sorted(self.envelope.shares(omega, states, float(self.dt)).items()))
 
         def excess(factor: float, target: float) -> float:
-            return min(max(flown(factor)[1].values()), _FAR) - target
+            return min(max(flown(factor)[1].values()), self.far) - target
 
-        target = _TARGET
-        for _ in range(_MOST_CORRECTIONS):
+        target = self.target
+        for _ in range(self.corrections):
             high = 1.0
-            while high < _MOST_AMPLIFIED and excess(high, target) < 0:
+            while high < self.amplified and excess(high, target) < 0:
                 high *= 2
             if excess(0.0, target) >= 0:
                 high = 0.0
             elif excess(high, target) > 0:
-                high = float(scipy.optimize.brentq(excess, 0.0, high, (target,), _PRECISION * high))  # type: ignore[arg-type]
-            found = flown(high, FINER)
+                high = float(scipy.optimize.brentq(excess, 0.0, high, (target,), self.precision * high))  # type: ignore[arg-type]
+            found = flown(high, _FINER)
             if max(found[1].values()) <= 1:
                 return found
-            target *= _TARGET / max(found[1].values())
-        return flown(0.0, FINER)
+            target *= self.target / max(found[1].values())
+        return flown(0.0, _FINER)
 
     def standard(self) -> dict[str, Flown]:
         """See `AbstractTask`. Each has the largest amplitude that all vehicles can fly."""
@@ -159,7 +167,7 @@ class RotorSpeeds(task.AbstractTask):
         return judged
 
     @eqx.filter_jit
-    def _history(self, omega: Speeds) -> Float[Array, "samples parameters"]:
+    def _history(self, omega: RotorSpeeds) -> Float[Array, "samples parameters"]:
         """The bounds after each sample of a flight of the airframe's vehicle."""
         parameters = self.model.alpha
         slopes = self._sense(omega, parameters)
@@ -170,7 +178,7 @@ class RotorSpeeds(task.AbstractTask):
 
         return jax.lax.scan(add, jnp.zeros((slopes.shape[-1],) * 2, dtype=float), slopes)[1]
 
-    def _sense(self, omega: Speeds, parameters: Parameters) -> Float[Array, "samples sensors unknowns"]:
+    def _sense(self, omega: RotorSpeeds, parameters: Parameters) -> Float[Array, "samples sensors unknowns"]:
         """The derivatives of the weighted outputs of a flight from rest, by forward Euler; fast in reverse mode.
 
         The unknowns are the parameters and, if the start is not known, the initial state of the measured channels.
@@ -188,7 +196,7 @@ class RotorSpeeds(task.AbstractTask):
             carry = following, jax.vmap(push)(slopes, tuple(identity[:, :count].T))
             return carry, carry[1]
 
-        forcing = jax.tree.map(lambda leaf: leaf[:-1], self.model.forcing(Rotors(omega, self.dt), parameters))
+        forcing = jax.tree.map(lambda leaf: leaf[:-1], self.model.forcing(Inputs(omega, self.dt), parameters))
         # Recomputing a step is faster than keeping its intermediate values for the reverse pass.
         slopes = jax.lax.scan(jax.checkpoint(step), (first, first_slopes), forcing)[1]
         rows = jnp.concatenate([starts[None, :sensors], jnp.stack(jax.tree.leaves(slopes)[:sensors], axis=1)])
@@ -204,7 +212,11 @@ def drawn(bracket: Bracket, key: Key, count: int) -> Float[Array, "count paramet
 
 @eqx.filter_jit
 def fly_finely(
-    model: AbstractModel, vehicles: Float[Array, "vehicles parameters"], omega: Speeds, dt: Scalar, finer: int = FINER
+    model: AbstractModel,
+    vehicles: Float[Array, "vehicles parameters"],
+    omega: RotorSpeeds,
+    dt: Scalar,
+    finer: int = _FINER,
 ) -> Float[Array, "vehicles times 12"]:
     """The states of all vehicles from rest, at a `finer` step than the sample time."""
     held = jnp.concatenate([jnp.repeat(omega[:-1], finer, axis=0), omega[-1:]])
@@ -212,14 +224,14 @@ def fly_finely(
 
 
 def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, bandwidth: float) -> dict[str, np.ndarray]:
-    """The fields `tones`, `amplitudes`, `hover` and `action` of `RotorSpeeds`, with tones up to `bandwidth` [Hz]."""
+    """The fields `tones`, `amplitudes`, `hover` and `action` of `RotorSpeedTask`, with tones up to `bandwidth` [Hz]."""
     duration = (samples - 1) * dt
     frequency = np.arange(math.floor(2 * duration * bandwidth + 1e-9) + 1) / (2 * duration)
     hover = hover_squares(airframe, envelope)
     action = np.linalg.solve(np.asarray(airframe.mixer), np.diag(np.append(airframe.inertia, airframe.mass)))
     speed, limits = np.sqrt(hover), np.asarray([envelope.slowest, envelope.fastest])
     change = (np.abs(action) / (2 * speed)[:, None]).max(axis=0)[:, None]  # of rotor speed, by one unit
-    angular = 2 * math.pi * np.maximum(frequency, _SLOWEST)
+    angular = 2 * math.pi * np.maximum(frequency, RotorSpeedTask.slowest_tone)
     uses = (
         change / np.abs(speed[:, None] - limits).min(),
         change * angular / np.asarray(envelope.slew),
@@ -285,11 +297,12 @@ def design_input(
     progress("envelope")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
-    vehicles = drawn(bracket, key, VEHICLES)
+    vehicles = drawn(bracket, key, RotorSpeedTask.vehicles)
     envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
-    center, others = np.asarray(bracket.center)[None], drawn(bracket, jax.random.fold_in(key, 1), _DRAWS - 1)
+    center = np.asarray(bracket.center)[None]
+    others = drawn(bracket, jax.random.fold_in(key, 1), RotorSpeedTask.averaged - 1)
     tones = _tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
-    rotor_speeds = RotorSpeeds(
+    rotor_speeds = RotorSpeedTask(
         envelope=envelope,
         scale=np.asarray(bracket.half_width),
         unexcited=np.asarray(model.half_width),
@@ -305,7 +318,7 @@ def design_input(
         criterion=criterion,
         **tones,
     )
-    found = task.solve(rotor_speeds, _PLAN, compare=compare, key=key, progress=progress)
+    found = task.solve(rotor_speeds, rotor_speeds.search, compare=compare, key=key, progress=progress)
     if not (found.designed.bounds < rotor_speeds.unexcited).any():
         raise InputError("the limits are too narrow: no input within them excites a parameter; widen them.")
     return found

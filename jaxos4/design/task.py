@@ -29,29 +29,40 @@ from ..logs.table import SPEED_NAMES, Path, refuse
 from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]
-Inputs = Float[np.ndarray, "samples 4"]
+Series = Float[np.ndarray, "samples 4"]
+"""Rotor speeds [rad/s], held from sample to sample; or references as `fly_closed_loop` takes them."""
 # Inputs, and the largest share of each limit that a vehicle uses.
-Flown = tuple[Inputs, dict[str, float]]
+Flown = tuple[Series, dict[str, float]]
 Progress = Callable[[str], None]
 
 CRITERIA = ("D", "A", "worst")
-# In the criterion `worst`, the largest bound is replaced by this norm of the bounds, which has derivatives.
-_NORM = 16
-# The penalty of each stage.
-_PENALTIES = (10.0, 50.0, 250.0, 1250.0, 6000.0)
-# BFGS starts with a unit matrix as second derivative, so its unknowns are coefficients over their usual size.
-_UNIT = 0.1
-_TOLERANCE = 1e-6
 _REFERENCE_NAMES = ("roll_reference", "pitch_reference", "yaw_reference", "az_reference")
 # The largest error of a sample time in a file, as a share of it.
 _PRECISION = 1e-3
 
 
+class Search(NamedTuple):
+    """How the coefficients of a task are searched.
+
+    - `starts`: the number of searches. `first`: the length of their first coefficients, which are random.
+    - `steps`: the most steps of BFGS in a stage. `tolerance`: of its unknowns and of its cost.
+    - `penalties`: of each stage.
+    - `unit`: the usual size of a coefficient. BFGS starts with a unit matrix as second derivative, so its unknowns are
+      coefficients over this size.
+    """
+
+    starts: int
+    first: float
+    steps: int
+    tolerance: float = 1e-6
+    penalties: tuple[float, ...] = (10.0, 50.0, 250.0, 1250.0, 6000.0)
+    unit: float = 0.1
+
+
 class Designed(NamedTuple):
     """Inputs of a flight, and the accuracy of an estimate from it.
 
-    - `inputs`: rotor speeds [rad/s], held from sample to sample; or references as `fly_closed_loop` takes them.
-      `dt`: their sample time [s].
+    - `inputs`: rotor speeds or references. `dt`: their sample time [s].
     - `bounds`: the smallest standard deviation that each parameter can have after the flight.
     - `uses`: the largest share of each limit that any vehicle of the bracket uses; empty if none was flown.
     - `period`: the time after which the inputs repeat [s]; the whole flight if they do not.
@@ -59,7 +70,7 @@ class Designed(NamedTuple):
       square root of the duration.
     """
 
-    inputs: Inputs
+    inputs: Series
     dt: float
     bounds: Float[np.ndarray, " parameters"]
     uses: dict[str, float]
@@ -152,18 +163,14 @@ class Design(NamedTuple):
         return mean, int(excited.sum())
 
 
-def solve(task: AbstractTask, plan: tuple[int, float, int], *, compare: bool, key: Key, progress: Progress) -> Design:
-    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`.
-
-    `plan`: the number of searches, the length of their first coefficients, and the steps of BFGS in a stage.
-    """
+def solve(task: AbstractTask, search: Search, *, compare: bool, key: Key, progress: Progress) -> Design:
+    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`."""
     progress("compiling the search")
-    searches, first, steps = plan
-    directions = jax.random.normal(jax.random.fold_in(key, 2), (searches, task.size), dtype=float)
-    starts, costs = first / math.sqrt(task.size) * directions, np.zeros(searches)
-    for number, penalty in enumerate(_PENALTIES, start=1):
-        starts, costs = jax.block_until_ready(_minimise(task, starts, as_float(penalty), steps))
-        progress(f"search, stage {number} of {len(_PENALTIES)}")
+    directions = jax.random.normal(jax.random.fold_in(key, 2), (search.starts, task.size), dtype=float)
+    starts, costs = search.first / math.sqrt(task.size) * directions, np.zeros(search.starts)
+    for number, penalty in enumerate(search.penalties, start=1):
+        starts, costs = jax.block_until_ready(_minimise(task, starts, as_float(penalty), search))
+        progress(f"search, stage {number} of {len(search.penalties)}")
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     progress(f"flying {task.vehicles} vehicles")
     flown = {"designed": task.flown(np.asarray(starts)[best])}
@@ -174,30 +181,32 @@ def solve(task: AbstractTask, plan: tuple[int, float, int], *, compare: bool, ke
 
 @eqx.filter_jit
 def _minimise(
-    task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar, steps: int
+    task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar, search: Search
 ) -> tuple[Float[Array, "starts coefficients"], Float[Array, " starts"]]:
     """One stage of all searches: their last coefficients and costs. A trial whose simulation fails is rejected."""
 
     def cost(scaled: Coefficients, penalty: Scalar) -> Scalar:
-        uses = jax.tree.leaves(task.uses(_UNIT * scaled))
+        uses = jax.tree.leaves(task.uses(search.unit * scaled))
         excess = sum(jnp.square(jnp.maximum(jnp.square(use) - 1, 0)).sum() / use.shape[-2] for use in uses)
-        return task.objective(_UNIT * scaled) + penalty / 2 * excess
+        return task.objective(search.unit * scaled) + penalty / 2 * excess
 
     def one(start: Coefficients) -> tuple[Coefficients, Scalar]:
-        solver = optimistix.BFGS(_TOLERANCE, _TOLERANCE)
-        found = optimistix.minimise(cost, solver, start / _UNIT, penalty, max_steps=steps, throw=False)
-        return _UNIT * found.value, found.state.f_info.f
+        solver = optimistix.BFGS(search.tolerance, search.tolerance)
+        first = start / search.unit
+        found = optimistix.minimise(cost, solver, first, penalty, max_steps=search.steps, throw=False)
+        return search.unit * found.value, found.state.f_info.f
 
     return jax.vmap(one)(starts)
 
 
 def criterion_of(
-    information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str
+    information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str, norm: int = 16
 ) -> Scalar:
     """The logarithm of a mean bound of the first unknowns, see `design_input`. Smaller is better.
 
     A bound is a standard deviation as a share of the `half_width` of its parameter's bracket. The volume of `"D"` is
-    given as the edge of a cube.
+    given as the edge of a cube. In `"worst"`, the largest bound is replaced by the `norm` of the bounds, which has
+    derivatives.
     """
     count = half_width.shape[0]
     factor, basis = joint_factor(information[None], count)
@@ -208,7 +217,7 @@ def criterion_of(
     if criterion == "A":
         return jnp.log(squares.mean()) / 2
     largest = squares.max()
-    return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (_NORM / 2)).sum()) / _NORM
+    return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (norm / 2)).sum()) / norm
 
 
 def check_settings(
@@ -243,7 +252,7 @@ def write_references(designed: Designed, path: Path) -> None:
         np.savetxt(beside, rows, delimiter=",", header=",".join(("t", *_REFERENCE_NAMES)), comments="", fmt="%.8g")
 
 
-def read_input(path: Path, dt: float) -> Float[np.ndarray, "samples 4"]:
+def read_input(path: Path, dt: float) -> Series:
     """Read rotor speeds [rad/s] with the sample time `dt` [s]. Raises `InputError` as `read_references` does."""
     omega, step = read_references(path, SPEED_NAMES)
     if (omega < 0).any() or abs(step - dt) > _PRECISION * dt:
@@ -251,7 +260,7 @@ def read_input(path: Path, dt: float) -> Float[np.ndarray, "samples 4"]:
     return omega
 
 
-def read_references(path: Path, names: tuple[str, ...] = _REFERENCE_NAMES) -> tuple[Inputs, float]:
+def read_references(path: Path, names: tuple[str, ...] = _REFERENCE_NAMES) -> tuple[Series, float]:
     """Read the columns `names`, by default references, and their sample time [s]. Other columns are ignored.
 
     **Raises:** `InputError`, one line: file, what is wrong and what to do.

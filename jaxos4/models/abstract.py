@@ -21,14 +21,14 @@ PARAMETER_NAMES = tuple(f"alpha{i}" for i in range(1, 9))
 DEFAULT_HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
 
 Contradiction = Callable[[float, float], tuple[str, str] | None]
-Constant = float | Callable[[Airframe], Scalar]
+OfAirframe = float | Callable[[Airframe], Scalar]
+"""A number, or a function of the airframe that gives one."""
 
 
 class Parameter(NamedTuple):
     """One unknown of a model.
 
-    - `half_width`, `center`: of the default bracket of a term's parameter. Each is a number, or a function of the
-      airframe.
+    - `half_width`, `center`: of the default bracket of a term's parameter.
     - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
     - `in_forcing`: whether the forcing depends on it. If not, the rate equations are linear in it. The model sets it.
@@ -41,8 +41,8 @@ class Parameter(NamedTuple):
 
     name: str
     unit: str
-    half_width: Constant = 0.0
-    center: Constant = 0.0
+    half_width: OfAirframe = 0.0
+    center: OfAirframe = 0.0
     each_recording: bool = False
     force_axis: int | None = None
     in_forcing: bool = False

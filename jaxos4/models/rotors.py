@@ -15,12 +15,6 @@ Speed = Float[Array, "*samples"]
 Commands = Callable[[Int[Array, "*rows"]], Float[Array, "*rows 4"]]
 """The commands [rad/s] at the samples with these numbers."""
 
-# The lag that acts is at least this share of a sample, so that a step stays finite wherever a search looks.
-_SHORTEST_LAG = 0.05
-# The voltage, as a share of the full one, over which a motor passes from driving to braking: the ripple of its current.
-_SMOOTH = 0.005
-_LEAST = 1e-6
-
 
 class Grid(NamedTuple):
     """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
@@ -52,16 +46,18 @@ class Grid(NamedTuple):
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
         return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts)
 
-    def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Part":
-        """Some samples in a row. `before`: see `Part`."""
-        return Part(self.dt, rows, self.first[rows], self.last[rows], before, self.are_parts)
+    def batch(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Batch":
+        """Some samples in a row. `before`: see `Batch`."""
+        return Batch(self.dt, rows, self.first[rows], self.last[rows], before, self.are_parts)
 
 
-class Part(NamedTuple):
-    """Some samples in a row: the sample time [s], their numbers, and the first and last sample of their stretches.
+class Batch(NamedTuple):
+    """Some samples in a row, computed together.
 
-    `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
-    `are_parts`: see `Grid`.
+    - `dt`: the sample time [s]. `rows`: the numbers of the samples.
+    - `first`, `last`: the first and the last sample of the stretch of each.
+    - `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
+    - `are_parts`: see `Grid`.
     """
 
     dt: Scalar
@@ -85,7 +81,7 @@ class Speeds(NamedTuple):
     change: RotorSpeeds
 
 
-def measured_speeds(omega: Commands, part: Part) -> Speeds:
+def measured_speeds(omega: Commands, batch: Batch) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing.
 
     Means over parts of a sample change between their edges, where cubics through the means of the four parts around an
@@ -93,23 +89,23 @@ def measured_speeds(omega: Commands, part: Part) -> Speeds:
     """
 
     def near(offset: int) -> RotorSpeeds:
-        return omega(jnp.clip(part.rows + offset, part.first, part.last))
+        return omega(jnp.clip(batch.rows + offset, batch.first, batch.last))
 
     speed = near(0)
-    if not part.are_parts:
+    if not batch.are_parts:
         return Speeds(speed, speed, near(1) - speed)
     return Speeds(speed, speed, (8 * (near(1) - near(-1)) - (near(2) - near(-2))) / 12)
 
 
-def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
+def squared(speeds: Speeds, batch: Batch) -> tuple[RotorSpeeds, RotorSpeeds]:
     """The thrust of each rotor divided by b [rad^2/s^2], of speeds that change linearly over a sample.
 
     **Returns:** the mean over the sample; and the value at its beginning, when sensors measure: the mean of the values
     just before and just after.
     """
     begin, end, _ = speeds
-    before = jnp.concatenate([part.before[None], end[:-1]])
-    before = jnp.where(part.is_first[:, None], begin, before)
+    before = jnp.concatenate([batch.before[None], end[:-1]])
+    before = jnp.where(batch.is_first[:, None], begin, before)
     return (begin * begin + begin * end + end * end) / 3, (before * before + begin * begin) / 2
 
 
@@ -147,14 +143,26 @@ class Motor(NamedTuple):
         lag w' = g(u - c w) - k w^2.
 
     u - c w is the voltage less that which the motor itself makes. It drives the current and so the torque, g(x) = x.
-    Below 0 the motor brakes with a share of it, g(x) = braking x - (1 - braking) s (1 - exp(x / s)) with s = 0.005.
+    Below 0 the motor brakes with a share of it, g(x) = braking x - (1 - braking) s (1 - exp(x / s)).
     Without a load, and with full braking, this is a first-order system.
 
     - `lag`: time constant without a load [s].
     - `curve`: 1: the thrust is quadratic in the command, as without a load. 0: it is linear.
     - `braking`: the torque of a motor that is faster than its voltage, as a share of that of a drive. 0: it coasts.
     - `full`: the speed at the full command [rad/s].
+
+    The same for all motors:
+
+    - `smooth`: s, the voltage as a share of the full one over which a motor passes from driving to braking: the ripple
+      of its current.
+    - `shortest_lag`: the lag that acts is at least this share of a sample, so that a step stays finite wherever a
+      search looks.
+    - `least`: smaller numbers under a root or in a quotient count as this.
     """
+
+    smooth = 0.005
+    shortest_lag = 0.05
+    least = 1e-6
 
     lag: Scalar
     curve: Scalar | float = 1.0
@@ -167,34 +175,35 @@ class Motor(NamedTuple):
 
     def settled(self, command: Speed) -> Speed:
         """The speed [rad/s] that a command keeps."""
-        root = jnp.sqrt(jnp.maximum(self.curve**2 + 4 * (1 - self.curve) * command / self.full, _LEAST))
-        return 2 * command / jnp.maximum(self.curve + root, _LEAST)
+        root = jnp.sqrt(jnp.maximum(self.curve**2 + 4 * (1 - self.curve) * command / self.full, self.least))
+        return 2 * command / jnp.maximum(self.curve + root, self.least)
 
     def step(self, omega: Speed, command: Speed, dt: Scalar, steps: int = 2) -> Speed:
         """The speed after a time `dt` [s], by so many exponential Euler steps.
 
         They are exact for a first-order system, stable for any `dt`, and of second order.
         """
-        w, u, lag = omega / self.full, command / self.full, jnp.maximum(self.lag, _SHORTEST_LAG * dt)
+        w, u, lag = omega / self.full, command / self.full, jnp.maximum(self.lag, self.shortest_lag * dt)
         for _ in range(steps):
             x, load = u - self.curve * w, (1 - self.curve) * w
-            weak = (1 - self.braking) * jnp.exp(jnp.minimum(x, 0.0) / _SMOOTH)
-            braking = self.braking * x - _SMOOTH * (1 - self.braking - weak)
+            weak = (1 - self.braking) * jnp.exp(jnp.minimum(x, 0.0) / self.smooth)
+            braking = self.braking * x - self.smooth * (1 - self.braking - weak)
             slope = jnp.where(x >= 0, 1.0, self.braking + weak) * self.curve + 2 * load
             z = dt / steps * slope / lag
-            share = jnp.where(jnp.abs(z) > _LEAST, -jnp.expm1(-z) / jnp.where(jnp.abs(z) > _LEAST, z, 1.0), 1 - z / 2)
+            finite = jnp.abs(z) > self.least
+            share = jnp.where(finite, -jnp.expm1(-z) / jnp.where(finite, z, 1.0), 1 - z / 2)
             w = jnp.maximum(w + dt / steps / lag * share * (jnp.where(x >= 0, x, braking) - load * w), 0.0)
         return w * self.full
 
 
-def driven(omega: RotorSpeeds, motor: Motor, part: Part) -> Speeds:
+def driven(omega: RotorSpeeds, motor: Motor, batch: Batch) -> Speeds:
     """Speeds of rotors whose motors follow commands [rad/s]. A stretch begins at the speed of its first command."""
 
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
         begin = jnp.where(is_first, settled, speed)
-        end = motor.step(begin, command, part.dt, 1 if part.are_parts else 2)
+        end = motor.step(begin, command, batch.dt, 1 if batch.are_parts else 2)
         return end, (begin, end)
 
-    begin, end = jax.lax.scan(over_a_sample, part.before, (omega, motor.settled(omega), part.is_first))[1]
+    begin, end = jax.lax.scan(over_a_sample, batch.before, (omega, motor.settled(omega), batch.is_first))[1]
     return Speeds(begin, end, end - begin)

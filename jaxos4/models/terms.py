@@ -16,7 +16,7 @@ from .._registry import Registry
 from ..airframe import GRAVITY, Airframe
 from ..excitation import AXES
 from .abstract import Contradiction, Parameter
-from .rotors import Commands, Grid, Motor, Part, Speeds, delayed, driven
+from .rotors import Batch, Commands, Grid, Motor, Speeds, delayed, driven
 from .state import Forcing, Rates, Vector
 
 # What a term can need from the logs or from the airframe.
@@ -28,18 +28,9 @@ VERTICAL_FORCE = "vertical specific force"
 FULL_SCALE = "full scale"
 VOLTAGE = "battery voltage"
 
-# Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a velocity of 2 m/s.
-_AUTHORITY, _FAST = 0.2, 2.0
-_EARLY = 0.002  # a time constant this far below 0 is neither chance nor rounding [s]
-# A thrust gain beyond this factor, or its reciprocal, is no error of a scale; below the second, no thrust is measured.
-_FAR_GAIN, _DEAD = 2.0, 0.2
 STEEPEST = 1.2
 """A thrust curve beyond this is no propeller's."""
-_BIAS = 0.3  # no levelled accelerometer has twice this bias [m/s^2]
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
-_YAW = 0.2  # the yaw torque of the rotors as a share of their roll torque
-# The half-width of the damping [1/s]: by thrust about roll and pitch, drag about yaw. No rotors give the last number.
-_DAMPING, _MOST_DAMPING = (5.0, 5.0, 2.0), 2.5
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
 VERTICAL_BIAS = _FORCE_BIASES[2]
 """The parameter that is the constant error of the accelerometer along z."""
@@ -64,7 +55,7 @@ class Term:
     the values of the term's parameters by name. It returns the quantity with the term. They act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s], a function of the numbers of the samples.
-    - `speed(omega, values, part, airframe)`: the rotor speeds that follow the commands over some samples. Only one of
+    - `speed(omega, values, batch, airframe)`: the rotor speeds that follow the commands over some samples. Only one of
       the terms in use may have it.
     - `angular_acceleration(total, values, rates, forcing)`: p', q', r' [rad/s^2].
     - `specific_force(force, values, forcing)`: along the body's axes [m/s^2].
@@ -82,7 +73,7 @@ class Term:
     force_axes: tuple[int, ...] = ()
     quantity: str = ""
     command: Callable[[Commands, Values, Grid], Commands] | None = None
-    speed: Callable[[RotorSpeeds, Values, Part, Airframe], Speeds] | None = None
+    speed: Callable[[RotorSpeeds, Values, Batch, Airframe], Speeds] | None = None
     angular_acceleration: Callable[[Rates, Values, Rates, Forcing], Rates] | None = None
     specific_force: Callable[[Vector, Values, Forcing], Vector] | None = None
     gyro: Callable[[Rates, Values], Rates] | None = None
@@ -104,12 +95,15 @@ class Term:
 
 
 def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
-    """The share `_AUTHORITY` of the rotors' torque over the inertia [rad/s^2], divided by `per`."""
+    """A fifth of the hover torque of one pair of rotors over the inertia [rad/s^2], divided by `per`.
+
+    The yaw torque of rotors is about a fifth of their roll torque.
+    """
 
     def share(airframe: Airframe) -> Scalar:
         arm = jnp.abs(jnp.asarray(airframe.rotor_positions)).mean()
         torque = 2 * arm * airframe.mass * airframe.gravity / 4
-        return (_AUTHORITY * torque * jnp.array([1.0, 1.0, _YAW]) / jnp.asarray(airframe.inertia))[axis] / per
+        return (0.2 * torque * jnp.array([1.0, 1.0, 0.2]) / jnp.asarray(airframe.inertia))[axis] / per
 
     return share
 
@@ -138,18 +132,19 @@ _INF, _LATE = float("inf"), "s is negative: rotors cannot answer before their co
 _CLOCKS = "if the log holds measured rotor speeds, name the columns omega1..4; else check the time stamps"
 _GAINS = (
     (0.0, _INF, "(the accelerometer answers thrust with the opposite sign)", "its z axis points down: change its sign"),
-    (_DEAD, _INF, "(the accelerometer does not follow the thrust)", "check that it is switched on and in m/s^2"),
-    (-_INF, _FAR_GAIN, "(the accelerometer shows more thrust than the airframe has)", _SCALES),
-    (1 / _FAR_GAIN, _INF, "(the accelerometer shows less thrust than the airframe has)", _SCALES),
+    (0.2, _INF, "(the accelerometer does not follow the thrust)", "check that it is switched on and in m/s^2"),
+    # A gain beyond 2, or below 1/2, is no error of a scale.
+    (-_INF, 2.0, "(the accelerometer shows more thrust than the airframe has)", _SCALES),
+    (0.5, _INF, "(the accelerometer shows less thrust than the airframe has)", _SCALES),
 )
 _BENT = f"is not between 0 (thrust linear in the command) and {STEEPEST:g}: no motor with a propeller is like this"
 _CLIMB = "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`"
 _GROWS = "is negative: no inflow makes thrust grow with the velocity along z"
 _CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, and fly climbs and descents"))
 _SPARSE = "1/s is more than rotors give (1): motors were logged too rarely", "log on board, faster, or rotor speeds"
-_DAMPED = _limits((-_INF, _MOST_DAMPING, *_SPARSE))
-_OFF = f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so the thrust does not match the weight"
-_LEVEL = _limits((-2 * _BIAS, 2 * _BIAS, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
+_DAMPED = _limits((-_INF, 2.5, *_SPARSE))
+_OFF = "m/s^2: a levelled accelerometer is off by less than 0.6, so the thrust does not match the weight"
+_LEVEL = _limits((-0.6, 0.6, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
 
 
 def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[[Rates, Values, Rates, Forcing], Rates]:
@@ -177,10 +172,10 @@ def _scaled(share: Callable[[Values, Grid], Float[Array, " samples"]]) -> Callab
     return command
 
 
-def _drive(omega: RotorSpeeds, values: Values, part: Part, airframe: Airframe) -> Speeds:
+def _drive(omega: RotorSpeeds, values: Values, batch: Batch, airframe: Airframe) -> Speeds:
     full = jnp.asarray(airframe.max_rotor_speed)
     motor = Motor(values["rotor_lag"], values["thrust_curve"], values["motor_braking"], full)
-    return driven(omega, motor, part)
+    return driven(omega, motor, batch)
 
 
 def _velocity(forcing: Forcing):
@@ -200,8 +195,8 @@ def _add_force_bias(force: Vector, values: Values) -> Vector:
     return x, y, z
 
 
-# Small vehicles have 0.02 to 0.1 s.
-_LAG = Parameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-_EARLY, _INF, _LATE, _CLOCKS)))
+# Small vehicles have 0.02 to 0.1 s. A time constant of less than -0.002 s is neither chance nor rounding.
+_LAG = Parameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-0.002, _INF, _LATE, _CLOCKS)))
 
 _OWN: dict[str, Term] = {
     "offset": Term(
@@ -218,16 +213,18 @@ _OWN: dict[str, Term] = {
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
+        # By thrust about roll and pitch, by drag about yaw.
         tuple(
-            Parameter(f"{x}_damping", "1/s", y, nonnegative=True, contradiction=_DAMPED)
-            for x, y in zip(AXES, _DAMPING, strict=True)
+            Parameter(f"{x}_damping", "1/s", half_width, nonnegative=True, contradiction=_DAMPED)
+            for x, half_width in zip(AXES, (5.0, 5.0, 2.0), strict=True)
         ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
         quantity="damping",
     ),
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
-        tuple(Parameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(AXES[:2])),
+        # The bracket reaches the authority at 2 m/s.
+        tuple(Parameter(f"{x}_velocity", "rad/(m s)", _authority(i, 2.0)) for i, x in enumerate(AXES[:2])),
         needs=frozenset({VELOCITY}),
         # Along y the vehicle rolls, along x it pitches.
         angular_acceleration=_torque("velocity", lambda rates, forcing: _velocity(forcing)[1::-1]),
@@ -262,7 +259,7 @@ _OWN: dict[str, Term] = {
         "rotors follow their commands as first-order systems: rotor_lag [s]; if no load can be found",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
-        speed=lambda omega, values, part, airframe: driven(omega, Motor(values["rotor_lag"]), part),
+        speed=lambda omega, values, batch, airframe: driven(omega, Motor(values["rotor_lag"]), batch),
         quantity="motors",
     ),
     "delay": Term(
@@ -283,7 +280,7 @@ _OWN: dict[str, Term] = {
             Parameter("thrust_gain", "1", 0.5, center=1.0, scales_torque=True, contradiction=_limits(*_GAINS)),
             # A sensor that was levelled before take-off has a smaller bias.
             *(
-                Parameter(name, "m/s^2", _BIAS, force_axis=axis, contradiction=_LEVEL if axis == 2 else None)
+                Parameter(name, "m/s^2", 0.3, force_axis=axis, contradiction=_LEVEL if axis == 2 else None)
                 for axis, name in enumerate(_FORCE_BIASES)
             ),
         ),

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,15 +14,13 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from .._custom_types import Count, Numeric, Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
-from .abstract import PARAMETER_NAMES, AbstractModel, ByRecording, Constant, Parameter
+from .abstract import PARAMETER_NAMES, AbstractModel, ByRecording, OfAirframe, Parameter
 from .os4 import CorrectedOS4
-from .rotors import Grid, Part, measured_speeds, squared
+from .rotors import Batch, Grid, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
 from .terms import COMMANDS, FULL_SCALE, TERMS, VELOCITY, VOLTAGE, Term, Values, clash, default_terms, required
 
 DEFAULT_TERMS = default_terms(frozenset({COMMANDS}))
-# The samples of a padded flight that are computed together.
-_BLOCK = 512
 
 Row = tuple[Term, str, Parameter]
 """A row of the table of parameters: a term, the parameter's name in it, and the parameter of the model."""
@@ -57,10 +56,14 @@ class FlightModel(AbstractModel):
       own offsets and gyro biases. All other parameters are the vehicle's.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
 
+    `batch`: so many samples of a padded flight are computed together.
+
     **Raises:** `ValueError` for a term that does not exist or is given twice, terms that exclude each other, recordings
     that are not counted from 0, or a term that needs `airframe.max_rotor_speed` or `battery_voltage` if that is not
     known.
     """
+
+    batch: ClassVar[int] = 512
 
     airframe: Airframe
     terms: tuple[str, ...] = eqx.field(static=True)
@@ -148,7 +151,7 @@ class FlightModel(AbstractModel):
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The chain from commands to torque and thrust: each term acts at its place.
 
-        If the flight is padded (`Inputs.length`), blocks that are padding alone are not computed: they are 0.
+        If the flight is padded (`Inputs.length`), batches that are padding alone are not computed: they are 0.
         """
         if inputs.within is None:
             return self._beside(inputs, self._rotors(inputs, parameters))
@@ -196,10 +199,10 @@ class FlightModel(AbstractModel):
         grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=are_parts)
         before = jnp.zeros_like(inputs.omega[0])
         if inputs.length is None:
-            return self._driven(inputs, grid, grid.part(jnp.arange(len(inputs.omega)), before), parameters)[0]
-        return self._driven_in_blocks(inputs, inputs.length, grid, before, parameters)
+            return self._driven(inputs, grid, grid.batch(jnp.arange(len(inputs.omega)), before), parameters)[0]
+        return self._driven_in_batches(inputs, inputs.length, grid, before, parameters)
 
-    def _driven(self, inputs: Inputs, grid: Grid, part: Part, parameters) -> tuple[Forcing, Array]:
+    def _driven(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
         """The forcing by the rotors over some samples, and the rotor speeds at the end of the last."""
         airframe = self.airframe
 
@@ -209,8 +212,8 @@ class FlightModel(AbstractModel):
         for change, values in self._contributions("command", parameters):
             omega = change(omega, values, grid)
         drive, values = next(iter(self._contributions("speed", parameters)), (None, {}))
-        speeds = drive(omega(part.rows), values, part, airframe) if drive else measured_speeds(omega, part)
-        mean, around = squared(speeds, part)
+        speeds = drive(omega(batch.rows), values, batch, airframe) if drive else measured_speeds(omega, batch)
+        mean, around = squared(speeds, batch)
         roll, pitch, yaw, thrust = (mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
         found = Forcing(
@@ -224,20 +227,20 @@ class FlightModel(AbstractModel):
         )
         return found, speeds.end[-1]
 
-    def _driven_in_blocks(self, inputs: Inputs, length: Count, grid: Grid, before: Array, parameters) -> Forcing:
-        """`_driven` of the samples that count, block by block, so that padding takes no time."""
+    def _driven_in_batches(self, inputs: Inputs, length: Count, grid: Grid, before: Array, parameters) -> Forcing:
+        """`_driven` of the samples that count, batch by batch, so that padding takes no time."""
         samples = inputs.omega.shape[0]
 
         def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
             filled, before = carry
-            rows = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1)
-            found, before = self._driven(inputs, grid, grid.part(rows, before), parameters)
-            place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * _BLOCK, axis=0)
+            rows = jnp.minimum(i * self.batch + jnp.arange(self.batch), samples - 1)
+            found, before = self._driven(inputs, grid, grid.batch(rows, before), parameters)
+            place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * self.batch, axis=0)
             return jax.tree.map(place, filled, found), before
 
-        zeros = jnp.zeros(-(-samples // _BLOCK) * _BLOCK, before.dtype)
+        zeros = jnp.zeros(-(-samples // self.batch) * self.batch, before.dtype)
         nothing = Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros)
-        filled, _ = jax.lax.fori_loop(0, -(-length // _BLOCK), fill, (nothing, before))
+        filled, _ = jax.lax.fori_loop(0, -(-length // self.batch), fill, (nothing, before))
         return jax.tree.map(lambda leaf: leaf[:samples], filled)
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
@@ -292,7 +295,7 @@ class FlightModel(AbstractModel):
     def _table(self) -> tuple[Row, ...]:
         return _table(self._terms, self.force_axes, max(self.recordings) + 1)
 
-    def _of_terms(self, constant: Callable[[Parameter], Constant]) -> Parameters:
+    def _of_terms(self, constant: Callable[[Parameter], OfAirframe]) -> Parameters:
         """A constant of each row of the table, for this airframe."""
         # In the order of the table: a set would order the operations of a program by the addresses of its functions.
         constants = [constant(parameter) for *_, parameter in self._table]

@@ -1,30 +1,23 @@
 """From features to unknowns: a linear map, a learnt correction, the learnt size of the error, calibrated intervals."""
 
 import functools
+import itertools
 import math
 import statistics
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Scalar, as_float
-from .cmac import CMAC
 
-# Features grow linearly up to this size and logarithmically beyond: flights that nearly diverge have huge features.
-_LINEAR = 4.0
-_DRAWN = 1024  # random numbers at once, for the first weights
 _SILU = jax.nn.silu
-# The perceptron that predicts the size of the error: its width and depth, and the limit of its logarithm.
-_SPREAD_WIDTH, _SPREAD_DEPTH, _LARGEST_LOGARITHM = 32, 2, 7.0
-
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
 LEVELS = np.array([2 * _NORMAL.cdf(z) - 1 for z in np.linspace(_NORMAL.inv_cdf(0.75), _NORMAL.inv_cdf(0.9995), 28)])
-_SCALES = 9  # noise scales at which intervals are calibrated, evenly spaced in the logarithm
 
 
 class Scaling(eqx.Module):
@@ -69,6 +62,46 @@ class GatedPerceptron(eqx.Module):
         return self.last(self.hidden(x) * self.gate(x))
 
 
+class CMAC(eqx.Module):
+    """The cerebellar model articulation controller: a table of weights, of which an input selects a few.
+
+    The output is a sum over all pairs of inputs; each pair adds the mean of one weight from each of its tilings.
+
+    A tiling divides the plane of two inputs into square cells, and each cell has a weight. The tilings of a pair are
+    shifted against each other, so that inputs that are close share most of their weights. The output is piecewise
+    constant in the inputs. The outermost cells also hold everything beyond them.
+
+    Albus tiles all inputs together and hashes the cells. In nine dimensions two flights rarely share a cell, so that
+    little is learnt; pairs can represent the products in which parameters act on a flight.
+
+    - `extent`: cells cover inputs from minus this to this: twice what a flight without noise has.
+
+    Reference: Albus (1975), A new approach to manipulator control, J. Dyn. Sys., Meas., Control 97(3), 220-227.
+    """
+
+    extent: ClassVar[float] = 3.0
+
+    table: Float[Array, "pairs tilings cells cells out"]
+
+    def __init__(self, in_size: int, out_size: int, tilings: int, cells: int, *, key: Key):
+        del key  # weights begin at 0
+        self.table = jnp.zeros((in_size * (in_size - 1) // 2, tilings, cells, cells, out_size))
+
+    def __call__(self, x: Float[Array, " in"]) -> Float[Array, " out"]:
+        """The output for inputs `x`."""
+        pairs, tilings, cells = self.table.shape[:3]
+        first, second = np.array(list(itertools.combinations(range(x.size), 2))).T
+        place, number = (x / self.extent + 1) / 2 * (cells - 1), np.arange(tilings)
+
+        def cell(inputs: Int[np.ndarray, " pairs"], shift: Int[np.ndarray, " tilings"]) -> Int[Array, "pairs tilings"]:
+            shifted = place[inputs, None] + (shift % tilings / tilings).astype(x.dtype)
+            return jnp.clip(jnp.floor(shifted), 0, cells - 1).astype(int)
+
+        # The second input moves by another multiple, so that the shifts do not lie on the diagonal.
+        own = np.arange(pairs)[:, None], number, cell(first, number), cell(second, 3 * number)
+        return self.table[own].mean(axis=1).sum(axis=0)
+
+
 ARCHITECTURES = {
     "mlp": (GatedPerceptron, ("width", "depth")),
     "cmac": (CMAC, ("tilings", "cells")),
@@ -77,7 +110,15 @@ ARCHITECTURES = {
 
 
 class Regressor(eqx.Module):
-    """The trained part of a network: a linear map `skip`, its `correction`, and the error's spread."""
+    """The trained part of a network: a linear map `skip`, its `correction`, and the error's spread.
+
+    - `spread_width`, `spread_depth`: of the perceptron that predicts the logarithm of the error's spread.
+    - `largest_logarithm`: its limit, to either side.
+    """
+
+    spread_width: ClassVar[int] = 32
+    spread_depth: ClassVar[int] = 2
+    largest_logarithm: ClassVar[float] = 7.0
 
     skip: Float[Array, "unknowns features"]
     correction: GatedPerceptron | CMAC
@@ -87,7 +128,7 @@ class Regressor(eqx.Module):
         self.skip, sizes = skip, (skip.shape[1] + 1, skip.shape[0])
         first, second = jax.random.split(key)
         self.correction = ARCHITECTURES[architecture][0](*sizes, **shape, key=first)
-        self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=second)
+        self.spread = eqx.nn.MLP(*sizes, self.spread_width, self.spread_depth, _SILU, dtype=float, key=second)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> tuple[Array, Array]:
         """Unknowns of one flight in bracket coordinates, from its features and its noise scale.
@@ -97,7 +138,7 @@ class Regressor(eqx.Module):
         compressed = compress(features / scaling.width)
         inputs = jnp.concatenate([compressed, (jnp.log(scale) / scaling.span)[None]])
         u = self.skip @ compressed + scaling.gain * self.correction(inputs)
-        return u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM)
+        return u, jnp.clip(self.spread(inputs), -self.largest_logarithm, self.largest_logarithm)
 
 
 def first_regressor(
@@ -118,17 +159,21 @@ def first_regressor(
     shapes = [array.shape for array in arrays(blank)]
     limits = np.repeat([1 / math.sqrt(weight[1]) for weight in shapes[::2]], 2).tolist()
     ends = np.cumsum([math.prod(shape) for shape in shapes])
-    keys = jax.random.split(key, -(-int(ends[-1]) // _DRAWN))
-    drawn = jax.lax.map(lambda k: jax.random.uniform(k, (_DRAWN,), minval=-1, maxval=1, dtype=float), keys).ravel()
+    at_once = 1024
+    keys = jax.random.split(key, -(-int(ends[-1]) // at_once))
+    drawn = jax.lax.map(lambda k: jax.random.uniform(k, (at_once,), minval=-1, maxval=1, dtype=float), keys).ravel()
     parts = zip(limits, jnp.split(drawn[: ends[-1]], ends[:-1]), shapes, strict=True)
     values = [limit * part.reshape(shape) for limit, part, shape in parts]
     return eqx.tree_at(lambda r: [r.skip, *arrays(r)], blank, [linear_map, *values])
 
 
-def compress(x: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
-    """Features as the network takes them: linear up to a size, logarithmic beyond."""
+def compress(x: Float[Array, "*batch features"], linear: float = 4.0) -> Float[Array, "*batch features"]:
+    """Features as the network takes them: linear up to the size `linear`, logarithmic beyond.
+
+    Flights that nearly diverge have huge features.
+    """
     size = jnp.abs(x)
-    return jnp.where(size < _LINEAR, x, jnp.sign(x) * (_LINEAR + jnp.log1p(jnp.maximum(size - _LINEAR, 0))))
+    return jnp.where(size < linear, x, jnp.sign(x) * (linear + jnp.log1p(jnp.maximum(size - linear, 0))))
 
 
 def loss(
@@ -173,6 +218,9 @@ class ErrorTable(NamedTuple):
         return rms, correlation, factors, simultaneous
 
 
-def calibrated_scales(noise: tuple[float, float]) -> Float[Array, " scales"]:
-    """The noise scales at which a network is calibrated, from the lowest to the highest of its training."""
-    return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else _SCALES))
+def calibrated_scales(noise: tuple[float, float], count: int = 9) -> Float[Array, " scales"]:
+    """The noise scales at which a network is calibrated, from the lowest to the highest of its training.
+
+    There are `count`, evenly spaced in the logarithm; one if the lowest is the highest.
+    """
+    return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else count))

@@ -23,13 +23,7 @@ from ..results import RESULTS
 from ..shooting import ShootingProblem, Unknowns, in_blocks
 from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
 from .features import FEATURES, Coordinates, Features
-from .training import calibrate, train, untrained
-
-# The first linear map is a matrix of features times features: more features than this do not fit in memory.
-_MOST_FEATURES = 6000
-_MOST_STEPS = 1_000_000
-_LARGEST_INFLATION = 2.0  # if missing samples enlarge a standard deviation by more, the problem is another one
-_SAME = 1e-6  # relative tolerance of equal numbers: files round them
+from .training import Schedule, calibrate, train, untrained
 
 # What must be equal in training and in use: kinds, with the words that name them, and numbers.
 _KINDS: dict[str, Callable[[ShootingProblem], Any]] = {
@@ -68,8 +62,16 @@ class NetworkEstimator(eqx.Module):
     - `patience`: training stops early after this many checks, of 250 steps each, without a better validation loss.
     - `held_out`: simulated flights for the calibration of the intervals, each with new noise at nine noise scales.
 
+    Limits of these settings, for all networks:
+
+    - `most_features`: the first linear map is a matrix of features times features, which must fit in memory.
+    - `most_steps`: of training.
+
     **Raises:** `ValueError` for a setting out of range.
     """
+
+    most_features: ClassVar[int] = 6000
+    most_steps: ClassVar[int] = 1_000_000
 
     features: str = eqx.field(static=True, default="score")
     channels: str = eqx.field(static=True, default="rates")
@@ -89,8 +91,8 @@ class NetworkEstimator(eqx.Module):
         for name, choices in (("features", FEATURES), ("channels", CHANNELS), ("architecture", ARCHITECTURES)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
-        if self.steps > _MOST_STEPS:
-            raise ValueError(f"`steps` must be at most {_MOST_STEPS}, got {self.steps}.")
+        if self.steps > self.most_steps:
+            raise ValueError(f"`steps` must be at most {self.most_steps}, got {self.steps}.")
         setting("learning_rate", positive=True)(self.learning_rate)
         if self.architecture == "cmac" and self.features != "score":
             raise ValueError(f'`architecture` "cmac" needs `features` "score", got {self.features!r}.')
@@ -116,8 +118,9 @@ class NetworkEstimator(eqx.Module):
         """
         self._check(problem, bracket)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, as_float(self.noise[1]))
-        scaling, regressor = untrained(features, self, key)
-        regressor, history = train(regressor, scaling, features, self, key)
+        schedule = Schedule(self.noise, self.steps, self.batch, self.learning_rate, self.patience)
+        scaling, regressor = untrained(features, self.noise, self.architecture, self.shape, key)
+        regressor, history = train(regressor, scaling, features, schedule, key)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
@@ -130,8 +133,8 @@ class NetworkEstimator(eqx.Module):
             if not 0 < upper - lower < np.inf:
                 raise ValueError(f"`bracket` of {name} must have a positive, finite width, got [{lower}, {upper}].")
         numbers = problem.flight.time.shape[0] * CHANNELS[self.channels]
-        if self.features == "raw" and numbers > _MOST_FEATURES:
-            what = f"of this flight are {numbers} numbers, more than {_MOST_FEATURES}"
+        if self.features == "raw" and numbers > self.most_features:
+            what = f"of this flight are {numbers} numbers, more than {self.most_features}"
             raise ValueError(f'`features` "raw" {what}: use "score".')
 
 
@@ -146,11 +149,16 @@ class TrainedNetwork(AbstractEstimator):
     Its intervals contain the truth in the share of flights that their level gives, even if the network is bad: they
     are calibrated on simulated flights that training did not use (split-conformal prediction). The share is an average
     over flights that do not diverge, with parameters and initial states uniform in the bracket of training.
+
+    - `largest_inflation`: if missing samples enlarge a standard deviation by more, the problem is another one.
+    - `same`: relative tolerance of equal numbers, because files round them.
     """
 
     looks_at: ClassVar[str] = "rates"
     prior: ClassVar[float] = UNIFORM_PRIOR
     needs_network: ClassVar[bool] = True
+    largest_inflation: ClassVar[float] = 2.0
+    same: ClassVar[float] = 1e-6
 
     settings: NetworkEstimator
     features: Features
@@ -229,12 +237,12 @@ class TrainedNetwork(AbstractEstimator):
 
         def differ(quantity: Callable[[ShootingProblem], Any]) -> Bool[Array, ""]:
             pairs = zip(*(map(as_float, jax.tree.leaves(quantity(p))) for p in (problem, own)), strict=True)
-            same = [((a == b) | (jnp.abs(a - b) <= _SAME * jnp.abs(b).max())).all() for a, b in pairs]
+            same = [((a == b) | (jnp.abs(a - b) <= self.same * jnp.abs(b).max())).all() for a, b in pairs]
             return ~jnp.asarray(same, bool).all()
 
         width = coordinates.width[len(own.model.parameter_names) :]
         first_state, off = (problem.split(x)[:, :size].ravel() for x in problem.first_state())
-        allowed = 1.5 * width + off if width.size else _SAME * (1 + jnp.abs(coordinates.first_state))
+        allowed = 1.5 * width + off if width.size else self.same * (1 + jnp.abs(coordinates.first_state))
         start = ~(jnp.abs(first_state - coordinates.first_state) <= allowed).all()
         return {what: differ(quantity) for what, quantity in _QUANTITIES.items()} | {"start": start}
 
@@ -264,7 +272,7 @@ class TrainedNetwork(AbstractEstimator):
 
         differences = self._differences(problem)
         other = jnp.stack(list(differences.values())).any()
-        other |= (inflation > _LARGEST_INFLATION).any() | (scale > self.settings.noise[1] * (1 + _SAME))
+        other |= (inflation > self.largest_inflation).any() | (scale > self.settings.noise[1] * (1 + self.same))
         result = RESULTS.where(outside.any(), RESULTS.at_bound, RESULTS.successful)
         result = RESULTS.where(unidentifiable.any(), RESULTS.unidentifiable, result)
         feasible = finite & shot.feasible & jnp.isfinite(parameters).all()

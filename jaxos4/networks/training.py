@@ -1,7 +1,7 @@
 """The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,34 +14,60 @@ from ..errors import TrainingError
 from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
 from .features import CHUNK, Features, Flights, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
 
-if TYPE_CHECKING:
-    import optax  # `_optimiser` imports it, because it is slow to import
 
-    from .estimator import NetworkEstimator
+class Schedule(NamedTuple):
+    """How a network is trained. `NetworkEstimator` explains the first five, which its user sets.
 
-CHECK = 250
-"""Steps between two evaluations of the validation loss."""
+    - `check`: steps between two evaluations of the validation loss.
+    - `validation`: simulated flights of the validation.
+    - `uses`: how often training uses a simulated flight, each time with new noise; a flight costs more than its noise.
+    - `improvement`: a loss is an improvement if it is lower by this share.
+    - `diverged`: a loss beyond this ends training; the worst answer inside a bracket has a far lower one.
+    - `flyable`: the smallest share of simulated flights that must not diverge.
+    - `warm_up`: steps in which the learning rate rises, at most half of all.
+    - `last_rate`: the learning rate at the end of training, relative to the largest.
+    """
 
-_VALIDATION = 2  # chunks of the validation
-_USES = 4  # how often training uses a simulated flight, each time with new noise
-_IMPROVEMENT = 1e-4  # a loss is an improvement if it is lower by this share
-_DIVERGED = 1e15  # in units of the noise; the worst answer inside a bracket has a far lower loss
-_FLYABLE = 0.01  # the smallest share of simulated flights that must not diverge
+    noise: tuple[float, float]
+    steps: int
+    batch: int
+    learning_rate: float
+    patience: int
+    check: int = 250
+    validation: int = 2 * CHUNK
+    uses: int = 4
+    improvement: float = 1e-4
+    diverged: float = 1e15
+    flyable: float = 0.01
+    warm_up: int = 200
+    last_rate: float = 1e-3
 
-_WARM_UP = 200  # steps
-_LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
-_NEWTON_SCHULZ = ((3.4445, -4.7750, 2.0315),) * 5  # Optax's coefficients; as rows they compile to a loop
+    @property
+    def rates(self) -> Float[np.ndarray, " steps"]:
+        """The learning rate of each step: a linear rise, then half a cosine."""
+        step, warm_up = np.arange(self.steps), min(self.warm_up, self.steps // 2)
+        wave = (1 + np.cos(np.pi * (step - warm_up) / (self.steps - warm_up))) / 2
+        share = np.where(step < warm_up, step / max(warm_up, 1), self.last_rate + (1 - self.last_rate) * wave)
+        return (self.learning_rate * share).astype(np.float32)
 
-# Flights for each feature, and the ridge, of the fit of the linear map.
-_PER_FEATURE, _RIDGE = 4, 1e-6
 
+def untrained(
+    features: Features,
+    noise: tuple[float, float],
+    architecture: str,
+    shape: dict[str, Any],
+    key: Key,
+    *,
+    per_feature: int = 4,
+) -> tuple[Scaling, Regressor]:
+    """Scaling and regressor before training, with a linear map that is fitted to simulated flights.
 
-def untrained(features: Features, settings: "NetworkEstimator", key: Key) -> tuple[Scaling, Regressor]:
-    """Scaling and regressor before training, with a linear map that is fitted to simulated flights."""
-    scales = np.asarray(settings.noise, float)
-    count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
+    `per_feature`: of these flights, for each feature; `noise`: their lowest and highest noise scale.
+    """
+    scales = np.asarray(noise, float)
+    count, purpose = max(CHUNK, per_feature * features.size), Purpose.LINEAR_MAP
     chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)
-    return _untrained(features, chunks, scales, key, settings.architecture, settings.shape)
+    return _untrained(features, chunks, scales, key, architecture, shape)
 
 
 @eqx.filter_jit
@@ -66,7 +92,7 @@ def _untrained(
     sizes = jnp.where(sizes > 0, sizes, 1.0) * jnp.sqrt(features.size / unit.shape[0])
     inputs = jnp.where(flown[:, None], compress(samples.features / sizes), 0.0)
     targets = jnp.where(flown[:, None], samples.u, 0.0)
-    ridge = _RIDGE * jnp.trace(inputs.T @ inputs) / features.size
+    ridge = 1e-6 * jnp.trace(inputs.T @ inputs) / features.size
     linear_map = jnp.linalg.solve(inputs.T @ inputs + ridge * jnp.eye(features.size), inputs.T @ targets).T
     scaling = Scaling(sizes, unit, jnp.minimum(10 * unit, 1.0), jnp.maximum(jnp.abs(jnp.log(scales)).max(), 1.0))
     key = jax.random.fold_in(key, place_of(Purpose.WEIGHTS, 0))
@@ -74,7 +100,7 @@ def _untrained(
 
 
 def train(
-    regressor: Regressor, scaling: Scaling, features: Features, settings: "NetworkEstimator", key: Key
+    regressor: Regressor, scaling: Scaling, features: Features, schedule: Schedule, key: Key
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
 
@@ -85,38 +111,38 @@ def train(
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
-    scales, batch, steps = np.asarray(settings.noise, float), settings.batch, settings.steps
-    held_out = draw_chunks(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION)
+    scales, batch, steps, check = np.asarray(schedule.noise, float), schedule.batch, schedule.steps, schedule.check
+    held_out = draw_chunks(features, schedule.validation, key=key, purpose=Purpose.VALIDATION)
     held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
     flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
-    if not flyable > _FLYABLE:
+    if not flyable > schedule.flyable:
         what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
-    state, rates = _first_state(regressor), _learning_rates(settings.learning_rate, steps)
-    flown = batch * CHECK // _USES
+    state, rates = _first_state(regressor), schedule.rates
+    flown = batch * check // schedule.uses
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
-    for number, first in enumerate(range(0, steps, CHECK)):
+    for number, first in enumerate(range(0, steps, check)):
         place = number * math.ceil(flown / CHUNK)
         flights = draw_chunks(features, flown, key=key, purpose=Purpose.FLIGHTS, first=place)
-        count = min(CHECK, steps - first)
-        places = place_of(Purpose.STEPS, first + np.arange(CHECK))
-        rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
+        count = min(check, steps - first)
+        places = place_of(Purpose.STEPS, first + np.arange(check))
+        rate = np.resize(rates[first : first + count], check)  # of one shape: the last steps need no other program
         regressor, state, *losses = _advance(
             regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
         )
         history.append([float(value) for value in losses])
         value, current = history[-1]
-        if not np.less(history[-1], _DIVERGED).all():
-            loss = next(each for each in (current, value) if not each < _DIVERGED)
+        if not np.less(history[-1], schedule.diverged).all():
+            loss = next(each for each in (current, value) if not each < schedule.diverged)
             raise TrainingError(
                 f"training diverged within {first + count} steps (loss {loss:g}): lower `learning_rate`."
             )
         without_improvement += 1
-        if current < lowest - _IMPROVEMENT * abs(current):
+        if current < lowest - schedule.improvement * abs(current):
             best, lowest, without_improvement = regressor, current, 0
-        if without_improvement >= settings.patience:
+        if without_improvement >= schedule.patience:
             break
     whole = jax.tree.map(lambda x: as_float(np.asarray(x)) if eqx.is_inexact_array_like(x) else x, best)
     return whole, np.asarray(history)
@@ -173,18 +199,12 @@ def _first_state(regressor: Regressor) -> PyTree:
     return _optimiser(0.0).init(eqx.filter(regressor, eqx.is_inexact_array))
 
 
-def _optimiser(rate: Scalar | float) -> "optax.GradientTransformation":
-    import optax
+def _optimiser(rate: Scalar | float) -> Any:
+    """Muon, a `GradientTransformation` of Optax."""
+    import optax  # slow to import
 
-    return optax.contrib.muon(rate, ns_coeffs=_NEWTON_SCHULZ)
-
-
-def _learning_rates(largest: float, steps: int) -> Float[np.ndarray, " steps"]:
-    """The learning rate of each step: a linear rise, then half a cosine."""
-    step, warm_up = np.arange(steps), min(_WARM_UP, steps // 2)
-    wave = (1 + np.cos(np.pi * (step - warm_up) / (steps - warm_up))) / 2
-    share = np.where(step < warm_up, step / max(warm_up, 1), _LAST_RATE + (1 - _LAST_RATE) * wave)
-    return (largest * share).astype(np.float32)
+    # Optax's own coefficients of Newton and Schulz; as rows they compile to a loop.
+    return optax.contrib.muon(rate, ns_coeffs=((3.4445, -4.7750, 2.0315),) * 5)
 
 
 def _single(tree: PyTree) -> PyTree:
