@@ -101,8 +101,8 @@ from .identification import (
 )
 from .logs import read_flight as read_flight, read_log as read_log, write_flight as write_flight
 from .models.abstract import DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH, AbstractModel as AbstractModel
+from .models.flight_model import TERMS as TERMS, FlightModel as FlightModel
 from .models.os4 import CorrectedOS4 as CorrectedOS4, PublishedOS4 as PublishedOS4
-from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
 from .networks import NetworkEstimator as NetworkEstimator, TrainedNetwork as TrainedNetwork
 from .networks.file import load_network as load_network, save_network as save_network
 from .noise import (

@@ -7,12 +7,9 @@ a start costs nothing. An entry point is imported when it is used.
 from collections import UserDict
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from .errors import InputError
-
-if TYPE_CHECKING:  # its import takes a tenth of a second
-    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 
@@ -33,8 +30,8 @@ class Registry(UserDict[str, T], Generic[T]):
         self.group = group
 
     @cached_property
-    def _others(self) -> "dict[str, EntryPoint]":
-        from importlib.metadata import entry_points
+    def _others(self) -> dict[str, Any]:
+        from importlib.metadata import entry_points  # takes a tenth of a second
 
         return {each.name: each for each in entry_points(group=self.group)}
 

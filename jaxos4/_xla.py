@@ -7,38 +7,29 @@ names the versions of JAX that know all of these.
 """
 
 import os
-from collections.abc import Mapping
-
-NO_FLAGS = "JAXOS4_NO_XLA_OPTIONS"
-"""The environment variable that switches all flags off."""
-
-LOOP_FLAGS = {
-    "xla_cpu_small_while_loop_byte_threshold": (
-        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000,-unroll-full-max-count=15"
-    ),
-    "xla_cpu_prefer_vector_width": "--xla_cpu_prefer_vector_width=512",
-}
-"""The flags that `import jaxos4` sets, by the names of their options.
-
-- Loops whose step moves less than a gigabyte become native functions. Larger ones keep XLA's threads.
-- Loops over 16 lanes stay loops: LLVM turns a loop into vectors, but not the scalar code that it unrolls it to.
-- Vectors are as wide as the processor's. Results are the same.
-"""
-
-QUICK_FLAGS = {"xla_cpu_use_fusion_emitters": "--xla_cpu_use_fusion_emitters=false"}
-"""The flag that commands for single flights add: XLA's older way to write loops.
-
-Programs compile in two thirds of the time. The program of one flight also runs faster, by a tenth; that of a batch
-takes half as long again.
-"""
 
 
-def add_flags(wanted: Mapping[str, str] = LOOP_FLAGS) -> None:
-    """Adds flags to `XLA_FLAGS`: each whose option the user has not set; none to the name of a file with flags.
+def add_flags(*, quick: bool = False) -> None:
+    """Adds flags to `XLA_FLAGS`, each unless the user has set its option. No result changes.
 
-    They have no effect if JAX has computed before.
+    - Loops whose step moves less than a gigabyte become native functions. Larger ones keep XLA's threads.
+    - Loops over 16 lanes stay loops: LLVM turns a loop into vectors, but not the scalar code that it unrolls it to.
+    - Vectors are as wide as the processor's.
+    - `quick`: XLA's older way to write loops, for a command that computes a single flight. Programs compile in two
+      thirds of the time, and that of one flight runs faster, by a tenth; that of a batch takes half as long again.
+
+    Nothing is added if `JAXOS4_NO_XLA_OPTIONS` is set, or if `XLA_FLAGS` is the name of a file with flags. Flags have
+    no effect if JAX has computed before.
     """
+    options = {
+        "xla_cpu_small_while_loop_byte_threshold": (
+            "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000,-unroll-full-max-count=15"
+        ),
+        "xla_cpu_prefer_vector_width": "--xla_cpu_prefer_vector_width=512",
+    }
+    if quick:
+        options["xla_cpu_use_fusion_emitters"] = "--xla_cpu_use_fusion_emitters=false"
     flags = os.environ.get("XLA_FLAGS", "").strip()
-    added = [flag for option, flag in wanted.items() if option not in flags]
-    if added and not os.environ.get(NO_FLAGS) and (not flags or flags.startswith("--")):
+    added = [flag for option, flag in options.items() if option not in flags]
+    if added and not os.environ.get("JAXOS4_NO_XLA_OPTIONS") and (not flags or flags.startswith("--")):
         os.environ["XLA_FLAGS"] = " ".join([flags, *added]).strip()

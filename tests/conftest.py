@@ -26,11 +26,12 @@ UNCHECKED = ("__init__", "blackbox_frames")
 modules = [path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("*.py") if path.stem not in UNCHECKED]
 jaxtyping.install_import_hook([".".join(module.with_suffix("").parts) for module in modules], "typechecker.check")
 
-from jaxos4._xla import QUICK_FLAGS, add_flags  # noqa: E402
-
 # Tests compile for longer than they compute: XLA hardly optimises their programs, which then compile in a third of the
 # time, and compute three to five times as long. The other cores have workers, so a program is compiled in one part.
-add_flags(QUICK_FLAGS | {"parallel_codegen": "--xla_cpu_parallel_codegen_split_count=1"})
+QUICK = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*os.environ.get("XLA_FLAGS", "").split(), *QUICK]))
+import jaxos4  # noqa: E402, F401 - which adds its own
+
 jax.config.update("jax_disable_most_optimizations", True)
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)

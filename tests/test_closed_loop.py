@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.closed_loop import fly_standard
-from jaxos4.noise import coloured
 
 pytestmark = pytest.mark.slow
 
@@ -206,24 +205,7 @@ def test_gusts_have_their_strength_and_their_correlation_time_and_follow_from_th
     assert not np.array_equal(other.specific_force, flight.specific_force)
 
 
-def test_the_process_is_exact():
-    step, count = 0.02, 200_000
-    noise = np.asarray(coloured(jax.random.normal(jax.random.key(0), (count, 4)), jnp.asarray(step)))
-    error = np.sqrt(2 / (count * step))  # of a variance
-    np.testing.assert_allclose(noise.var(axis=0), 1, atol=4 * error)
-    assert np.abs(np.corrcoef(noise.T) - np.eye(4)).max() < 4 * error
-    for shift in (1, 50, 100):
-        found = (noise[shift:] * noise[:-shift]).mean(axis=0)
-        np.testing.assert_allclose(found, np.exp(-shift * step), atol=4 * error)
-    # Innovations are white and have the right size.
-    fresh = noise[1:] - np.exp(-step) * noise[:-1]
-    np.testing.assert_allclose(fresh.var(axis=0), -np.expm1(-2 * step), rtol=4 * np.sqrt(2 / count))
-
-
 # Batches and failures.
-
-
-# The command line.
 
 
 EVERY_EFFECT = jaxos4.ClosedLoop(
@@ -266,6 +248,9 @@ def test_a_batch_is_a_loop_and_a_failure_stays_in_its_lane():
         assert np.isfinite(states[:first]).all()
         assert (omega[first:] == 0).all()
         assert np.isfinite(omega).all()
+
+
+# The command line.
 
 
 def test_simulate_writes_what_estimate_reads(run, tmp_path):

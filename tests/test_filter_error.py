@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
+from disturbances import joint_cost, transition
 from helpers import DT, noisy_states, standard_flight, standard_problem
 from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, names
 
@@ -73,21 +73,13 @@ def disturbed(seed=0):
 # The filters.
 
 
-def transition(strength, tau, dt=DT):
-    """State transition and added covariance of a rate and the Ornstein-Uhlenbeck disturbance that drives it."""
-    drift, noise = np.array([[0.0, 1.0], [0.0, -1 / tau]]), np.diag([0.0, 2 * strength**2 / tau])
-    whole = scipy.linalg.expm(np.block([[-drift, noise], [np.zeros((2, 2)), drift.T]]) * dt)  # Van Loan (1978)
-    moved = whole[2:, 2:].T
-    return moved, moved @ whole[:2, 2:]
-
-
 @pytest.mark.parametrize("tau", [0.003, 0.2, 0.34, 30.0])
 def test_the_variance_that_a_disturbance_adds_is_exact(tau):
     """Also for time constants of thousands of samples, where its formula is a difference of nearly equal numbers."""
     noise = LogNoise(*(jnp.asarray(np.log([x, 1.0, 1.0])) for x in (3.0, tau, 1e-9)))
     two = jax.tree.map(lambda leaf: jnp.asarray(np.zeros_like(leaf[:2])), observed_in(disturbed()))
     gains = filter_gains(two, noise, jnp.asarray(DT))
-    moved, added = transition(3.0, tau)
+    moved, added = transition(3.0, tau, DT)
     start = np.diag([0.0, 9.0])
     expected = (moved @ start @ moved.T + added)[0, 0] + 1e-18
     np.testing.assert_allclose(gains.variance[1, 0, 0], expected, rtol=1e-9)
@@ -104,21 +96,8 @@ def test_the_likelihood_is_that_of_a_joint_gaussian():
     means, total = uncoupled_rates(problem.flight)[:samples], 0.0
     for i, mean in enumerate(means.T):
         strength, tau, sensor = (float(np.exp(x[i])) for x in NOISE)
-        moved, added = transition(strength, tau)
-        own = [np.diag([1e6, strength**2])]
-        for _ in range(samples - 1):
-            own.append(moved @ own[-1] @ moved.T + added)
-        covariance = np.zeros((samples, samples))
-        for k in range(samples):
-            ahead = own[k]
-            for j in range(k, samples):
-                covariance[k, j] = covariance[j, k] = ahead[0, 0]
-                ahead = moved @ ahead
-        covariance += sensor**2 * np.eye(samples)
-        y = states[:, RATES[i]] - mean
-        known = ~np.isnan(y)
-        dense = covariance[np.ix_(known, known)]
-        total += (y[known] @ np.linalg.solve(dense, y[known]) + np.linalg.slogdet(dense)[1]) / 2
+        first = np.diag([1e6, strength**2])
+        total += joint_cost(states[:, RATES[i]] - mean, *transition(strength, tau, DT), first, sensor, seen=0)
     found = likelihood(problem, UNCOUPLED, NOISE).cost.sum()
     np.testing.assert_allclose(found, total, rtol=1e-6)
     # It would see a time constant that is wrong by 1 %.
@@ -147,8 +126,8 @@ def test_the_information_is_the_covariance_of_the_gradient():
     """Over flights that the filter's own model made: 64 draws, standard error 18 % of each variance."""
     flight, rng = standard_flight(), np.random.default_rng(3)
     strength, tau, sensor = (np.exp(np.asarray(x)) for x in NOISE)
-    parts = [np.linalg.cholesky(transition(s, t)[1]) for s, t in zip(strength, tau, strict=True)]
-    moves = [transition(s, t)[0] for s, t in zip(strength, tau, strict=True)]
+    parts = [np.linalg.cholesky(transition(s, t, DT)[1]) for s, t in zip(strength, tau, strict=True)]
+    moves = [transition(s, t, DT)[0] for s, t in zip(strength, tau, strict=True)]
     exact = uncoupled_rates(flight)
     draws = np.tile(np.asarray(flight.states), (LANES, 1, 1))
     state = np.zeros((LANES, 3, 2))
@@ -218,7 +197,7 @@ def test_a_known_start_is_used_in_flights_of_several_segments():
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
     gains = filter_gains(observed, NOISE, jnp.asarray(DT))
     # After one sample only the disturbance is unknown.
-    moved, added = transition(4.0, 0.2)
+    moved, added = transition(4.0, 0.2, DT)
     expected = (moved @ np.diag([0.0, 16.0]) @ moved.T + added)[0, 0] + 0.02**2
     np.testing.assert_allclose(gains.variance[1, 0, 0], expected, rtol=1e-9)
 

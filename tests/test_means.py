@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
+from disturbances import joint_cost, sample
 from helpers import CINERAT
 from scipy.integrate import simpson
 
@@ -24,37 +24,6 @@ pytestmark = pytest.mark.slow
 
 
 # The filters.
-
-
-def piece(time, tau, *, of=None):
-    """How (integral of the disturbance, disturbance, sum) move in a time, and the covariance that noise adds.
-
-    `of`: 0 or 1: this state is summed; by default none. By Van Loan (1978), for a disturbance of unit variance.
-    """
-    drift, noise = np.array([[0.0, 1.0, 0.0], [0.0, -1 / tau, 0.0], [0.0, 0.0, 0.0]]), np.diag([0.0, 2 / tau, 0.0])
-    if of is not None:
-        drift[2, of] = 1.0
-    whole = scipy.linalg.expm(np.block([[-drift, noise], [np.zeros((3, 3)), drift.T]]) * time)
-    moved = whole[3:, 3:].T
-    return moved, moved @ whole[:3, 3:]
-
-
-def sample(dt, tau, begin, length, measured):
-    """The same over one sample, with the measurement instead of the sum.
-
-    `measured`: 0: the integral of the disturbance, as a rate. 1: the disturbance, as a specific force. The mean over
-    the window is measured, or the value at its beginning.
-    """
-    window = piece(length, tau, of=measured) if length else (np.eye(3), np.zeros((3, 3)))
-    if length:
-        window = [np.diag([1, 1, 1 / length]) @ window[0], np.diag([1, 1, 1 / length]) @ window[1]]
-        window[1] = window[1] @ np.diag([1, 1, 1 / length])
-    else:
-        window[0][2, measured] = 1.0
-    total, added = np.eye(3), np.zeros((3, 3))
-    for moved, noise in (piece(begin, tau), window, piece(dt - begin - length, tau)):
-        total, added = moved @ total, moved @ added @ moved.T + noise
-    return total, added
 
 
 WINDOWS = {"mean": (0.0, 1.0), "middle": (0.5, 0.0), "beginning": (0.0, 0.0), "part": (0.2, 0.5)}
@@ -118,18 +87,8 @@ def test_the_likelihood_of_rates_is_that_of_a_joint_gaussian_of_means(share):
         # Of what a measurement sees, nothing remains in the next.
         moved[:, 2] = 0.0
         added = strength**2 * added
-        own, covariance = np.diag([1e6, strength**2, 0.0]), np.zeros((samples, samples))
-        for k in range(samples):
-            own = moved @ own @ moved.T + added
-            ahead = own
-            for j in range(k, samples):
-                covariance[k, j] = covariance[j, k] = ahead[2, 2]
-                ahead = moved @ ahead
-        covariance += sensor**2 * np.eye(samples)
-        y = states[:, RATES[i]] - mean[:, i]
-        known = ~np.isnan(y)
-        dense = covariance[np.ix_(known, known)]
-        total += (y[known] @ np.linalg.solve(dense, y[known]) + np.linalg.slogdet(dense)[1]) / 2
+        first = moved @ np.diag([1e6, strength**2, 0.0]) @ moved.T + added
+        total += joint_cost(states[:, RATES[i]] - mean[:, i], moved, added, first, sensor, seen=2)
     np.testing.assert_allclose(cost_of(problem, jnp.asarray(parameters), noise), total, rtol=1e-6)
     # It sees another window.
     other = dataclasses.replace(problem, flight=dataclasses.replace(flight, averaging_time=(1 - share) * dt))

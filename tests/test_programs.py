@@ -1,9 +1,5 @@
-"""How many programs an identification compiles, and that other numbers of one shape are other data.
+"""How many programs an identification compiles, and that other numbers of one shape are other data."""
 
-`eqx.filter_eval_shape` traces a program as a call does, but does not compile it, which takes long.
-"""
-
-import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,7 +12,6 @@ from helpers import compiled_programs, curvatures, first_state, noisy_states, st
 
 import jaxos4
 from jaxos4.shooting import for_threads, padded
-from jaxos4.simulation import METHODS
 
 pytestmark = pytest.mark.slow
 
@@ -51,18 +46,35 @@ def cost_and_residuals(problem, *at):
     return problem.cost(*at), problem.residuals(*at).reshape(-1, problem.size)
 
 
-def test_other_limits_and_tolerances_of_a_search_need_no_other_program():
+def test_other_numbers_need_no_other_program():
+    """Of a flight, a vehicle, a bracket and a search; a sample time is a number of any kind."""
+    model, omega = jaxos4.PublishedOS4(), standard_flight().omega
+    other, twice = eqx.tree_at(lambda m: m.airframe.mass, model, np.asarray(0.7)), 2 * model.alpha
+    steps = 0.02, np.float64(0.03), jnp.asarray(0.04, float)
     problem = standard_problem(states=noisy_states(1)[0], channels="rates", free=True)
-    bracket = jaxos4.Bracket.default(problem.model)
-    for make, settings in (
-        (jaxos4.OutputError, {"max_steps": 7, "tolerance": 1e-3}),
-        (jaxos4.EquationError, {"bridge": 7}),
-    ):
-        make()(problem, bracket)
-        other = make(**settings)
-        with compiled_programs() as programs:
-            other(problem, bracket)
-        assert not programs
+    changed = eqx.tree_at(lambda p: (p.sigma, p.model), problem, (2 * problem.sigma, other))
+    narrow = jaxos4.Bracket.around(np.asarray(model.alpha), 0.5 * jaxos4.DEFAULT_HALF_WIDTH)
+    before = (
+        lambda: jaxos4.simulate(model, model.alpha, omega, dt=0.01),
+        lambda: jaxos4.IBSS()(problem, jaxos4.Bracket.default(model)),
+        lambda: jaxos4.OutputError()(problem, narrow),
+        lambda: jaxos4.EquationError()(problem, narrow),
+    )
+    after = (
+        *(lambda dt=dt: jaxos4.simulate(other, twice, omega, dt=dt) for dt in steps),
+        lambda: jaxos4.IBSS(tolerance=0.02, reach=3.0)(changed, narrow),
+        lambda: jaxos4.OutputError(max_steps=7, tolerance=1e-3)(changed, narrow),
+        lambda: jaxos4.EquationError(bridge=7)(changed, narrow),
+    )
+    for compute in before:
+        compute()
+    with compiled_programs() as programs:
+        for compute in after:
+            compute()
+    assert programs == []
+    with compiled_programs() as programs:  # a sample less is another program
+        jaxos4.simulate(model, model.alpha, omega[1:], dt=0.01)
+    assert programs != []
 
 
 def test_a_batch_is_the_same_on_any_number_of_cores_by_one_program(monkeypatch):
@@ -136,78 +148,3 @@ def test_a_search_is_one_native_loop():
     assert "xla_cpu_small_call" in program
     entry = program[program.index("\nENTRY") :]
     assert " while(" not in entry
-
-
-# Tracing.
-
-DURATION = 0.1
-
-
-@pytest.fixture
-def counted():
-    """A new model class, and the number of times that a program of it was traced: each calls `forcing`."""
-    count = [0]
-
-    class Counted(jaxos4.PublishedOS4):
-        def forcing(self, inputs, parameters):
-            count[0] += 1
-            return super().forcing(inputs, parameters)
-
-    return Counted, count
-
-
-def model_of(model_class, trial):
-    """The OS4 with another mass and other inertias."""
-    model = model_class()
-    mass, inertia = model.airframe.mass * (1 + trial), model.airframe.inertia * (1 + trial)
-    return eqx.tree_at(lambda m: (m.airframe.mass, m.airframe.inertia), model, (mass, inertia))
-
-
-def problem_of(model_class, trial):
-    flight = standard_flight(duration=DURATION)
-    return jaxos4.ShootingProblem(
-        model_of(model_class, trial),
-        eqx.tree_at(lambda f: f.states, flight, flight.states + trial),
-        sigma=(1.0 + trial) * jaxos4.SENSOR_SIGMA,
-        initial_state=np.full(12, 0.01 * trial),
-        channels="rates",
-    )
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_simulates_another_flight_without_another_trace(counted, method):
-    model_class, count = counted
-    omega = standard_flight(duration=DURATION).omega
-    for trial, dt in enumerate((0.01, 0.02, np.float64(0.03), jnp.asarray(0.04))):
-        model, start = model_of(model_class, trial), jnp.full(12, 0.01 * trial)
-        simulate = functools.partial(jaxos4.simulate, dt=dt, method=method)
-        eqx.filter_eval_shape(simulate, model, model.alpha, omega + trial, initial_state=start)
-    assert count[0] == 1
-    # A sample less is another program.
-    eqx.filter_eval_shape(simulate, model, model.alpha, omega[1:], initial_state=start)
-    assert count[0] == 2
-
-
-def shot(what):
-    def shoot(problem, trial):
-        return getattr(jaxos4.ShootingProblem, what)(problem, 1.1 * problem.model.alpha, problem.first_state()[0])
-
-    return shoot
-
-
-def search(problem, trial):
-    bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
-    return jaxos4.IBSS(tolerance=0.01 * (1 + trial), reach=4 - trial)(problem, bracket)
-
-
-@pytest.mark.parametrize("compute", [shot("cost"), shot("residuals"), shot("predict"), search])
-def test_another_problem_needs_no_other_trace(counted, compute):
-    model_class, count = counted
-    counts = []
-    for trial in range(3):
-        eqx.filter_eval_shape(lambda problem, trial=trial: compute(problem, trial), problem_of(model_class, trial))
-        counts.append(count[0])
-    assert counts[0] == counts[-1]
-    # Another kind of problem is seen.
-    eqx.filter_eval_shape(lambda problem: compute(problem, 0), problem_of(model_class, 0).restrict("attitude"))
-    assert count[0] > counts[0]

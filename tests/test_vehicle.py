@@ -67,20 +67,24 @@ def shooting_problem(flight, airframe, terms=TERMS, **arguments):
     return jaxos4.ShootingProblem(model, flight, sigma=np.full(12, GYRO), channels="rates", method="rk4", **arguments)
 
 
-@eqx.filter_jit
-def searched(estimator, flights, airframes):
-    @eqx.filter_vmap
-    def one(flight, airframe):
-        return estimator(InnovationsProblem(shooting_problem(flight, airframe)))
-
-    return one(flights, airframes)
+def first_problem(damping=0.0, share=1.0):
+    """The innovations of the first flight without its accelerometer, and the recording of each sample."""
+    flight, airframe = (lane(part, 0) for part in flown(damping, share))
+    problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
+    return problem, np.zeros(flight.time.shape[0], int)
 
 
 @functools.cache
 def found_by(name):
     """The estimates of all unknowns: parameters, and the logarithms of the noise."""
     estimator = {"filter error": jaxos4.FilterError(), "ibss": jaxos4.IBSS()}[name]
-    return searched(estimator, *flown())
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def search(*one):
+        return estimator(InnovationsProblem(shooting_problem(*one)))
+
+    return search(*flown())
 
 
 @eqx.filter_jit
@@ -123,8 +127,7 @@ def test_inertias_lie_in_their_intervals_and_bisection_finds_what_newtons_method
     left = np.abs(newton.cost - found.cost)
     assert left.max() < 2 * jaxos4.FilterError().tolerance, left
     np.testing.assert_allclose(found.std[:, :count], newton.std[:, :count], rtol=0.1)
-    # Regression sees the same flights, and is wrong by more than these searches ever are.
-    errors = of_inertias(regressions(*flown())) - 1
+    errors = of_inertias(regressions(*flown())) - 1  # regression sees the same flights, and is wrong
     assert np.square(errors / std).sum() > 200
     assert np.abs(errors.mean()) > 0.1
 
@@ -143,7 +146,6 @@ def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
     found, newton = hybrid(InnovationsProblem(shooting_problem(flight, airframe))), lane(found_by("filter error"), 0)
     assert names(found) == "successful"
     std, best = (np.asarray(each)[: unknowns.count] for each in (newton.std, newton.parameters))
-    # The seed is 41 standard deviations off after 20 steps of training, and 39 after 100: 20 are enough.
     assert (np.abs(found.seed.center - best) / std).max() > 10
     assert (np.abs(found.parameters[: unknowns.count] - best) / std).max() < 0.05
     # IBSS searches the whole bracket after the search near the seed.
@@ -177,10 +179,8 @@ def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
 )
 def test_what_is_not_estimated_is_named(kind, damping, share):
     """A flight with a roll damping; in a hover with hardly any motion."""
-    flight, airframe = (lane(part, 0) for part in flown(damping, share))
-    problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
+    problem, recording = first_problem(damping, share)
     unknowns, stages = problem.problem.unknowns, []
-    recording = np.zeros(flight.time.shape[0], int)
     fit = fit_innovations(jaxos4.FilterError(), problem, recording, progress=stages.append)
     assert fit.answered
     assert ("fitting again without what came out negative" in stages) == (kind == "negative")
@@ -207,9 +207,7 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
 @functools.cache
 def poorly_known():
     """The problem of a flight that says little about alpha8, as a case, and its fit."""
-    flight, airframe = (lane(part, 0) for part in flown(1.0, 1.0))
-    problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
-    recording = np.zeros(flight.time.shape[0], int)
+    problem, recording = first_problem(1.0)
     nothing = dict.fromkeys(("model", "held_out")) | {"provenance": types.SimpleNamespace(fitted_seconds=60.0)}
     case = Case(problem, problem.problem, jaxos4.FilterError(), "filter-error", recording=recording, **nothing)
     return case, fit_case(case)
@@ -243,8 +241,7 @@ def test_at_the_upper_end_of_a_wide_interval_the_least_cost_is_higher_by_two():
     np.testing.assert_allclose(both.estimate.std, 2 * wider.estimate.std)
 
 
-# How much higher the cost is at each end, in shares of 1.96^2 / 2; None: the fit did not converge. Then the
-# end, in shares of that of the covariance.
+# How much higher the cost is at each end, in shares of 1.96^2 / 2 (None: no fit); the end, in that of the covariance.
 ENDS = {
     "no fit": ([None], 1.0),
     "at once": ([1.0], 1.0),
@@ -296,25 +293,21 @@ def test_an_inertia_whose_interval_has_no_end_is_not_identifiable(monkeypatch):
 @pytest.mark.usefixtures("optimised")
 def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch):
     case, fit = poorly_known()
-    # A search that ended beside the minimum.
     problem, found = fit.searched
-    aside = eqx.tree_at(lambda e: e.cost, found, found.cost + 3.0)
-    stages = []
+    aside, stages = eqx.tree_at(lambda e: e.cost, found, found.cost + 3.0), []  # it ended beside the minimum
     better = profile.with_profile(fit._replace(searched=(problem, aside)), case, progress=stages.append)
     assert stages.count("fitting again where the cost is lower") == 1
     assert better.rollouts > fit.rollouts
     assert abs(float(better.estimate.cost - found.cost)) < 2 * jaxos4.FilterError().tolerance
-    assert "alpha8" in better.profiled
-    assert better.is_lowest
+    assert (better.is_lowest, "alpha8" in better.profiled) == (True, True)
     # The search ends where it began, although the cost is lower at an end: no minimum is found.
-    stages = []
+    stages.clear()
     fits_at_ends(monkeypatch, found, case.problem.problem.unknowns, [-1.0] * 3)
     lost = profile.with_profile(fit, case, progress=stages.append)
     assert not lost.is_lowest
     assert stages.count("fitting again where the cost is lower") <= 2
     assert lost.searched[1].cost <= found.cost
-    answer = answer_of(case, lost)
-    assert judge(case, lost, [answer], progress=stages.append)["doubts"][0].result == "max_sweeps"
+    assert judge(case, lost, [answer_of(case, lost)], progress=stages.append)["doubts"][0].result == "max_sweeps"
     # A search that did not converge has no profile.
     failed = fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.at_bound))
     assert profile.with_profile(failed, case, progress=stages.append) is failed
@@ -322,10 +315,9 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
 
 @pytest.mark.usefixtures("optimised")
 def test_a_flight_that_the_model_cannot_follow_has_no_answer():
-    flight, airframe = (lane(part, 0) for part in flown())
-    problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
+    problem, recording = first_problem()
     wild = eqx.tree_at(lambda p: p.problem.flight.omega, problem, 1e6 * problem.flight.omega)
-    fit = fit_innovations(jaxos4.FilterError(), wild, np.zeros(flight.time.shape[0], int))
+    fit = fit_innovations(jaxos4.FilterError(), wild, recording)
     assert not fit.answered
     assert names(fit.estimate) == "nonfinite_trajectory"
     bracket = problem.problem.unknowns.bracket

@@ -24,7 +24,7 @@ import jaxos4
 from jaxos4.estimators import make_estimator
 from jaxos4.identification.fit import fit_innovations
 from jaxos4.logs.sampling import averages
-from jaxos4.models.vehicle import DEFAULT_TERMS
+from jaxos4.models.flight_model import DEFAULT_TERMS
 from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)

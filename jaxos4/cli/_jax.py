@@ -5,7 +5,7 @@ import tempfile
 import warnings
 from pathlib import Path
 
-from .._xla import QUICK_FLAGS, add_flags
+from .._xla import add_flags
 
 NO_CACHE = "JAXOS4_NO_CACHE"
 """The environment variable that switches off the cache of compiled programs."""
@@ -19,7 +19,7 @@ def prepare(*, batch: bool) -> None:
     `batch`: whether the command computes many flights at once; those of a single one should compile quickly.
     """
     if not batch:
-        add_flags(QUICK_FLAGS)
+        add_flags(quick=True)
 
     import jax
 

@@ -15,9 +15,9 @@ from ..closed_loop import ClosedLoop, References, fly_closed_loop
 from ..errors import InputError
 from ..flight import ANGLES, POSITION, VELOCITY, Flight
 from ..models.abstract import PARAMETER_NAMES
+from ..models.flight_model import FlightModel
 from ..models.state import Attitude, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
-from ..models.vehicle import FlightModel
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
 from ..shooting.innovations import NOISE_PRECISION

@@ -129,11 +129,19 @@ class ReferenceTask(task.AbstractTask):
     tones: Tones = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     size: int = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_references)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Ix, Iy and Iz, then the model's other parameters."""
+        return self.fleet.inertias_first(INERTIAS, self.fleet.model.parameter_names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each of `names`."""
+        return self.fleet.inertias_first(("kg m^2",) * 3, self.fleet.model.parameter_units)
 
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
@@ -237,8 +245,6 @@ def design_references(
         tones=tones,
         samples=samples,
         size=8 * tones.number,
-        names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
-        units=fleet.inertias_first(("kg m^2",) * 3, fleet.model.parameter_units),
         criterion=criterion,
         **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -86,12 +86,20 @@ class RotorSpeedTask(task.AbstractTask):
     weights: Float[Array, " sensors"]
     dt: Scalar
     size: int = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
     start_is_known: bool = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_input)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The model's parameters."""
+        return self.model.parameter_names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each of `names`."""
+        return self.model.parameter_units
 
     def _omega(self, coefficients: Coefficients) -> RotorSpeeds:
         """The rotor speeds [rad/s]."""
@@ -243,6 +251,17 @@ def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, band
     return {"tones": tones, "amplitudes": amplitudes, "hover": hover, "action": action}
 
 
+def _of_bracket(model: AbstractModel, bracket: Bracket, key: Key) -> dict[str, Any]:
+    """The fields of `RotorSpeedTask` that model and bracket decide."""
+    others = drawn(bracket, jax.random.fold_in(key, 1), RotorSpeedTask.averaged - 1)
+    return {
+        "model": model,
+        "scale": np.asarray(bracket.half_width),
+        "unexcited": np.asarray(model.half_width),
+        "draws": jnp.concatenate([np.asarray(bracket.center)[None], others]),
+    }
+
+
 def _standard_envelope(model: AbstractModel, vehicles: Array, duration: float, dt: float) -> Envelope:
     with named("the standard multisine, which sets the envelope"):
         omega = multisine(model.airframe, duration=duration, dt=dt)
@@ -299,24 +318,17 @@ def design_input(
     bracket = Bracket.default(model) if bracket is None else bracket
     vehicles = drawn(bracket, key, RotorSpeedTask.vehicles)
     envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
-    center = np.asarray(bracket.center)[None]
-    others = drawn(bracket, jax.random.fold_in(key, 1), RotorSpeedTask.averaged - 1)
     tones = _tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
     rotor_speeds = RotorSpeedTask(
+        **tones,
+        **_of_bracket(model, bracket, key),
         envelope=envelope,
-        scale=np.asarray(bracket.half_width),
-        unexcited=np.asarray(model.half_width),
-        model=model,
         fleet=vehicles,
-        draws=jnp.concatenate([center, others]),
         weights=as_float(1 / SENSOR_SIGMA[CASCADE_ORDER[: CHANNELS[channels]]]),
         dt=as_float(dt),
         size=tones["amplitudes"].size,
-        names=model.parameter_names,
-        units=model.parameter_units,
         start_is_known=start_is_known,
         criterion=criterion,
-        **tones,
     )
     found = task.solve(rotor_speeds, rotor_speeds.search, compare=compare, key=key, progress=progress)
     if not (found.designed.bounds < rotor_speeds.unexcited).any():

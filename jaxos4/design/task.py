@@ -101,18 +101,26 @@ class AbstractTask(eqx.Module):
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
     - `size`: the number of coefficients.
-    - `names`, `units`: those of the parameters, the targets first. `scale`: for each target, a size of which accuracies
-      are shares. `unexcited`: a parameter whose bound is not below this counts as not excited.
+    - `scale`: for each target, a size of which accuracies are shares. `unexcited`: a parameter whose bound is not below
+      this counts as not excited.
     """
 
     kind: ClassVar[str]
     vehicles: ClassVar[int]
     size: eqx.AbstractVar[int]
     envelope: eqx.AbstractVar[Envelope]
-    names: eqx.AbstractVar[tuple[str, ...]]
-    units: eqx.AbstractVar[tuple[str, ...]]
     scale: eqx.AbstractVar[Float[Numeric, " targets"]]
     unexcited: eqx.AbstractVar[Float[Numeric, " parameters"]]
+
+    @property
+    @abc.abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """The name of each parameter, the targets first."""
+
+    @property
+    @abc.abstractmethod
+    def units(self) -> tuple[str, ...]:
+        """The unit of each of `names`."""
 
     @abc.abstractmethod
     def objective(self, coefficients: Coefficients) -> Scalar:

@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Count, Numeric, Scalar
 from ..analysis.prediction import filtered
 from ..flight import RATES, STATE_NAMES, Flight
+from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
-from ..models.vehicle import FlightModel
 from ..shooting import FASTEST
 from ..shooting.gains import Covariance, LogNoise, first_covariance, next_gains, step_of, transition
 from ..simulation import rk4_step

@@ -14,8 +14,8 @@ from ..errors import InputError, named, printable, shortened
 from ..flight import FORCE_NAMES
 from ..identification.results import Identification
 from ..linalg import covariance_root
+from ..models.flight_model import FlightModel
 from ..models.terms import TERMS
-from ..models.vehicle import FlightModel
 from ..result_file import vehicle_result
 from ..shooting.gains import LogNoise
 

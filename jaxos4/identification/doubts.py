@@ -8,8 +8,8 @@ from ..airframe import Airframe
 from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import decisive_horizon
 from ..models.abstract import Parameter
+from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
-from ..models.vehicle import FlightModel
 from ..recording.checks import Finding
 from .answers import AXES, INVERSE
 from .results import Constant, Disturbance, ParameterEstimate, PredictionSkill, SampleTime

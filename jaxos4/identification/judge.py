@@ -10,7 +10,7 @@ import numpy as np
 from .._custom_types import as_float
 from ..analysis.frequency_response import frequency_response
 from ..analysis.prediction import Predictions
-from ..models.vehicle import FlightModel
+from ..models.flight_model import FlightModel
 from ..recording.motion import OVER_NOISE, WEAK
 from ..results import meaning, result_names
 from ..shooting import with_room

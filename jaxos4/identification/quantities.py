@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..models.vehicle import FlightModel
+from ..models.flight_model import FlightModel
 from ..recording.checks import Finding
 from ..results import NINETY_FIVE
 from .answers import AXES, INVERSE

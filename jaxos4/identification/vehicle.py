@@ -16,8 +16,8 @@ from ..errors import InputError, TrainingError, shortened
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
+from ..models.flight_model import FlightModel
 from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
-from ..models.vehicle import FlightModel
 from ..recording import preparation
 from ..recording.pieces import Recording
 from ..recording.preparation import Prepared

@@ -6,8 +6,8 @@ from .abstract import (
     AbstractModel as AbstractModel,
     Parameter as Parameter,
 )
+from .flight_model import FlightModel as FlightModel
 from .os4 import CorrectedOS4 as CorrectedOS4, PublishedOS4 as PublishedOS4
 from .terms import TERMS as TERMS, Term as Term, default_terms as default_terms
-from .vehicle import FlightModel as FlightModel
 
 MODELS = {"published": PublishedOS4, "corrected": CorrectedOS4}
