@@ -69,9 +69,8 @@ def setting(
             allowed &= np.isfinite(numbers) | (not finite)
             if not np.all(allowed | (np.isnan(numbers) & optional)):
                 limits = ["positive"] * positive + ["finite"] * finite
-                limits += [f"at least {low:g}"] * (low > -np.inf and not positive) + [f"at most {high:g}"] * (
-                    high < np.inf
-                )
+                limits += [f"at least {low:g}"] * (low > -np.inf and not positive)
+                limits += [f"at most {high:g}"] * (high < np.inf)
                 raise ValueError(f"`{name}` must be {' and '.join(limits)}, got {numbers.tolist()}.")
         return jnp.broadcast_to(array, (len(axes),)) if axes else array
 

@@ -11,7 +11,7 @@ from helpers import curvatures, first_state, forcing_of
 
 import jaxos4
 from jaxos4.flight import Inputs, Stretches
-from jaxos4.models.rotors import Batch, Motor, driven
+from jaxos4.models.rotors import Batch, Grid, Motor, driven
 from jaxos4.models.state import CASCADE_ORDER
 
 pytestmark = pytest.mark.slow
@@ -110,8 +110,11 @@ def test_a_motor_is_its_equation():
     def error(finer):
         omega = jnp.asarray(np.repeat(commands, finer, axis=0))
         rows = jnp.arange(omega.shape[0])
-        batch = Batch(jnp.asarray(dt / finer), rows, 0 * rows, 0 * rows + rows.size - 1, jnp.zeros(4))
-        return np.abs(np.asarray(eqx.filter_jit(driven)(omega, motor, batch).begin[::finer, 0]) / 500 - exact).max()
+        grid = Grid(jnp.asarray(dt / finer), 0 * rows, 0 * rows, 0 * rows + rows.size - 1, 0.0 * rows)
+        return np.abs(
+            np.asarray(eqx.filter_jit(driven)(omega, motor, Batch(grid, rows, jnp.zeros(4))).begin[::finer, 0]) / 500
+            - exact
+        ).max()
 
     u = commands[0, 0] / 500
     w, exact = 2 * u / (0.7 + np.sqrt(0.49 + 1.2 * u)), []

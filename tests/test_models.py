@@ -10,7 +10,6 @@ import pytest
 from helpers import (
     OS4,
     REFERENCES,
-    corrected_derivative,
     euler_trajectory,
     forcing_of,
     published_derivative,
@@ -87,9 +86,8 @@ def test_the_whole_standard_flight_agrees(model_class):
 # The tests above can fail: they reject each of these wrong references.
 
 
-def test_each_model_fails_the_reference_of_the_other():
+def test_the_models_differ_in_three_places():
     points = random_points(2000)
-    assert differs(derivatives(jaxos4.PublishedOS4(), *points), corrected_derivative(*points))
     different = np.abs(derivatives(jaxos4.CorrectedOS4(), *points) - published_derivative(*points)).max(axis=0) > 1e-6
     assert set(np.array(jaxos4.STATE_NAMES)[different]) == {"vx", "vy", "p", "q"}
 

@@ -199,7 +199,7 @@ class FlightModel(AbstractModel):
         grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=are_parts)
         before = jnp.zeros_like(inputs.omega[0])
         if inputs.length is None:
-            return self._driven(inputs, grid, grid.batch(jnp.arange(len(inputs.omega)), before), parameters)[0]
+            return self._driven(inputs, grid, Batch(grid, jnp.arange(len(inputs.omega)), before), parameters)[0]
         return self._driven_in_batches(inputs, inputs.length, grid, before, parameters)
 
     def _driven(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
@@ -234,7 +234,7 @@ class FlightModel(AbstractModel):
         def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
             filled, before = carry
             rows = jnp.minimum(i * self.batch + jnp.arange(self.batch), samples - 1)
-            found, before = self._driven(inputs, grid, grid.batch(rows, before), parameters)
+            found, before = self._driven(inputs, grid, Batch(grid, rows, before), parameters)
             place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * self.batch, axis=0)
             return jax.tree.map(place, filled, found), before
 

@@ -46,31 +46,22 @@ class Grid(NamedTuple):
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
         return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts)
 
-    def batch(self, rows: Int[Array, " rows"], before: Float[Array, "4"]) -> "Batch":
-        """Some samples in a row. `before`: see `Batch`."""
-        return Batch(self.dt, rows, self.first[rows], self.last[rows], before, self.are_parts)
-
 
 class Batch(NamedTuple):
-    """Some samples in a row, computed together.
+    """Some samples of a grid in a row, computed together.
 
-    - `dt`: the sample time [s]. `rows`: the numbers of the samples.
-    - `first`, `last`: the first and the last sample of the stretch of each.
+    - `rows`: their numbers.
     - `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
-    - `are_parts`: see `Grid`.
     """
 
-    dt: Scalar
+    grid: Grid
     rows: Int[Array, " rows"]
-    first: Int[Array, " rows"]
-    last: Int[Array, " rows"]
     before: Float[Array, "4"]
-    are_parts: bool = False
 
     @property
     def is_first(self) -> Bool[Array, " rows"]:
         """Whether a sample begins a stretch."""
-        return self.rows == self.first
+        return self.rows == self.grid.first[self.rows]
 
 
 class Speeds(NamedTuple):
@@ -87,12 +78,13 @@ def measured_speeds(omega: Commands, batch: Batch) -> Speeds:
     Means over parts of a sample change between their edges, where cubics through the means of the four parts around an
     edge have their values.
     """
+    first, last = batch.grid.first[batch.rows], batch.grid.last[batch.rows]
 
     def near(offset: int) -> RotorSpeeds:
-        return omega(jnp.clip(batch.rows + offset, batch.first, batch.last))
+        return omega(jnp.clip(batch.rows + offset, first, last))
 
     speed = near(0)
-    if not batch.are_parts:
+    if not batch.grid.are_parts:
         return Speeds(speed, speed, near(1) - speed)
     return Speeds(speed, speed, (8 * (near(1) - near(-1)) - (near(2) - near(-2))) / 12)
 
@@ -202,7 +194,7 @@ def driven(omega: RotorSpeeds, motor: Motor, batch: Batch) -> Speeds:
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
         begin = jnp.where(is_first, settled, speed)
-        end = motor.step(begin, command, batch.dt, 1 if batch.are_parts else 2)
+        end = motor.step(begin, command, batch.grid.dt, 1 if batch.grid.are_parts else 2)
         return end, (begin, end)
 
     begin, end = jax.lax.scan(over_a_sample, batch.before, (omega, motor.settled(omega), batch.is_first))[1]
