@@ -253,16 +253,21 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         omega = command if loop.logged == "commands" else carry.speeds
         return _Carry(later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
 
-    weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())
+    inputs = jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), _draw(loop, key, runs, steps, h)
+    return log(loop, dt, jax.lax.scan(run, _hovering(loop, allocation, runs), inputs)[1], log_key)
+
+
+def _hovering(loop: ClosedLoop, allocation: Array, runs: int) -> _Carry:
+    """Before the first run: level and at rest, with rotors that carry the weight."""
+    airframe, zero = loop.airframe, jnp.zeros(())
+    weight = as_float(airframe.mass * airframe.gravity)
     hover, _ = _speeds(allocation, jnp.zeros(3), weight, airframe.max_rotor_speed)
     velocity = None if loop.air is None else (zero, zero, zero)
     motion = BodyMotion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
-    still = jnp.zeros(9).at[8].set(vehicle.gravity)
-    signals = None if sense is None else Signals(still, still, jnp.zeros(4))
-    commands = jnp.broadcast_to(motor.command(hover), (runs + 1, 4))
-    first = _Carry(motion, hover, jnp.zeros(3), commands, signals)
-    inputs = jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), _draw(loop, key, runs, steps, h)
-    return log(loop, dt, jax.lax.scan(run, first, inputs)[1], log_key)
+    still = jnp.zeros(9).at[8].set(airframe.gravity)
+    signals = None if loop.sensors is None else Signals(still, still, jnp.zeros(4))
+    commands = jnp.broadcast_to(loop.motor.command(hover), (runs + 1, 4))
+    return _Carry(motion, hover, jnp.zeros(3), commands, signals)
 
 
 def _control(

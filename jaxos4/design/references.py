@@ -128,10 +128,14 @@ class ReferenceTask(task.AbstractTask):
     basis: Float[Array, "points coefficients"]
     tones: Tones = eqx.field(static=True)
     samples: int = eqx.field(static=True)
-    size: int = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_references)
+
+    @property
+    def size(self) -> int:
+        """A cosine and a sine for each tone of each reference."""
+        return 8 * self.tones.number
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -244,7 +248,6 @@ def design_references(
         basis=as_float(_parts(tones.turns(_POINTS))),
         tones=tones,
         samples=samples,
-        size=8 * tones.number,
         criterion=criterion,
         **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )

@@ -85,11 +85,15 @@ class RotorSpeedTask(task.AbstractTask):
     draws: Float[Array, "draws parameters"]
     weights: Float[Array, " sensors"]
     dt: Scalar
-    size: int = eqx.field(static=True)
     start_is_known: bool = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_input)
+
+    @property
+    def size(self) -> int:
+        """A coefficient for each tone of each acceleration."""
+        return self.amplitudes.size
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -318,15 +322,13 @@ def design_input(
     bracket = Bracket.default(model) if bracket is None else bracket
     vehicles = drawn(bracket, key, RotorSpeedTask.vehicles)
     envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
-    tones = _tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
     rotor_speeds = RotorSpeedTask(
-        **tones,
+        **_tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth),
         **_of_bracket(model, bracket, key),
         envelope=envelope,
         fleet=vehicles,
         weights=as_float(1 / SENSOR_SIGMA[CASCADE_ORDER[: CHANNELS[channels]]]),
         dt=as_float(dt),
-        size=tones["amplitudes"].size,
         start_is_known=start_is_known,
         criterion=criterion,
     )

@@ -100,17 +100,20 @@ class AbstractTask(eqx.Module):
     """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
-    - `size`: the number of coefficients.
     - `scale`: for each target, a size of which accuracies are shares. `unexcited`: a parameter whose bound is not below
       this counts as not excited.
     """
 
     kind: ClassVar[str]
     vehicles: ClassVar[int]
-    size: eqx.AbstractVar[int]
     envelope: eqx.AbstractVar[Envelope]
     scale: eqx.AbstractVar[Float[Numeric, " targets"]]
     unexcited: eqx.AbstractVar[Float[Numeric, " parameters"]]
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """The number of coefficients."""
 
     @property
     @abc.abstractmethod

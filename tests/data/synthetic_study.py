@@ -31,6 +31,16 @@ ESTIMATORS = {
     "kalman": (1.3, 0.2, 24, False),
 }
 GAUSSIAN = np.array([0.67449, 1.64485, 1.95996, 2.57583])  # for LEVELS
+PROVENANCE = {
+    "title": "A synthetic study",
+    "specification": 'title = "A synthetic study"\nscales = [0.1, 1.0, 10.0]\n',
+    "version": "0.1.0",
+    "precision": "float64",
+    "device": "cpu",
+    "jax": "0.9.0",
+    "seed": 0,
+    "command": "jaxos4 study synthetic.toml --out synthetic",
+}
 
 
 def synthetic_study(
@@ -47,10 +57,49 @@ def synthetic_study(
     `spoiled`: some flights have other results, one cell failed, and one was not run. `drawn`: each flight has its own
     truth, drawn over 60 % of the bracket.
     """
-    rng = np.random.default_rng(0)
     values = (models, ["os4"], ["multisine"], [5.0], ["euler"], ["white"], scales, [1.0], ["all"], estimators)
     coordinates = {name: list(some) for name, some in zip(SCENARIO, values, strict=True)}
-    shape = tuple(map(len, values))
+    seen = np.array([["rates" if ESTIMATORS[name][3] else "all" for name in estimators]])
+    found, failures = answers(flights, coordinates, seen, drawn), []
+    if spoiled:
+        spoil(found, flights, len(scales) - 1, len(estimators) - 1)
+        message = "FloatingPointError: <b>the filter's covariance</b> is not positive definite"
+        failures.append({"cell": 7, **{name: some[-1] for name, some in coordinates.items()}, "message": message})
+    center = np.broadcast_to(TRUTH + 0.2 * HALF_WIDTH * (not drawn), (len(models), 1, 1, 8))
+    per_flight, wide = (*SCENARIO, "flight"), ("model", "airframe", "width", "parameter")
+    of_parameters = {name: (*per_flight, "parameter") for name in ("estimate", "std", "bound")}
+    of_flights = {name: per_flight for name in ("result", "rollouts", "cost", "hit")}
+    dimensions = {"truth": (*SCENARIO[:-1], "flight", "parameter"), "half_width": (*per_flight, "parameter", "level")}
+    dimensions |= of_parameters | of_flights
+    dataset = xr.Dataset(
+        {
+            **{name: (dimensions[name], array) for name, array in found.items()},
+            "center": (wide, center),
+            "bracket_half_width": (wide, np.broadcast_to(HALF_WIDTH, center.shape)),
+            "seen": (("channels", "estimator"), seen),
+        },
+        coords={
+            **coordinates,
+            "flight": np.arange(flights),
+            "parameter": list(MODEL.parameter_names),
+            "unit": ("parameter", list(UNITS)),
+            "level": list(LEVELS),
+        },
+        attrs=PROVENANCE | {"failures": json.dumps(failures)},
+    )
+    for name in dataset.variables:
+        dataset[name].attrs = {"long_name": str(name).replace("_", " "), "units": "1"}
+    for name in ("truth", "center", "bracket_half_width", "estimate", "std", "half_width", "bound"):
+        dataset[name].attrs["units"] = "unit"
+    flags = {"flag_values": np.arange(len(RESULTS), dtype=np.int8), "flag_meanings": " ".join(RESULTS)}
+    dataset["result"].attrs |= flags
+    return dataset
+
+
+def answers(flights, coordinates, seen, drawn):
+    """Arrays of the answers of estimators whose errors are Gaussian, by name."""
+    rng, shape = np.random.default_rng(0), tuple(map(len, coordinates.values()))
+    estimators, scales = coordinates["estimator"], coordinates["scale"]
     truth = np.broadcast_to(TRUTH, (*shape[:-1], flights, 8)).copy()
     if drawn:
         truth += 0.6 * HALF_WIDTH * rng.uniform(-1, 1, truth.shape)
@@ -60,8 +109,6 @@ def synthetic_study(
     rollouts = np.zeros((*shape, flights), dtype=np.int32)
     cost = np.full((*shape, flights), np.nan)
     hit = np.full((*shape, flights), -1, dtype=np.int8)
-    failures = []
-    seen = np.array([["rates" if ESTIMATORS[name][3] else "all" for name in estimators]])
     for index in np.ndindex(shape):
         spread, bias, shots, _ = ESTIMATORS[estimators[index[-1]]]
         sigma = scales[index[6]] * BOUND[seen[index[8], index[9]]]
@@ -73,68 +120,28 @@ def synthetic_study(
         cost[index] = 0.5 * rng.chisquare(500, flights)
         if estimators[index[-1]] == "hybrid":
             hit[index] = rng.random(flights) < 0.97
+    return {
+        **{"truth": truth, "estimate": estimate, "std": std, "half_width": half_width, "bound": bound},
+        **{"result": result, "rollouts": rollouts, "cost": cost, "hit": hit},
+    }
 
-    def spoil(scale, estimator, names):
-        """Flights of a cell end without an estimate."""
+
+def spoil(found, flights, worst, last):
+    """Some flights end without an estimate. `worst`: the place of the largest noise; `last`: of the last estimator."""
+
+    def without(scale, estimator, names):
         cell = (*[0] * 6, scale, 0, 0, estimator)
         for flight, name in names.items():
-            result[cell][flight] = RESULTS.index(name)
-            for numbers in (estimate, std, half_width):
-                numbers[cell][flight] = np.nan
+            found["result"][cell][flight] = RESULTS.index(name)
+            for numbers in ("estimate", "std", "half_width"):
+                found[numbers][cell][flight] = np.nan
         return cell
 
-    if spoiled:
-        worst, last = len(scales) - 1, len(estimators) - 1
-        spoil(0, 0, {1: "at_bound", 3: "nonfinite_trajectory"})
-        spoil(worst, 0, {2: "max_sweeps"})
-        result[(*[0] * 6, worst, 0, 0, 1)][5:8] = RESULTS.index("unidentifiable")
-        for scale, name in ((worst, "failed"), (0, "not_run")):
-            cell = spoil(scale, last, dict.fromkeys(range(flights), name))
-            rollouts[cell], cost[cell] = 0, np.nan
-            bound[cell] = np.nan if name == "not_run" else bound[cell]
-        message = "FloatingPointError: <b>the filter's covariance</b> is not positive definite"
-        failures.append({"cell": 7, **{name: some[-1] for name, some in coordinates.items()}, "message": message})
-    per_flight, per_parameter = (*SCENARIO, "flight"), (*SCENARIO, "flight", "parameter")
-    wide = ("model", "airframe", "width", "parameter")
-    center = np.broadcast_to(TRUTH + 0.2 * HALF_WIDTH * (not drawn), (len(models), 1, 1, 8))
-    dataset = xr.Dataset(
-        {
-            "truth": ((*SCENARIO[:-1], "flight", "parameter"), truth),
-            "center": (wide, center),
-            "bracket_half_width": (wide, np.broadcast_to(HALF_WIDTH, center.shape)),
-            "estimate": (per_parameter, estimate),
-            "std": (per_parameter, std),
-            "half_width": ((*per_parameter, "level"), half_width),
-            "bound": (per_parameter, bound),
-            "result": (per_flight, result),
-            "rollouts": (per_flight, rollouts),
-            "cost": (per_flight, cost),
-            "hit": (per_flight, hit),
-            "seen": (("channels", "estimator"), seen),
-        },
-        coords={
-            **coordinates,
-            "flight": np.arange(flights),
-            "parameter": list(MODEL.parameter_names),
-            "unit": ("parameter", list(UNITS)),
-            "level": list(LEVELS),
-        },
-        attrs={
-            "title": "A synthetic study",
-            "specification": 'title = "A synthetic study"\nscales = [0.1, 1.0, 10.0]\n',
-            "version": "0.1.0",
-            "precision": "float64",
-            "device": "cpu",
-            "jax": "0.9.0",
-            "seed": 0,
-            "command": "jaxos4 study synthetic.toml --out synthetic",
-            "failures": json.dumps(failures),
-        },
-    )
-    for name in dataset.variables:
-        dataset[name].attrs = {"long_name": str(name).replace("_", " "), "units": "1"}
-    for name in ("truth", "center", "bracket_half_width", "estimate", "std", "half_width", "bound"):
-        dataset[name].attrs["units"] = "unit"
-    flags = {"flag_values": np.arange(len(RESULTS), dtype=np.int8), "flag_meanings": " ".join(RESULTS)}
-    dataset["result"].attrs |= flags
-    return dataset
+    without(0, 0, {1: "at_bound", 3: "nonfinite_trajectory"})
+    without(worst, 0, {2: "max_sweeps"})
+    found["result"][(*[0] * 6, worst, 0, 0, 1)][5:8] = RESULTS.index("unidentifiable")
+    for scale, name in ((worst, "failed"), (0, "not_run")):
+        cell = without(scale, last, dict.fromkeys(range(flights), name))
+        found["rollouts"][cell], found["cost"][cell] = 0, np.nan
+        if name == "not_run":
+            found["bound"][cell] = np.nan
