@@ -97,7 +97,7 @@ def chirp(
     if span * sum(ends) / 2 < 1:
         least = len(AXES) * (2 / sum(ends) + 2 * dt)
         raise ValueError(f"`duration` must be at least {least:.3g} s for one cycle on each axis, got {duration:g} s.")
-    sine, frequency = _sweep(samples, span, ends)
+    sine, frequency = sweep(samples, span, ends)
     angle = np.pad(sine / (2 * math.pi * frequency), 1)
     rate = np.diff(angle) / dt
     shape = np.diff(rate) / dt / np.abs(rate).max()
@@ -124,7 +124,7 @@ def _pulses(airframe, heights, width, duration, dt, amplitude) -> RotorSpeeds:
 def _about_axes(airframe, shape: np.ndarray, intervals: int, amplitude, dt: float) -> RotorSpeeds:
     """`shape` (unit peak rate) about each axis in turn, repeated while a complete sequence fits."""
     slots = intervals // (len(AXES) * len(shape)) * [0, 1, 2]
-    return _rotor_speeds(airframe, _peak_rates(amplitude) * _in_turn([shape], intervals + 1, 3, slots), dt)
+    return _rotor_speeds(airframe, _peak_rates(amplitude) * in_turn([shape], intervals + 1, 3, slots), dt)
 
 
 def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> RotorSpeeds:
@@ -171,34 +171,7 @@ def _check_frequencies(name: str, frequencies: Sequence[float], dt: float) -> No
         raise ValueError(f"`{name}`: frequencies must lie between 0 and half the sample rate, {most:g} Hz, got {got}.")
 
 
-def standard_references(
-    samples: int, dt: float, largest: Float[np.ndarray, "4"]
-) -> dict[str, Float[np.ndarray, "samples 4"]]:
-    """Multisine, doublet, 3-2-1-1 and chirp as references for a controller.
-
-    References are as `fly_closed_loop` takes them. A multisine excites them at once, the others in turn. Pulses last
-    0.3 s, about 0.3 periods of the controlled vehicle's attitude, and all are of one height.
-
-    - `largest`: the largest value of each. References are 0 if a shape does not fit into the time.
-    """
-    time = dt * np.arange(samples)[:, None]
-    vertical = 0.4, 0.8, 1.2  # [Hz]
-    sines = [np.sin(2 * math.pi * time * np.asarray(some)).sum(axis=1) for some in (*STANDARD_TONES, vertical)]
-    swept, _ = _sweep(max(samples // 4, 1), samples // 4 * dt, (0.2, 3.0))
-    heights = {"doublet": [1, -1, 0], "3211": [1, 1, 1, -1, -1, 1, -1, 0]}
-    pulses = {name: np.repeat(np.array(each, float), max(round(0.3 / dt), 1)) for name, each in heights.items()}
-    shapes = {"multisine": np.stack(sines, axis=1)}
-    for name, parts in ({name: (once, -once) for name, once in pulses.items()} | {"chirp": (swept,)}).items():
-        shapes[name] = _in_turn(parts, samples, 4, [slot % 4 for slot in range(samples // len(parts[0]))])
-    return {name: with_largest(shape, largest) for name, shape in shapes.items()}
-
-
-def with_largest(shape: np.ndarray, largest: Float[np.ndarray, "4"]) -> Float[np.ndarray, "samples 4"]:
-    """References with these largest values."""
-    return largest * shape / np.maximum(np.abs(shape).max(axis=0), 1e-9)
-
-
-def _in_turn(shapes: Sequence[np.ndarray], samples: int, columns: int, slots: Sequence[int]) -> np.ndarray:
+def in_turn(shapes: Sequence[np.ndarray], samples: int, columns: int, slots: Sequence[int]) -> np.ndarray:
     """One column after another in the order of `slots`; the next of `shapes` follows after all columns."""
     found, length = np.zeros((samples, columns)), len(shapes[0])
     for slot, column in enumerate(slots):
@@ -206,7 +179,7 @@ def _in_turn(shapes: Sequence[np.ndarray], samples: int, columns: int, slots: Se
     return found
 
 
-def _sweep(samples: int, span: float, frequencies: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def sweep(samples: int, span: float, frequencies: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """A sine whose frequency rises linearly in `span` seconds; and the frequency at each sample.
 
     It is faded in and out over a fifth of the time each.

@@ -1,14 +1,12 @@
-"""A flight in closed loop: references, the true vehicle, its controller, and what its sensors log."""
+"""A flight in closed loop: the true vehicle, its controller, and what its sensors log."""
 
-import functools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float, integer, setting
 from ..airframe import alpha_scalars
@@ -19,49 +17,9 @@ from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
+from .references import References, random_references
 from .sensors import BodyMotion, Sense, Signals, log
 from .settings import ClosedLoop, PerAxis
-
-References = Float[Array, "samples 4"]
-
-
-def random_references(
-    *, duration: float = 20.0, dt: float = 0.004, amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5), key: Key
-) -> References:
-    """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
-
-    Each steps every half second, one after another. Accelerations come in pairs of opposite sign. So the vehicle gains
-    little vertical velocity, as in a real flight.
-
-    **Arguments:**
-
-    - `duration`, `dt`: length and sample time [s].
-    - `amplitude`: levels are uniform between -amplitude and amplitude: roll, pitch, yaw [rad], acceleration [m/s^2].
-
-    **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
-
-    **Raises:** `ValueError` that names the argument.
-    """
-    setting("duration", positive=True)(duration)
-    setting("dt", positive=True)(dt)
-    if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
-        raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
-    time = dt * np.arange(round(duration / dt) + 1)
-    steps = (time[:, None] / 0.5 + np.arange(4) / 4).astype(int)
-    flown = (time >= 1) & (time <= duration - 1)
-    return _levels(key, steps, int(steps[-1, -1]) + 1, flown[:, None] * np.asarray(amplitude, dtype=float))
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _levels(key: Key, steps: Int[Array, "samples 4"], count: int, amplitude: References) -> References:
-    """The level of each reference in each of its steps, of which there are at most `count`.
-
-    Every second acceleration is the one before it with the opposite sign.
-    """
-    levels = jax.random.uniform(key, (count, 4), minval=-1, maxval=1)
-    step = np.arange(count)
-    levels = levels.at[:, 3].set(levels[step - step % 2, 3] * (1 - 2 * (step % 2)))
-    return amplitude * jnp.take_along_axis(levels, steps, axis=0)
 
 
 def fly_closed_loop(

@@ -12,9 +12,8 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float
 from ..bracket import Bracket
-from ..closed_loop import ClosedLoop
+from ..closed_loop import ClosedLoop, standard_references, with_largest
 from ..errors import InputError
-from ..excitation import standard_references, with_largest
 from ..flight import ANGLES, RATES
 from . import task
 from .envelope import Envelope, Uses
