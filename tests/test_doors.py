@@ -13,15 +13,15 @@ import sys
 import tokenize
 import xml.etree.ElementTree as ElementTree
 
-import blackbox_logs as blackbox
 import numpy as np
 import pytest
 import small_study
+import strange
 import xarray as xr
 from helpers import refused
 from hypothesis import given, settings, strategies as st
-from pages import STRANGE, in_one_line, nodes
-from recorded_logs import ACCIDENTS, blackbox_csv, damaged, table_csv
+from recorded_logs import ACCIDENTS, damaged, table_csv
+from strange import in_one_line, nodes
 from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
 
@@ -106,7 +106,7 @@ def test_a_damaged_file_ends_in_one_line(name, tmp_path):
             if places := list(nodes(tree)):
                 holder, key = places[data.draw(st.integers(0, len(places) - 1))]
                 if data.draw(st.booleans()) or isinstance(holder, list):
-                    holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(STRANGE))))
+                    holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(strange.VALUES))))
                 else:
                     del holder[key]
         path.write_text(json.dumps(tree), encoding="utf-8")
@@ -205,14 +205,6 @@ def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, ca
     with pytest.raises(InputError, match="no |more than it holds"):
         read_results(tmp_path)
     assert capfd.readouterr() == ("", "")
-
-
-def test_blank_lines_above_the_header_of_a_blackbox_csv_are_skipped(save):
-    text = blackbox_csv(blackbox.recorded(blackbox.T), settings={"acc_1G": "2048"})
-    plain, spaced = (read_recording(save(each), full_scale=1.0) for each in (text, f"\n\n{text}"))
-    np.testing.assert_array_equal(plain.states, spaced.states)
-    doubled = text.replace("\n", "\n\n")
-    assert not in_one_line(lambda path: read_recording(path, full_scale=1.0), save(doubled))
 
 
 # Texts in exported files and drafts

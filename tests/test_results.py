@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
+import strange
 from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
 from matplotlib.figure import Figure
-from pages import STRANGE, in_one_line, nodes, stands_alone, words
+from pages import stands_alone, words
 from rich.console import Console
+from strange import in_one_line, nodes
 from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
 
 import jaxos4
@@ -320,7 +322,7 @@ def test_a_damaged_result_ends_in_one_line(tmp_path):
         for _ in range(data.draw(st.integers(1, 3))):
             places = list(nodes(tree))
             holder, key = places[data.draw(st.integers(0, len(places) - 1))]
-            holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(STRANGE))))
+            holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(strange.VALUES))))
         path.write_text(json.dumps(tree), encoding="utf-8")
         in_one_line(shown, path)
 
