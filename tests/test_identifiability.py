@@ -5,11 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, measured, noisy_states, numpy_jacobian, standard_flight, standard_problem
+from helpers import DT, measured, noisy_states, standard_flight, standard_problem
 from lanes import LANES, identify, lanes
 
 import jaxos4
-from jaxos4.shooting import ROUNDING
 
 MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
 
@@ -86,18 +85,13 @@ def test_the_published_gyroscopic_parameters_lie_below_the_noise_and_the_figure_
 
 
 @pytest.mark.parametrize("model_class", MODELS)
-def test_the_scaled_informations_inverse_is_the_bound(model_class):
+def test_directions_are_those_of_the_information_in_half_widths(model_class):
     problem = standard_problem(model_class, "all", free=True)
-    found = analysed(problem)
-    rebuilt = (found.directions / found.eigenvalues) @ found.directions.T
-    bound = jaxos4.cramer_rao_bound(problem, problem.model.alpha)
-    # In standard deviations: a covariance near 0 is a difference of large numbers.
-    unit = np.sqrt(np.diagonal(bound))
-    scale = found.half_width / unit
-    # Two programs sum the information, each with rounding errors, which grow by its condition number.
-    slopes = numpy_jacobian(problem, problem.model.alpha, np.zeros(problem.size))
-    rounding = 4 * ROUNDING * np.finfo(float).eps * np.linalg.cond(slopes / np.linalg.norm(slopes, axis=0)) ** 2
-    np.testing.assert_allclose(rebuilt * np.outer(scale, scale), bound / np.outer(unit, unit), rtol=0, atol=rounding)
+    found, flown = analysed(problem), jaxos4.evaluate(problem, problem.model.alpha)
+    scaled = flown.fisher_information * np.outer(found.half_width, found.half_width)
+    rebuilt = (found.directions * found.eigenvalues) @ found.directions.T
+    np.testing.assert_allclose(rebuilt, scaled, atol=1e-12 * np.abs(scaled).max())
+    np.testing.assert_allclose(found.std, np.sqrt(np.diagonal(flown.covariance)), rtol=1e-9)
     assert np.all(found.std_alone <= found.std * (1 + 1e-9))
 
 
@@ -155,7 +149,9 @@ def test_nothing_is_identifiable_without_measurements_a_trajectory_or_a_bracket(
     alpha, runaway = problem.model.alpha, problem.model.alpha.at[2].set(1e9)
     blank = eqx.tree_at(lambda p: p.flight.states, problem, jnp.full((501, 12), jnp.nan))
     for broken, at in ((blank, alpha), (problem, runaway)):
-        assert np.isposinf(jaxos4.robust_covariance(jaxos4.evaluate(broken, at))).all()
+        evaluation = jaxos4.evaluate(broken, at)
+        assert np.isposinf(jaxos4.robust_covariance(evaluation)).all()
+        assert (evaluation.feasible, evaluation.cost) in ((True, 0.0), (False, np.inf))
     for where, at in ((bracket, runaway), (jaxos4.Bracket(bracket.upper, bracket.lower), alpha)):
         found = jaxos4.identifiability(jaxos4.evaluate(problem, at), where)
         assert np.isposinf(found.std).all()

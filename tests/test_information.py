@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.stats
-from helpers import numpy_jacobian, standard_problem
+from helpers import first_state, numpy_jacobian, numpy_residuals, standard_problem
 
 import jaxos4
 from jaxos4 import linalg
@@ -33,23 +33,30 @@ def test_the_standard_flights_bounds_are_the_known_figures(channels):
     assert rounded == list(PRINTED[channels])
 
 
+PUBLISHED, CORRECTED = MODELS = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
+
+
+@pytest.mark.parametrize("free", [False, True, 5])
 @pytest.mark.parametrize(
-    ("model_class", "channels"),
-    [(jaxos4.PublishedOS4, "attitude"), (jaxos4.CorrectedOS4, "rates"), (jaxos4.CorrectedOS4, "all")],
+    ("model_class", "channels"), [(PUBLISHED, "attitude"), (CORRECTED, "rates"), (CORRECTED, "all")]
 )
-def test_information_is_the_jacobians_square(model_class, channels):
-    """A free initial state is eliminated: the bound is a corner of the inverse of the joint information."""
-    alpha = model_class().alpha
-    for free in (False, True):
-        problem = standard_problem(model_class, channels, free=free)
-        slopes = numpy_jacobian(problem, alpha, np.zeros(problem.size))  # from rest
-        joint = slopes.T @ slopes
-        information = np.linalg.inv(np.linalg.inv(joint)[:8, :8]) if free else joint[:8, :8]
-        scale = np.sqrt(np.diagonal(information))
-        actual = jaxos4.evaluate(problem, alpha).fisher_information
-        np.testing.assert_allclose(actual / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-6)
-        bound = jaxos4.cramer_rao_bound(problem, alpha)
+def test_information_is_the_jacobians_square(model_class, channels, free):
+    """A free initial state is eliminated, in each of 5 windows too: the bound is a corner of the inverse."""
+    alpha, problem = model_class().alpha, standard_problem(model_class, channels, free=bool(free))
+    if free == 5:
+        given = {"sigma": problem.sigma, "channels": channels, "windows": 5}
+        problem = jaxos4.ShootingProblem(problem.model, problem.flight, **given)
+    starts, moved = np.asarray(first_state(problem)), alpha * 1.001
+    slopes = numpy_jacobian(problem, alpha, starts)
+    joint = slopes.T @ slopes
+    information = np.linalg.inv(np.linalg.inv(joint)[:8, :8]) if free else joint[:8, :8]
+    unit = np.outer(*[np.sqrt(np.diagonal(information))] * 2)
+    found = jaxos4.evaluate(problem, alpha)
+    np.testing.assert_allclose(found.fisher_information / unit, information / unit, atol=1e-6)
+    for bound in (jaxos4.cramer_rao_bound(problem, alpha), found.covariance):
         np.testing.assert_allclose(np.diagonal(bound), np.diagonal(np.linalg.inv(information)), rtol=1e-4)
+    residuals = numpy_residuals(problem, np.asarray(moved), starts)
+    np.testing.assert_allclose(jaxos4.evaluate(problem, moved).cost, np.square(residuals).sum() / 2, rtol=1e-9)
 
 
 # The inverse.
@@ -107,9 +114,6 @@ def test_block_elimination_is_the_inverse_of_the_whole(windows):
         np.testing.assert_allclose(found[w] / own, inverse[np.ix_(places, places)] / own, atol=1e-9)
     identity = np.broadcast_to(np.eye(11), basis.shape)
     np.testing.assert_allclose(np.swapaxes(basis, 1, 2) @ factor, identity, atol=1e-9)
-
-
-MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
 
 
 def constants(airframe=jaxos4.OS4):
