@@ -192,15 +192,16 @@ def test_paths_that_are_no_readable_file_and_too_many_rows(tmp_path, save, monke
 @pytest.mark.parametrize(
     ("row", "cell", "words"), [(3, "", ""), (6, " 1", ""), (7, "x", "row 7, column q"), (5, "1e999", "row 5")]
 )
-def test_plain_lines_are_read_in_blocks_up_to_the_first_that_is_not(row, cell, words, save, monkeypatch):
+def test_plain_lines_are_read_together_up_to_the_first_that_is_not(row, cell, words, save):
     """The numbers and the refusals are those of a file that is read row by row."""
     path, found = save(edited(row, "q", cell)), []
     for lines in (1, 2, 100):
-        monkeypatch.setattr(csv_module, "_BLOCK", lines)
         if words:
-            assert words in refusal(path)
+            with pytest.raises(InputError, match=words):
+                csv_module.read_table(path, csv_module.COLUMN_NAMES, lines_at_once=lines)
         else:
-            found.append(np.stack([*csv_module.read_table(path, csv_module.COLUMN_NAMES).columns.values()]))
+            table = csv_module.read_table(path, csv_module.COLUMN_NAMES, lines_at_once=lines)
+            found.append(np.stack([*table.columns.values()]))
     assert all(np.array_equal(each, found[0], equal_nan=True) for each in found)
 
 

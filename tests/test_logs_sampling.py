@@ -8,8 +8,8 @@ from test_flight_csv import csv, read_flight_and_notes
 from test_logs_ulog import grid
 
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs import Table
-from jaxos4.logs.sampling import PARTS, Series, gyro_rows, logged_rate, resample, root_mean_square, speeds_within
+from jaxos4.logs.messages import Messages
+from jaxos4.logs.sampling import PARTS, Series, logged_rate, resample, root_mean_square, speeds_within
 
 # Uneven times
 
@@ -95,7 +95,8 @@ def test_a_gyro_beyond_a_kilohertz_is_averaged_to_one():
     t = grid(0.00025, 2.0)
     noise = np.random.default_rng(0).normal(0, 0.1, (t.size, 3))
     motor = Series(grid(0.01, 2.2, offset=-0.1), np.full((220, 4), 0.5))
-    rows, table = gyro_rows(Table("", {}), Series(t, rates(t) + noise), motor, measured=False, others={})
+    log = Messages("", {}, "", {}, {"p": "gyro", "command1": "motors"}, [])
+    rows, table = log.table(Series(t, rates(t) + noise), motor, {})
     assert np.median(np.diff(rows)) == pytest.approx(0.001)
     off = np.column_stack([table.columns[name] for name in "pqr"]) - rates(rows)
     assert np.std(off) == pytest.approx(0.1 / 2, rel=0.15)  # of four samples each

@@ -6,10 +6,8 @@ import numpy as np
 
 from ...flight import FORCE_NAMES, RATES
 from ...logs.table import counted
-from .evidence import Evidence
-from .finding import INERTIAS, Finding
+from .evidence import INERTIAS, Evidence, Finding
 
-_UNIFORM = 0.05  # of the step; resampled logs are far below
 _UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
 # Clipped thrust seems weaker, and moments of inertia are proportional to it.
 _QUANTITIES = {"p": ("Ix",), "q": ("Iy",), "r": ("Iz",), "az": ("thrust", *INERTIAS)}
@@ -19,7 +17,7 @@ def uneven_time(evidence: Evidence) -> Finding | None:
     """Samples that are not on a uniform grid, which a `Flight` from Python may have."""
     steps = np.diff(evidence.logged.time)
     step = float(np.median(steps))
-    uneven = np.abs(steps - step) > _UNIFORM * step
+    uneven = np.abs(steps - step) > 0.05 * step  # resampled logs are far below
     if not uneven.any():
         return None
     missing = 1 - (steps.size + 1) / (np.sum(steps) / step + 1)
@@ -85,12 +83,12 @@ def rare_motors(evidence: Evidence) -> Finding | None:
 
 def short_flight(evidence: Evidence) -> Finding | None:
     """Few independent motions of roll and pitch."""
-    every = [(piece.states[:, RATES[:2]], piece.dt, float(np.ptp(piece.time))) for piece in evidence.pieces]
-    every = [part for part in every if np.isfinite(part[0]).any(axis=0).all()]
-    if not every:
+    measured = [each for each in evidence.stretches if np.isfinite(each.states[:, RATES[:2]]).any(axis=0).all()]
+    if not measured:
         return None
-    rates, dt, _ = max(every, key=lambda part: part[2])
-    seconds, lasting = sum(part[2] for part in every), float(np.mean([dt * _correlated(column) for column in rates.T]))
+    lengths = [float(np.ptp(each.time)) for each in measured]
+    longest, seconds = measured[int(np.argmax(lengths))], sum(lengths)
+    lasting = float(np.mean([longest.dt * _correlated(column) for column in longest.states[:, RATES[:2]].T]))
     motions = seconds / (2 * lasting) if lasting > 0 else math.inf  # nothing moves
     if motions >= evidence.limits.motions:
         return None
@@ -98,7 +96,7 @@ def short_flight(evidence: Evidence) -> Finding | None:
         "short_flight",
         "the flight is short, so that intervals may be too narrow",
         f"{seconds:.1f} s, or {motions:.0f} independent motions of {2 * lasting:.2g} s",
-        f"fly for {_round_up(2 * evidence.limits.motions * 2 * lasting)} s or longer",
+        f"fly for {5 * math.ceil(2 * evidence.limits.motions * 2 * lasting / 5)} s or longer",
         INERTIAS,
         False,
     )
@@ -111,7 +109,3 @@ def _correlated(values: np.ndarray) -> float:
     products = np.fft.irfft(power)[: values.size]
     until = int(np.argmax(products < 0)) or values.size
     return float(products[:until].sum() / max(products[0], 1e-300))
-
-
-def _round_up(seconds: float) -> int:
-    return 5 * math.ceil(seconds / 5)
