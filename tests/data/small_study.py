@@ -63,7 +63,7 @@ def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
 
 def environment(devices: int = 1) -> dict[str, str]:
     """The environment of another process: its number of devices, and how it compiles."""
-    path = os.pathsep.join([str(pathlib.Path(__file__).resolve().parents[1]), *sys.path[1:]])
+    path = os.pathsep.join([str(pathlib.Path(__file__).resolve().parents[2]), *sys.path[1:]])
     ours = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
     return os.environ | how_we_compile() | ours
 

@@ -274,7 +274,7 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
 
 def documented_class(page: str) -> str:
     """The class that a page of `docs/extend` shows, as a file of its own has it."""
-    text = (pathlib.Path(__file__).parents[1] / "docs" / "extend" / page).read_text(encoding="utf-8")
+    text = (pathlib.Path(__file__).parents[2] / "docs" / "extend" / page).read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?class .*?)```", text, flags=re.DOTALL)
     return code.replace("from ..", "from jaxos4.")
 
