@@ -11,9 +11,9 @@ import sys
 import numpy as np
 import pytest
 import typer
+from crazyflie_logs import one_event
 from helpers import CRAZYFLIE_TOML, refused
 from synthetic_results import vehicle_result
-from test_logs_crazyflie import one_event
 
 import jaxos4
 from jaxos4.cli import _app, main

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_loop_flights import ANGLES, DT, LEVEL, QUIET, RATES, SUCCESS, VELOCITY, references
 from helpers import CRAZYFLIE, CRAZYFLIE_TOML, FULL_SPEED
 from scipy.spatial.transform import Rotation
 
@@ -17,22 +18,13 @@ from jaxos4.noise import coloured
 
 pytestmark = pytest.mark.slow
 
-DT, SAMPLES = 0.004, 4001
-RATES, ANGLES, VELOCITY = [7, 9, 11], [6, 8, 10], [1, 3, 5]
-SUCCESS = jaxos4.RESULTS.successful
-QUIET = {"gyro_noise": 0.0, "attitude_noise": 0.0, "force_noise": 0.0}
 NO_GAINS = {"attitude_gain": 0.0, "rate_gain": 0.0, "integral_gain": 0.0}
 VEHICLES = {"crazyflie": CRAZYFLIE, "os4": jaxos4.OS4}
 every_vehicle = pytest.mark.parametrize("airframe", VEHICLES.values(), ids=VEHICLES)
-LEVEL = np.zeros((SAMPLES, 4))
 
 
 def loop_of(airframe=CRAZYFLIE, **settings):
     return jaxos4.ClosedLoop(airframe, **{**QUIET, **settings})
-
-
-def references(seed=0):
-    return jaxos4.random_references(duration=DT * (SAMPLES - 1), dt=DT, key=jax.random.key(seed))
 
 
 def fly(loop, wanted=LEVEL, *, seed=1):

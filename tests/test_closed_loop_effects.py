@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_loop_flights import ANGLES, DT, LEVEL, QUIET, RATES, SAMPLES, SUCCESS, VELOCITY, references
 from helpers import CRAZYFLIE
 from scipy.signal import lsim
 from scipy.spatial.transform import Rotation
-from test_closed_loop import ANGLES, DT, LEVEL, QUIET, RATES, SAMPLES, SUCCESS, VELOCITY, references
 
 import jaxos4
 

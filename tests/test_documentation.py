@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, documented_class, how_we_compile, standard_flight, standard_problem
+from helpers import CRAZYFLIE, documented_class, how_we_compile, standard_flight, standard_problem, start
 from jaxtyping import Array, Float, TypeCheckError, jaxtyped
-from test_startup import start
 from typechecker import check
 from typer.main import get_command
 

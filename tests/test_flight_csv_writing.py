@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flight_csvs import csv, read_flight_and_notes
 from helpers import same
 from hypothesis import example, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
-from test_flight_csv import csv, read_flight_and_notes
 
 from jaxos4._files import write_atomically, write_file
 from jaxos4.airframe import OS4

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from flight_model_reference import FULL, VALUES, VOLTS, battery, commands, truth
 from helpers import curvatures, first_state, forcing_of
-from test_flight_model import FULL, VALUES, VOLTS, battery, commands, truth
 
 import jaxos4
 from jaxos4.flight import Inputs, Stretches

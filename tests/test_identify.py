@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import refused
-from test_logs_ulog import everything
+from px4_logs import everything
 
 import jaxos4
 from jaxos4.cli._output import in_options

@@ -6,13 +6,13 @@ import equinox as eqx
 import numpy as np
 import pytest
 import tomlkit
+from blackbox_logs import T as BLACKBOX_TIME, recorded
+from crazyflie_logs import one_event
 from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
+from px4_logs import everything
 from recorded_logs import VEHICLE, blackbox_csv
-from test_logs_blackbox import T as BLACKBOX_TIME, recorded
-from test_logs_crazyflie import one_event
-from test_logs_ulog import everything
-from test_signs import flown, turned
+from sign_flights import flown, turned
 
 import jaxos4
 from jaxos4.logs import LogFacts

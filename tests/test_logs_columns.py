@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from column_logs import T, neurobem_csv, quaternions
 from helpers import CRAZYFLIE, CRAZYFLIE_TOML
-from recorded_logs import FRD, GRAVITY, RPM, attitude, check, force, position, rates, speeds, table_csv, velocity
-from scipy.spatial.transform import Rotation
+from recorded_logs import FRD, GRAVITY, RPM, check, force, position, rates, speeds, table_csv, velocity
 from synthetic_results import held, provenance, vehicle_result
 
 import jaxos4
@@ -15,15 +15,8 @@ from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log, read_recording
 from jaxos4.logs.columns import column_map
 
-T = 0.004 * np.arange(750)
 SPEEDS = tuple(f"omega{i}" for i in range(1, 5))
 STATES = ("p", "q", "r", "phi", "theta", "psi", "x", "y", "z", "vx", "vy", "vz")
-
-
-def quaternions(turned=False):
-    """w, x, y, z, from the body to the earth, in our frame; or `turned`: both with y to the right and z down."""
-    rotation = FRD @ attitude(T) @ FRD if turned else attitude(T)
-    return Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
 
 
 ODD = """
@@ -84,14 +77,6 @@ def test_a_command_in_microseconds_is_a_fraction(save):
     table = {"columns": {f"command{i}": {"source": f"pwm{i}", "unit": "PWM"} for i in range(1, 5)}}
     flight, _ = read_log(save(table_csv(names, T, rates(T)[:, 0], commands)), CRAZYFLIE, columns=table)
     np.testing.assert_allclose(flight.omega, 2500 * np.clip((commands - 1000) / 1000, 0, 1), atol=1e-9)
-
-
-def neurobem_csv(rows=None):
-    names = "t,ang acc x,ang vel x,ang vel y,ang vel z,quat x,quat y,quat z,quat w,acc x,acc y,acc z,vel x,"
-    names = [*f"{names}pos x,pos y,pos z".split(","), "mot 1", "mot 2", "mot 3", "mot 4", "dmot 1", "vbat"]
-    quaternion = quaternions()[:, [1, 2, 3, 0]]
-    columns = (T, T, rates(T), quaternion, force(T), T, position(T), speeds(T), T, 16 - 0.1 * T)
-    return table_csv(names, *(column[:rows] for column in columns))
 
 
 def test_a_csv_of_neurobem_is_recognised(save):

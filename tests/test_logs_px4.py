@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, refused
-from recorded_logs import FRD, VEHICLE, check, force
-from test_logs_ulog import (
+from px4_logs import (
     ROTORS,
     T,
     angular_velocity,
@@ -19,6 +18,7 @@ from test_logs_ulog import (
     states,
     thrusts,
 )
+from recorded_logs import FRD, VEHICLE, check, force
 
 from jaxos4.errors import InputError
 from jaxos4.logs import Sampling, read_log, read_recording

@@ -8,15 +8,15 @@ import math
 import time
 import tracemalloc
 
+import ardupilot_logs as ardupilot
+import blackbox_logs as blackbox
+import column_logs as columns
+import crazyflie_logs as crazyflie
 import equinox as eqx
+import flight_csvs as flight_csv
 import numpy as np
+import px4_logs as ulog
 import pytest
-import test_flight_csv as flight_csv
-import test_logs_ardupilot as ardupilot
-import test_logs_blackbox as blackbox
-import test_logs_columns as columns
-import test_logs_crazyflie as crazyflie
-import test_logs_ulog as ulog
 from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
 from recorded_logs import RPM, blackbox_csv, check, outcome, speeds, survives_damage

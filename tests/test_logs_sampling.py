@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from flight_csvs import csv, read_flight_and_notes
 from hypothesis import given, settings, strategies as st
+from px4_logs import grid
 from recorded_logs import rates, table_csv
-from test_flight_csv import csv, read_flight_and_notes
-from test_logs_ulog import grid
 
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs.messages import Messages

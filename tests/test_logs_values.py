@@ -1,14 +1,14 @@
 """What the values of a log must be: units against each other, impossible samples, rates of logging."""
 
+import blackbox_logs as blackbox
+import crazyflie_logs as crazyflie
 import numpy as np
+import px4_logs as ulog
 import pytest
 import recorded_logs
-import test_logs_blackbox as blackbox
-import test_logs_crazyflie as crazyflie
-import test_logs_ulog as ulog
+from flight_csvs import csv, read_flight_and_notes
 from helpers import CRAZYFLIE, refused
 from recorded_logs import RPM, VEHICLE, blackbox_csv, outcome, rates, speeds, table_csv
-from test_flight_csv import csv, read_flight_and_notes
 
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import Sampling, read_log, read_recording

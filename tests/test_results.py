@@ -13,10 +13,9 @@ import pytest
 from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
 from matplotlib.figure import Figure
+from pages import STRANGE, in_one_line, nodes, stands_alone, words
 from rich.console import Console
 from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
-from test_doors import STRANGE, in_one_line, nodes
-from test_report import stands_alone, words
 
 import jaxos4
 from jaxos4.cli._output import write_json

@@ -5,13 +5,11 @@ import inspect
 import json
 import os
 import pathlib
-import subprocess
-import sys
 from typing import get_args
 
 import jax
 import pytest
-from helpers import how_we_compile
+from helpers import COMMAND, how_we_compile, start
 
 import jaxos4
 from jaxos4._xla import LOOP_FLAGS, NO_FLAGS, QUICK_FLAGS, add_flags
@@ -28,12 +26,10 @@ from jaxos4.simulation import METHODS
 
 pytestmark = pytest.mark.slow
 
-ROOT = pathlib.Path(__file__).resolve().parents[1]
 # Libraries that only some commands need, and that are slow to import.
 HEAVY = set("diffrax lineax optax optimistix xarray h5netcdf h5py matplotlib jinja2 pandas dask".split())
 CORE = {"jax", "equinox", "jaxtyping", "numpy", "msgspec"}
 SIMULATE = ("simulate", "--duration", "0.1", "--out", "flight.csv")
-COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
 # Prints the loaded packages when the process ends, however it ends.
 LIST = "import atexit, sys; atexit.register(lambda: print('\\nloaded', *{name.split('.')[0] for name in sys.modules}));"
 # Prints how many programs the cache of compiled programs gave, how many it did not have, and the flags of XLA.
@@ -43,14 +39,6 @@ seen = collections.Counter()
 jax.monitoring.register_event_listener(lambda event, **_: seen.update([event.rsplit('/', 1)[-1]]))
 atexit.register(lambda: print('\\ncounted', seen['cache_hits'], seen['cache_misses'], os.environ.get('XLA_FLAGS')))
 """
-
-
-def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Runs Python code in another process, without the tests' cache of compiled programs and flags of XLA."""
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "JAXOS4_", "XLA_"))}
-    variables = inherited | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]), "JAX_PLATFORMS": "cpu"}
-    process = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(process, env=variables | environment, cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
 def loaded(code: str, **environment: str) -> tuple[str, set[str]]:

@@ -3,8 +3,11 @@
 import contextlib
 import functools
 import itertools
+import os
 import pathlib
 import re
+import subprocess
+import sys
 
 import equinox as eqx
 import jax
@@ -15,6 +18,7 @@ import jaxos4
 from jaxos4.models.state import CASCADE_ORDER
 from jaxos4.recording import stretches
 
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 # The constants of the OS4 thesis, typed again instead of imported.
 OS4 = {"m": 0.650, "L": 0.23, "b": 3.13e-5, "d": 7.5e-7, "g": 9.81}
 DT = 0.01
@@ -274,9 +278,20 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
 
 def documented_class(page: str) -> str:
     """The class that a page of `docs/extend` shows, as a file of its own has it."""
-    text = (pathlib.Path(__file__).parents[2] / "docs" / "extend" / page).read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "extend" / page).read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?class .*?)```", text, flags=re.DOTALL)
     return code.replace("from ..", "from jaxos4.")
+
+
+COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
+
+
+def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Runs Python code in another process, without the tests' cache of compiled programs and flags of XLA."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "JAXOS4_", "XLA_"))}
+    variables = inherited | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]), "JAX_PLATFORMS": "cpu"}
+    process = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(process, env=variables | environment, cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
 def how_we_compile():

@@ -1,0 +1,47 @@
+"""Logs of ArduPilot."""
+
+import numpy as np
+from recorded_logs import FRD, attitude, dataflash, force, rates
+from scipy.spatial.transform import Rotation
+
+T = 0.0025 * np.arange(1200)  # the main loop runs at 400 Hz
+
+
+def degrees(t):
+    """Roll, pitch, yaw as ArduPilot has them: of x forward, y right, z down, and yaw from 0 to 360."""
+    angles = Rotation.from_matrix(FRD @ attitude(t) @ FRD).as_euler("ZYX", degrees=True)[:, ::-1]
+    return angles % [720, 720, 360]
+
+
+def imu(t, instance=0, sign=1):
+    values = (np.full(t.size, instance), sign * rates(t) @ FRD, force(t) @ FRD)
+    return ("IMU", "Bffffff", "I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ", t, values)
+
+
+def angles(t, name="ATT", letter="c"):
+    signed = np.mod(degrees(t) + [180, 180, 0], 360) - [180, 180, 0]
+    return (name, 3 * letter, "Roll,Pitch,Yaw", t, (signed,))
+
+
+def outputs(t, order=(0, 1, 2, 3)):
+    pwm = np.full((t.size, 8), 1000.0)
+    pwm[:, order] = 1000 + 1000 * commands(t)
+    return ("RCOU", "HHHHHHHH", ",".join(f"C{i}" for i in range(1, 9)), t, (pwm,))
+
+
+def commands(t):
+    return 0.3 + 0.1 * np.arange(4) + 0.05 * np.sin(2 * t)[:, None]
+
+
+FEW = T[:40]
+BAD = {
+    "header only": (b"\xa3\x95\x80", "holds no body rates; set LOG_BITMASK to 262145"),
+    "no gyro": (dataflash([outputs(FEW)]), "holds no body rates"),
+    "no motors": (dataflash([imu(FEW)]), "holds no rotor speeds or commands; add 1024"),
+    "hexarotor": (dataflash([imu(FEW), outputs(FEW)], {"FRAME_CLASS": 2.0}), "this is no quadrotor"),
+    "fifth motor": (dataflash([imu(FEW), outputs(FEW)], {"SERVO6_FUNCTION": 37.0}), "this is no quadrotor"),
+    "apart": (dataflash([imu(FEW), outputs(FEW + 60)]), "not logged at the same time"),
+    "too fast": (dataflash([("RATE", "fff", "R,P,Y", FEW, (9e3 * rates(FEW),)), outputs(FEW)]), "rad/s, beyond"),
+    "damaged all over": (dataflash([imu(FEW)]) + b"\xa3\x95\x01" * 1100, "damaged in more than 1000 places"),
+}
+SMALL = dataflash([imu(FEW), angles(FEW), outputs(FEW)], {"FRAME_CLASS": 1.0})
