@@ -157,7 +157,7 @@ def _layout(body: bytes) -> tuple[int, int, str, np.dtype | None, dict[str, floa
     labels, unknown = fields.split(","), (body[0], body[1], name, None, {})
     if not len(labels) == len(letters) == len({*labels}) or "" in labels or not {*letters} <= _TYPES.keys():
         return unknown
-    parts = [(label, f"<{_TYPES[letter][0]}") for label, letter in zip(labels, letters, strict=True)]
-    layout = np.dtype([(" head", "S3"), *parts])
+    typed = [(label, f"<{_TYPES[letter][0]}") for label, letter in zip(labels, letters, strict=True)]
+    layout = np.dtype([(" head", "S3"), *typed])
     units = {label: _TYPES[letter][1] for label, letter in zip(labels, letters, strict=True)}
     return (body[0], body[1], name, layout, units) if layout.itemsize == body[1] else unknown

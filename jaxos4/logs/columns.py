@@ -189,8 +189,8 @@ def array_table(data: Any, columns: ColumnMap) -> Table:
         if values.dtype.kind == "M":
             values = (values - values.flat[0]) / np.timedelta64(1, "s") if values.size else np.empty(0)
         if values.dtype.kind in "fiu" and values.ndim in (1, 2):
-            parts = values.T.astype(float) if values.ndim == 2 else [values.astype(float)]
-            raw |= {f"{name}[{i}]" if values.ndim == 2 else str(name): part for i, part in enumerate(parts)}
+            every = np.atleast_2d(values.T).astype(float)
+            raw |= {f"{name}[{i}]" if values.ndim == 2 else str(name): own for i, own in enumerate(every)}
     unread = tuple(str(name) for name in names if not any(key.partition("[")[0] == str(name) for key in raw))
     table = mapped_rows(Table("data", raw, unread, first_row=None), columns)
     sizes = {name: values.size for name, values in table.columns.items()}

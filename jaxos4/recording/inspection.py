@@ -29,7 +29,7 @@ class Channel(msgspec.Struct, frozen=True):
     most: float
 
 
-class Part(msgspec.Struct, frozen=True):
+class InspectedStretch(msgspec.Struct, frozen=True):
     """A stretch of the log [s]: whether it can be used, why not, and the excitation by axis if it can."""
 
     begin: float
@@ -61,7 +61,7 @@ class Inspection(msgspec.Struct, frozen=True):
     findings: tuple[str, ...]
     checks: tuple[Finding, ...]
     notes: tuple[str, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[InspectedStretch, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings, ready for JSON."""
@@ -80,7 +80,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         if not stretch.reason:
             flown.append(cut(recording, stretch))
         excited = {} if stretch.reason else excitation(flown[-1], airframe)
-        parts.append(Part(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
+        parts.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
     nothing = "" if flown else f"{nothing_usable(found)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(flown, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))

@@ -53,7 +53,7 @@ def force_noise(recording: Recording, step: float, *, share: float = 0.5) -> Flo
 class SpeedNoise(NamedTuple):
     """How the noise of rotor speeds is found.
 
-    - `seconds`, `fewest`: the length of the segments whose spectra are averaged [s], and their fewest samples.
+    - `seconds`, `fewest`: how long the samples of one spectrum last [s], and how many they are at least.
     - `neighbours`: spectra are averaged over so many neighbouring frequencies to either side.
     - `band`: in which changes of speeds are divided into motion and noise, as shares of the highest frequency.
     - `written`: rates at which the speeds may have been written before they were interpolated, of which one is chosen,
@@ -105,8 +105,8 @@ def _power(signals: Sequence[Float[np.ndarray, "samples 4"]], dt: float, setting
     for signal in signals:
         changes = np.diff(signal, axis=0)
         for first in range(0, len(changes) - length + 1, length // 2):
-            segment = changes[first : first + length]
-            spectra.append(np.abs(np.fft.rfft(weight * (segment - segment.mean(axis=0)), axis=0)) ** 2)
+            own = changes[first : first + length]
+            spectra.append(np.abs(np.fft.rfft(weight * (own - own.mean(axis=0)), axis=0)) ** 2)
     if not spectra:
         return None
     power = np.mean(spectra, axis=0) / np.square(weight).sum()

@@ -6,8 +6,18 @@ import numpy as np
 
 from ...airframe import Airframe
 from ...logs import Recording
+from .channels import (
+    clipped_values,
+    impossible_values,
+    rare_motors,
+    sensor_clocks,
+    short_flight,
+    uneven_time,
+    velocity_axes,
+    wrong_axes,
+    wrong_scale,
+)
 from .evidence import INERTIAS as INERTIAS, LIMITS, Evidence as Evidence, Finding as Finding, Limits as Limits
-from .log import clipped_values, impossible_values, rare_motors, short_flight, uneven_time
 from .mounting import (
     different_thrust as different_thrust,
     earth_axes,
@@ -16,7 +26,6 @@ from .mounting import (
     turned_about_vertical,
     wrong_thrust,
 )
-from .sensors import CLOCK as CLOCK, sensor_clocks, velocity_axes, wrong_axes, wrong_scale
 
 Check = Callable[[Evidence], Finding | None]
 

@@ -52,7 +52,7 @@ class Limits(msgspec.Struct, frozen=True):
     """Limits of the checks. A difference is a finding if it exceeds chance, and if it is large enough to matter.
 
     - `standard_errors`: chance reaches so many of its standard errors in one of 2,000 comparisons, because the standard
-      errors are those of a dozen blocks of the flight.
+      errors are those of a dozen batches of the flight.
     - `kinematics`: the same for the comparison of two causes, both of which are named if neither is clear.
     - `scale`: of attitude against gyro, relative. Inertias are wrong by the scale of the gyro.
     - `angle`: of a sensor about the vertical axis [rad]. 20 degrees change inertias by 8 %, 8 degrees by 1 %.

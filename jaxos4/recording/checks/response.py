@@ -22,16 +22,16 @@ Products = Complex[np.ndarray, "frequencies 6 6"]
 class Spectra(NamedTuple):
     """How the rotors' answer is measured.
 
-    - `step`, `segment`: of the samples, and of the segments that are transformed [s].
+    - `step`, `seconds`: of the samples, and how long those of one spectrum last [s].
     - `gap`: the longest that is interpolated [s].
     - `band`: [Hz]; gusts are slower; rotors, and noise of the gyro, leave little above.
     - `lags`: of rotors that follow commands, of which one is chosen [s].
     - `delays`: first and last, in steps of 1 ms [s].
-    - `fewest`: segments; fewer have no standard error.
+    - `fewest`: spectra; fewer have no standard error.
     """
 
     step: float = 0.004
-    segment: float = 2.0
+    seconds: float = 2.0
     gap: float = 0.05
     band: tuple[float, float] = (2.0, 15.0)
     lags: tuple[float, ...] = (0.01, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1)
@@ -63,15 +63,15 @@ def rotor_response(stretches: Sequence[Recording], airframe: Airframe, settings:
     step = max(settings.step, *(each.dt for each in stretches))
     if step > 0.5 / settings.band[1]:
         return None
-    segments = [segment for each in stretches for segment in _segments(each, airframe, step, settings)]
-    if len(segments) < settings.fewest:
+    spectra = [each for flown in stretches for each in _spectra(flown, airframe, step, settings)]
+    if len(spectra) < settings.fewest:
         return None
-    frequency = np.fft.rfftfreq(round(settings.segment / step), step)
+    frequency = np.fft.rfftfreq(round(settings.seconds / step), step)
     inside = (frequency >= settings.band[0]) & (frequency <= settings.band[1])
     omega = 2j * np.pi * frequency[inside]
     # Rotor speeds are those of the step after their time. Angular accelerations are the derivatives of rates.
     factors = np.stack([np.exp(-omega * step / 2)] * 3 + [omega, omega, np.ones_like(omega)])
-    groups = np.array_split(np.array(segments)[:, :, inside] * factors, min(BATCHES, len(segments)))
+    groups = np.array_split(np.array(spectra)[:, :, inside] * factors, min(BATCHES, len(spectra)))
     sums = np.array([np.einsum("sif,sjf->fij", group.conj(), group) for group in groups])
     whole = sums.sum(axis=0)
     first, last = settings.delays
@@ -88,12 +88,12 @@ def rotor_response(stretches: Sequence[Recording], airframe: Airframe, settings:
     return Response(turning, found[4:], _fit(whole, whole, omega, best, delays)[2], best)
 
 
-def _segments(
+def _spectra(
     flown: Recording, airframe: Airframe, step: float, settings: Spectra
 ) -> list[Complex[np.ndarray, "6 frequencies"]]:
-    """Spectra of roll and pitch torque, thrust per mass, roll and pitch rate and vertical force, by segment.
+    """Spectra of roll and pitch torque, thrust per mass, roll and pitch rate and vertical force.
 
-    Thrust and force are 0 in a segment in which the force was not measured.
+    Thrust and force are 0 if the force was not measured.
     """
     time, omega, sensed = averages(flown.time, flown.omega, flown.channels[:, _SENSED], held=flown.held)(step)
     for column in sensed.T:
@@ -101,11 +101,11 @@ def _segments(
             column[:] = interpolated(time, time, column, gap=settings.gap)
     mixer = np.asarray(airframe.mixer, dtype=float)[[0, 1, 3]]
     forced = omega**2 @ mixer.T / [1.0, 1.0, float(airframe.mass)]
-    signals, length = np.hstack([forced, sensed]).T, round(settings.segment / step)
+    signals, length = np.hstack([forced, sensed]).T, round(settings.seconds / step)
     found, weight = [], np.hanning(length)
     for begin in range(0, time.size - length, length // 2):
-        segment = signals[:, begin : begin + length]
-        spectra = np.fft.rfft(weight * (segment - segment.mean(axis=1, keepdims=True)))
+        own = signals[:, begin : begin + length]
+        spectra = np.fft.rfft(weight * (own - own.mean(axis=1, keepdims=True)))
         if np.isnan(spectra[5]).any():
             spectra[[2, 5]] = 0.0
         if np.isfinite(spectra).all():

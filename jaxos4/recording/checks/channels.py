@@ -1,4 +1,4 @@
-"""Checks of the sensors against each other: scales, axes and clocks of gyro, attitude, accelerometer and velocity."""
+"""Checks of the channels: each by itself (time, values, rate, length), and against others (scales, axes, clocks)."""
 
 import math
 from typing import NamedTuple
@@ -6,20 +6,121 @@ from typing import NamedTuple
 import numpy as np
 
 from ...excitation import AXES
+from ...flight import FORCE_NAMES, RATES
+from ...logs.table import counted
 from ..motion import excitation
 from .estimates import scaled_angles
 from .evidence import INERTIAS, Evidence, Finding
 from .mounting import earth_axes
 
 _ATTITUDE = (*INERTIAS, "attitude")
-CLOCK = "_clock"
-"""The end of the name of a finding about clocks."""
 _CLOCKS = {  # how to say that it is wrong, and what it concerns
     "gyro": ("is", INERTIAS),
     "accelerometer": ("is", (*INERTIAS, "thrust", "motors")),
     "attitude": ("is", ("attitude",)),
     "motors": ("are", ("motors",)),
 }
+_UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
+# Clipped thrust seems weaker, and moments of inertia are proportional to it.
+_CLIPPED = {"p": ("Ix",), "q": ("Iy",), "r": ("Iz",), "az": ("thrust", *INERTIAS)}
+
+
+def uneven_time(evidence: Evidence) -> Finding | None:
+    """Samples that are not on a uniform grid, which a `Flight` from Python may have."""
+    steps = np.diff(evidence.logged.time)
+    step = float(np.median(steps))
+    uneven = np.abs(steps - step) > 0.05 * step  # resampled logs are far below
+    if not uneven.any():
+        return None
+    missing = 1 - (steps.size + 1) / (np.sum(steps) / step + 1)
+    if missing > 0:
+        size = f"{100 * missing:.2g} % of the samples are missing, in gaps of up to {1e3 * steps.max():.3g} ms"
+    else:
+        size = f"steps of {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms"
+    return Finding(
+        "uneven_time",
+        "the time of the flight is not uniform",
+        size,
+        "write the flight to a CSV and read it with `jaxos4.recording.read_recording`, which resamples it",
+        (*INERTIAS, "thrust", "motors", "damping", "attitude"),
+        True,
+    )
+
+
+def impossible_values(evidence: Evidence) -> Finding | None:
+    """Single values far from all others."""
+    found = evidence.plausible.impossible
+    if not found:
+        return None
+    return Finding(
+        "impossible_values",
+        "single values are impossible, and count as not measured",
+        ", ".join(f"{name}: {counted(number, 'value')}, as {worst:.4g}" for name, (number, worst) in found.items()),
+        "nothing is to be done if they are few",
+        (*INERTIAS, "thrust"),
+        False,
+    )
+
+
+def clipped_values(evidence: Evidence) -> Finding | None:
+    """Values at the end of a sensor's range."""
+    found = evidence.plausible.clipped
+    if not found:
+        return None
+    each = [f"{n}: {count} ({100 * share:.2g} %) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
+    many = max(share for _, share, _ in found.values()) > evidence.limits.clipped
+    return Finding(
+        "clipped_values",
+        "a sensor is clipped at the end of its range; these values count as not measured",
+        ", ".join(each),
+        "fly gentler, or set a larger range of the sensor",
+        tuple(dict.fromkeys(quantity for name in found for quantity in _CLIPPED.get(name, ()))),
+        many,
+    )
+
+
+def rare_motors(evidence: Evidence) -> Finding | None:
+    """Rotor speeds or commands that keep their value for longer than rotors take to answer."""
+    if evidence.motor_step <= evidence.limits.held:
+        return None
+    return Finding(
+        "rare_motors",
+        "motors were logged more rarely than rotors answer, so that the damping comes out too large",
+        f"new values every {1e3 * evidence.motor_step:.0f} ms",
+        "log motors at 100 Hz or more, on board",
+        ("damping",),
+        True,
+    )
+
+
+def short_flight(evidence: Evidence) -> Finding | None:
+    """Few independent motions of roll and pitch."""
+    measured = [each for each in evidence.stretches if np.isfinite(each.states[:, RATES[:2]]).any(axis=0).all()]
+    if not measured:
+        return None
+    lengths = [float(np.ptp(each.time)) for each in measured]
+    longest, seconds = measured[int(np.argmax(lengths))], sum(lengths)
+    lasting = float(np.mean([longest.dt * _correlated(column) for column in longest.states[:, RATES[:2]].T]))
+    motions = seconds / (2 * lasting) if lasting > 0 else math.inf  # nothing moves
+    if motions >= evidence.limits.motions:
+        return None
+    return Finding(
+        "short_flight",
+        "the flight is short, so that intervals may be too narrow",
+        f"{seconds:.1f} s, or {motions:.0f} independent motions of {2 * lasting:.2g} s",
+        f"fly for {5 * math.ceil(2 * evidence.limits.motions * 2 * lasting / 5)} s or longer",
+        INERTIAS,
+        False,
+    )
+
+
+def _correlated(values: np.ndarray) -> float:
+    """The sum of the autocorrelation until it is first negative, in samples."""
+    values = np.nan_to_num(values - np.nanmean(values))
+    power = np.square(np.abs(np.fft.rfft(values, 1 << (2 * values.size - 1).bit_length())))
+    products = np.fft.irfft(power)[: values.size]
+    until = int(np.argmax(products < 0)) or values.size
+    return float(products[:until].sum() / max(products[0], 1e-300))
 
 
 def wrong_scale(evidence: Evidence) -> Finding | None:
@@ -127,7 +228,7 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
         for name, i in named.items()
     ]
     return Finding(
-        "_or_".join(named) + CLOCK,
+        "_or_".join(named) + "_clock",
         ", or ".join(causes),
         f"{1e3 * wrong[best[0]]:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
         "shift the time stamps, or log without a filter",
