@@ -329,7 +329,7 @@ def test_all_impossible_rotor_speeds_count_as_not_measured_and_not_only_the_larg
 
 def test_a_corrupt_field_of_an_esc_is_missing():
     fields = {"esc[0].actuator_function": np.array([101.0, np.nan]), "esc[1].state": np.array([5.0])}
-    log = Messages("log", {"esc_status": {0: fields}}, "", {}, {}, [])
+    log = Messages("log", {"esc_status": {0: fields}}, "")
     assert log.latest("esc_status", "esc[0].actuator_function") is None
     assert log.latest("esc_status", "esc[1].state") == 5.0
 

@@ -95,7 +95,7 @@ def test_a_gyro_beyond_a_kilohertz_is_averaged_to_one():
     t = grid(0.00025, 2.0)
     noise = np.random.default_rng(0).normal(0, 0.1, (t.size, 3))
     motor = Series(grid(0.01, 2.2, offset=-0.1), np.full((220, 4), 0.5))
-    log = Messages("", {}, "", {}, {"p": "gyro", "command1": "motors"}, [])
+    log = Messages("", {}, "", names={"p": "gyro", "command1": "motors"})
     rows, table = log.table(Series(t, rates(t) + noise), motor, {})
     assert np.median(np.diff(rows)) == pytest.approx(0.001)
     off = np.column_stack([table.columns[name] for name in "pqr"]) - rates(rows)

@@ -135,7 +135,7 @@ def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> 
         if name == "PARM" and {"Name", "Value"} <= units.keys():
             names = (each.decode(errors="replace") for each in records["Name"].astype("S64").tolist())
             parameters = {n: x for n, x in zip(names, fields["Value"].tolist(), strict=True) if abs(x) < 1e9}
-    return Messages(path, messages, _REMEDY, parameters, {}, notes)
+    return Messages(path, messages, _REMEDY, notes, parameters=parameters)
 
 
 def _instances(fields: Fields) -> dict[int, Fields]:

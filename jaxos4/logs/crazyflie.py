@@ -52,7 +52,7 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     events = _sets(path, content, notes) if content[:1] != _MAGIC else _events(path, content, notes)
     if not events:
         refuse(path, "holds no events; a flight needs at least two")
-    log = Messages(path, events, _REMEDY, {}, {}, notes, prefixed=False)
+    log = Messages(path, events, _REMEDY, notes, prefixed=False)
     rates = _logged(log, RATES, _RATES, _DEGREE)
     rates = needed(path, rates, "body rates", "add gyro.x, gyro.y and gyro.z to the deck's config.txt")
     remedy = "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt"

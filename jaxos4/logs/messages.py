@@ -1,7 +1,8 @@
 """Logs of messages: sensors with times of their own, brought to the rows of the gyro."""
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -30,23 +31,24 @@ Source = tuple[str, Sequence[str], float | Float[np.ndarray, " fields"]]
 """A kind of messages, the fields that hold some of our columns, and the factors to our units and frame."""
 
 
-class Messages(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Messages:
     """The decoded messages of a log. Its methods add to `names` and `notes`.
 
     - `fields`: by kind of message and instance, the fields of its messages as arrays of one length. `t`: times [s].
     - `remedy`: what to do if the log is corrupt.
-    - `parameters`: the settings of the autopilot.
-    - `names`: by our column, what the log calls it.
     - `notes`: what was assumed, one line each.
+    - `names`: by our column, what the log calls it.
+    - `parameters`: the settings of the autopilot.
     - `prefixed`: whether the name of a field begins with that of its kind and a dot.
     """
 
     path: Path
     fields: Mapping[str, Mapping[int, Fields]]
     remedy: str
-    parameters: Mapping[str, float]
-    names: dict[str, str]
-    notes: list[str]
+    notes: list[str] = dataclasses.field(default_factory=list)
+    names: dict[str, str] = dataclasses.field(default_factory=dict)
+    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
     prefixed: bool = True
 
     def of(self, kind: str, instance: int | None = None) -> Fields:

@@ -110,7 +110,7 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
         notes.append(f"columns are those of the preset {columns.name}")
     chosen = columns.chosen(path, held, topics)
     found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
-    log = Messages(path, found, _REMEDY, {}, {}, notes, prefixed=False)
+    log = Messages(path, found, _REMEDY, notes, prefixed=False)
     return _table(log, columns, chosen), tuple(notes)
 
 

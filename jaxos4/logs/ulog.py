@@ -310,7 +310,7 @@ def _decoded(path: Path) -> Messages:
             instances[len(instances)] = data.data | {"t": stamp / 1e6}
     changed = {name: value for _, name, value in log.changed_parameters}
     numbers = {k: v for k, v in (log.initial_parameters | changed).items() if isinstance(v, int | float)}
-    return Messages(path, found, _REMEDY, {k: float(v) for k, v in numbers.items() if math.isfinite(v)}, {}, [])
+    return Messages(path, found, _REMEDY, parameters={k: float(v) for k, v in numbers.items() if math.isfinite(v)})
 
 
 class _Content(io.BytesIO):
