@@ -76,8 +76,9 @@ class Messages:
             refuse(self.path, f"time runs backward in {kind}: {self.remedy}")
         if np.count_nonzero(kept) < fewest:
             return None
-        if not kept.all():
-            self.notes.append(f"{kind}: {np.count_nonzero(~kept)} late messages are ignored")
+        late = f"{kind}: {np.count_nonzero(~kept)} late messages are ignored"
+        if not kept.all() and late not in self.notes:
+            self.notes.append(late)
         with np.errstate(all="ignore"):  # a damaged float need not be finite
             values = np.column_stack([raw[name].astype(float)[kept] for name in fields])
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
