@@ -32,7 +32,7 @@ from jaxos4.export import TARGETS, export_vehicle, read_result
 from jaxos4.forecast.vehicle import vehicle_of
 from jaxos4.identification.problem import bracket_of
 from jaxos4.logs import read_log
-from jaxos4.logs.ulog_file import Topics
+from jaxos4.logs.messages import Messages
 from jaxos4.models import MODELS
 from jaxos4.recording import read_recording
 from jaxos4.recording.inspection import airframe_draft, inspect_log
@@ -320,8 +320,8 @@ def test_all_impossible_rotor_speeds_count_as_not_measured_and_not_only_the_larg
 
 
 def test_a_corrupt_field_of_an_esc_is_missing():
-    topics = {"esc_status": [{"esc[0].actuator_function": np.array([101.0, np.nan]), "esc[1].state": np.array([5.0])}]}
-    log = Topics("log", topics, {}, {}, [])
+    fields = {"esc[0].actuator_function": np.array([101.0, np.nan]), "esc[1].state": np.array([5.0])}
+    log = Messages("log", {"esc_status": {0: fields}}, "")
     assert log.latest("esc_status", "esc[0].actuator_function") is None
     assert log.latest("esc_status", "esc[1].state") == 5.0
 

@@ -9,7 +9,7 @@ from helpers import CINERAT
 
 import jaxos4
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.recording.pieces import as_recordings
+from jaxos4.logs import as_recordings
 from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.feedthrough import FEEDTHROUGHS, input_innovations
 from jaxos4.shooting.gains import LogNoise

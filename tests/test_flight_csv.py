@@ -11,7 +11,7 @@ import jaxos4.logs.csv as csv_module
 import jaxos4.logs.table as table_module
 from jaxos4.airframe import OS4
 from jaxos4.errors import InputError
-from jaxos4.logs import read_flight, read_recording
+from jaxos4.logs import read_flight
 
 
 def refusal(path, airframe=None):
@@ -120,15 +120,16 @@ def test_paths_that_are_no_readable_file_and_too_many_rows(tmp_path, save, monke
 @pytest.mark.parametrize(
     ("row", "cell", "words"), [(3, "", ""), (6, " 1", ""), (7, "x", "row 7, column q"), (5, "1e999", "row 5")]
 )
-def test_plain_lines_are_read_in_blocks_up_to_the_first_that_is_not(row, cell, words, save, monkeypatch):
+def test_plain_lines_are_read_together_up_to_the_first_that_is_not(row, cell, words, save):
     """The numbers and the refusals are those of a file that is read row by row."""
     path, found = save(edited(row, "q", cell)), []
     for lines in (1, 2, 100):
-        monkeypatch.setattr(csv_module, "_BLOCK", lines)
         if words:
-            assert words in refusal(path)
+            with pytest.raises(InputError, match=words):
+                csv_module.read_table(path, csv_module.COLUMN_NAMES, lines_at_once=lines)
         else:
-            found.append(np.stack([*csv_module.read_table(path, csv_module.COLUMN_NAMES).columns.values()]))
+            table = csv_module.read_table(path, csv_module.COLUMN_NAMES, lines_at_once=lines)
+            found.append(np.stack([*table.columns.values()]))
     assert all(np.array_equal(each, found[0], equal_nan=True) for each in found)
 
 
@@ -164,14 +165,6 @@ def test_a_real_flight_is_read(name, shared_flights):
     np.testing.assert_allclose(impulse, held, rtol=1e-3)
     # thrust over the flight carries the weight, so the units and the rotor columns are what they are taken for
     assert 0.6 < impulse.sum() * CRAZYFLIE.thrust_coefficient / (time[-1] * 0.027 * 9.81) < 1.6
-
-
-def test_an_accelerometer_that_is_off_is_none(tmp_path):
-    rows = [f"{0.01 * k:.2f},100,101,102,103,{0.1 * k:.1f},0,0,9.81" for k in range(200)]
-    (tmp_path / "off.csv").write_text(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows))
-    found = read_recording(tmp_path / "off.csv", None)
-    assert found.specific_force is None
-    assert any("it is off" in note for note in found.notes)
 
 
 def test_an_empty_first_rotor_cell_is_refused_also_beside_an_impossible_one(tmp_path):

@@ -16,8 +16,7 @@ from jaxos4.cli._output import in_options
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
-from jaxos4.recording.pieces import vehicle_evidence
-from jaxos4.recording.preparation import prepare
+from jaxos4.recording.prepared import prepare
 
 pytestmark = pytest.mark.slow
 
@@ -107,15 +106,15 @@ def test_wrong_requests_are_one_line(run, vehicle, monkeypatch, line, said):
 
 def test_a_log_shows_whether_its_vehicle_is_real(vehicle, tmp_path):
     commands = read_recording(vehicle / "flight1.csv", full_scale=1.0)
-    assert vehicle_evidence(commands) == "has commands, not rotor speeds"
+    assert commands.vehicle_evidence == "has commands, not rotor speeds"
     felt = commands._replace(commanded=False, specific_force=np.ones((commands.time.size, 3)))
-    assert vehicle_evidence(felt) == "has an accelerometer"
+    assert felt.vehicle_evidence == "has an accelerometer"
     speeds = commands._replace(commanded=False)
-    assert vehicle_evidence(speeds) == ""
+    assert speeds.vehicle_evidence == ""
     (tmp_path / "log").write_bytes(everything())
     facts = read_recording(tmp_path / "log", full_scale=1.0).facts
-    assert vehicle_evidence(speeds._replace(facts=facts)) == "is a log of a vehicle (PX4 ULog)"
-    assert vehicle_evidence(jaxos4.Recording.of(speeds.flight)) == ""
+    assert speeds._replace(facts=facts).vehicle_evidence == "is a log of a vehicle (PX4 ULog)"
+    assert jaxos4.Recording.of(speeds.flight).vehicle_evidence == ""
 
 
 def test_each_measurement_is_either_fitted_or_held_out(vehicle):

@@ -11,10 +11,11 @@ from hypothesis import given, settings, strategies as st
 
 import jaxos4
 from jaxos4.errors import InputError
+from jaxos4.logs import as_recording
 from jaxos4.logs.sampling import averages
 from jaxos4.recording import Recording
-from jaxos4.recording.pieces import as_recording, averaged, cut, hold_out
-from jaxos4.recording.usable import Stretch
+from jaxos4.recording.stretches import Stretch, cut
+from jaxos4.recording.windows import averaged, hold_out
 
 
 def stretch(samples, seed, *, force=False, velocity=False, voltage=False, dt=0.01, start=0.0):

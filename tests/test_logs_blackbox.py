@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from blackbox_logs import RATES, SETTINGS, T, bbl, recorded, without
 from helpers import CRAZYFLIE, usable_stretches
-from recorded_logs import FRD, GRAVITY, RPM, attitude, blackbox_csv, check, force, rates, speeds
-from scipy.spatial.transform import Rotation
+from recorded_logs import FRD, GRAVITY, RPM, attitude, blackbox_csv, check, force, quaternions, rates, speeds
 
-from jaxos4.errors import InputError
 from jaxos4.logs import read_log, read_recording
 from jaxos4.logs.blackbox_frames import Numbers
 from jaxos4.recording import cut
@@ -59,10 +57,9 @@ def test_commands_are_fractions_of_their_protocol(low, high, settings, save):
 # Attitude, and the fields of Indiflight
 
 
-def quaternions(scale, turned=False):
-    """w, x, y, z as whole numbers, from the body to the earth."""
-    rotation = FRD @ attitude(T) @ FRD if turned else attitude(T)
-    found = Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
+def whole(scale, turned=False):
+    """Quaternions as whole numbers; the first is not negative."""
+    found = quaternions(T, turned)
     return np.rint(scale * found * np.sign(found[:, :1])).astype(int)
 
 
@@ -72,7 +69,7 @@ def fields(name, values):
 
 @pytest.mark.parametrize("raw", [True, False])
 def test_the_attitude_of_betaflight_is_a_quaternion_without_its_first_number(raw, save):
-    columns = recorded(T) | fields("imuQuaternion", quaternions(0x7FFF)[:, 1:])
+    columns = recorded(T) | fields("imuQuaternion", whole(0x7FFF)[:, 1:])
     content = bbl(columns) if raw else blackbox_csv(columns, settings=SETTINGS | {"motor_poles": "14"})
     check(read_log(save(content))[0], names=ATTITUDE, atol=2e-2)  # the first number is near 0 at half a turn
 
@@ -90,7 +87,7 @@ def test_the_measured_speeds_and_the_attitude_of_indiflight_are_read(turned, sav
     """Its gyro and accelerometer were forward, left, up, as Betaflight's; now they are forward, right, down."""
     signs = FRD if turned else np.eye(3)
     columns = without(recorded(T, gyro=lambda t: rates(t) @ signs, accelerometer=lambda t: force(t) @ signs), "eRPM")
-    columns |= fields("quat", quaternions(8127, turned=True)) | fields("omega", np.rint(0.9 * speeds(T)).astype(int))
+    columns |= fields("quat", whole(8127, turned=True)) | fields("omega", np.rint(0.9 * speeds(T)).astype(int))
     columns |= fields("omegaUnfiltered", np.rint(speeds(T)).astype(int))
     flight, notes = read_log(save(blackbox_csv(columns, settings=SETTINGS)))
     check(flight, names=ATTITUDE, atol=5e-3)
@@ -216,11 +213,3 @@ def test_a_real_log_is_what_another_decoder_makes_of_it(name, rows, sessions, us
 
 
 # Bad logs, for the laws of all readers.
-
-
-def test_blank_lines_above_the_header_are_skipped_and_others_are_refused(save):
-    text = blackbox_csv(recorded(T), settings={"acc_1G": "2048"})
-    plain, spaced = (read_recording(save(each), full_scale=1.0) for each in (text, f"\n\n{text}"))
-    np.testing.assert_array_equal(plain.states, spaced.states)
-    with pytest.raises(InputError):
-        read_recording(save(text.replace("\n", "\n\n")), full_scale=1.0)

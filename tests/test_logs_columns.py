@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from column_logs import T, neurobem_csv, quaternions
+from column_logs import T, neurobem_csv
 from helpers import CRAZYFLIE, CRAZYFLIE_TOML
-from recorded_logs import FRD, GRAVITY, RPM, check, force, position, rates, speeds, table_csv, velocity
+from recorded_logs import FRD, GRAVITY, RPM, check, force, position, quaternions, rates, speeds, table_csv, velocity
 from synthetic_results import held, provenance, vehicle_result
 
 import jaxos4
@@ -50,7 +50,7 @@ def odd_csv():
     place = position(T) @ FRD * [1000, 1, 1]
     names = ["time", "rpm 1", "rpm 2", "rpm 3", "rpm 4", "gyro x", "gyro y", "gyro z", "acc x", "acc y", "acc z"]
     names += ["q0", "q1", "q2", "q3", "n", "e", "d", "vx", "vy", "vz", "voltage", "note"]
-    columns = (1e3 * T, motors, gyro, force(T) @ FRD / GRAVITY, quaternions(turned=True), place, velocity(T) @ FRD)
+    columns = (1e3 * T, motors, gyro, force(T) @ FRD / GRAVITY, quaternions(T, turned=True), place, velocity(T) @ FRD)
     return table_csv(names, *columns, 11_100 - T, T)
 
 

@@ -11,8 +11,10 @@ from recorded_logs import (
     RPM,
     attitude,
     check,
+    commands,
     force,
     position,
+    quaternions,
     rates,
     speeds,
     survives_damage,
@@ -35,11 +37,6 @@ MAP = {
     **{f"a{axis}": f"/imu.linear_acceleration.{axis}" for axis in "xyz"},
     **{f"q{axis}": f"/imu.orientation.{axis}" for axis in "wxyz"},
 }
-
-
-def quaternions(t, turned=False):
-    rotation = FRD @ attitude(t) @ FRD if turned else attitude(t)
-    return Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
 
 
 def topics(t=T, motors=T, prefix=""):
@@ -128,7 +125,7 @@ PX4 = {
     + "".join(f"float32 {n}\n" for n in "x y z vx vy vz".split()),
     "px4_msgs/msg/BatteryStatus": "uint64 timestamp\nfloat32 voltage_v",
 }
-COMMANDS = 0.3 + 0.1 * np.arange(4) + 0.05 * np.sin(2 * T)[:, None]
+COMMANDS = commands(T)
 
 
 def px4():

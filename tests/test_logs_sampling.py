@@ -7,9 +7,10 @@ from hypothesis import given, settings, strategies as st
 from px4_logs import grid
 from recorded_logs import rates, table_csv
 
+from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs import Table
-from jaxos4.logs.sampling import PARTS, Series, gyro_rows, logged_rate, resample, root_mean_square, speeds_within
+from jaxos4.logs.messages import Messages
+from jaxos4.logs.sampling import PARTS, Series, logged_rate, resample, root_mean_square, speeds_within
 
 # Uneven times
 
@@ -95,10 +96,25 @@ def test_a_gyro_beyond_a_kilohertz_is_averaged_to_one():
     t = grid(0.00025, 2.0)
     noise = np.random.default_rng(0).normal(0, 0.1, (t.size, 3))
     motor = Series(grid(0.01, 2.2, offset=-0.1), np.full((220, 4), 0.5))
-    rows, table = gyro_rows(Table("", {}), Series(t, rates(t) + noise), motor, measured=False, others={})
+    log = Messages("", {}, "", names={"p": "gyro", "command1": "motors"})
+    rows, table = log.table(Series(t, rates(t) + noise), motor, {})
     assert np.median(np.diff(rows)) == pytest.approx(0.001)
     off = np.column_stack([table.columns[name] for name in "pqr"]) - rates(rows)
     assert np.std(off) == pytest.approx(0.1 / 2, rel=0.15)  # of four samples each
+
+
+def test_late_messages_are_ignored_and_noted_once_and_the_fastest_source_is_taken():
+    t = np.array([0.0, 0.01, 0.005, 0.02, 0.03])
+    slow = {"t": grid(0.02, 0.2), "x": np.arange(10.0)}
+    log = Messages("log", {"slow": {0: slow}, "late": {3: {"t": t, "x": np.arange(5.0)}}}, "copy it again")
+    for _ in range(2):
+        found = log.fastest(("p",), [("slow", ("x",), 1.0), ("late", ("x",), 2.0)])
+    np.testing.assert_array_equal(found.values[:, 0], [0, 2, 6, 8])
+    assert log.names == {"p": "late.x"}
+    assert log.notes == ["late: 1 late messages are ignored"]
+    log.fields["late"][3]["t"] = t[::-1]
+    with pytest.raises(InputError, match="log: time runs backward in late: copy it again"):
+        log.series("late", ["x"])
 
 
 # Rates of their own

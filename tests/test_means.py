@@ -14,9 +14,9 @@ from scipy.integrate import simpson
 import jaxos4
 from jaxos4.flight import RATES
 from jaxos4.identification.vehicle import prepare_vehicle
+from jaxos4.logs import as_recordings
 from jaxos4.logs.sampling import PARTS, speeds_within
 from jaxos4.models.state import Rates, State
-from jaxos4.recording.pieces import as_recordings
 from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise, Window, step_of
 

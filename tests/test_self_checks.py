@@ -10,12 +10,11 @@ import jaxos4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES, VELOCITY
 from jaxos4.logs import write_flight
-from jaxos4.recording import Recording, read_recording
-from jaxos4.recording.checks import CHECKS, Limits, different_vehicles, plausible, self_checks
-from jaxos4.recording.checks.attitude import attitude_turns
-from jaxos4.recording.checks.finding import Measured
+from jaxos4.recording import Recording, plausible, read_recording
+from jaxos4.recording.checks import CHECKS, Limits, different_vehicles, self_checks
+from jaxos4.recording.checks.estimates import Measured, attitude_turns, batched
 from jaxos4.recording.checks.response import rotor_response
-from jaxos4.recording.pieces import cut
+from jaxos4.recording.stretches import cut
 
 pytestmark = pytest.mark.slow
 
@@ -265,7 +264,7 @@ def test_estimates_hold_within_their_standard_errors(flights):
         limits = 5 * response.delays.error + 0.006
         assert abs(response.delays.value[2]) < limits[2]
     values = np.random.default_rng(0).normal(size=(12, 50))
-    jackknife = Measured.of(values.mean(axis=0), (values.sum(axis=0) - values) / 11)
+    jackknife = Measured.of(batched(np.stack([values, np.ones((12, 50))], axis=1)), lambda sums: sums[0] / sums[1])
     np.testing.assert_allclose(jackknife.error, values.std(axis=0, ddof=1) / np.sqrt(12))
 
 

@@ -11,8 +11,9 @@ from sign_flights import flown, turned
 from jaxos4.errors import InputError
 from jaxos4.logs import read_recording, write_flight
 from jaxos4.recording import Stretch, averaged, cut
-from jaxos4.recording.motion import motor_clock_note, opposite_axes as opposites, refused_note, yaw_doubt
-from jaxos4.recording.preparation import at_limit, prepare
+from jaxos4.recording.checks import opposite_yaw, self_checks
+from jaxos4.recording.motion import opposite_axes as opposites, refused_note
+from jaxos4.recording.prepared import at_limit, prepare
 
 
 def opposite_axes(pieces, airframe):
@@ -57,7 +58,7 @@ def test_a_fit_is_refused_with_the_remedy_unless_the_vehicle_does_not_turn():
     assert opposite_axes([still], turned(CRAZYFLIE, "rotor_spins")) == opposite_axes([], CRAZYFLIE) == []
     brief = cut(averaged(recording, [0.02])[0], Stretch(0.0, 1.5))  # too short for signals from 2 Hz on
     assert opposite_axes([brief], turned(CRAZYFLIE, "rotor_spins")) == []
-    assert (refused_note({}), yaw_doubt({})) == ("", None)
+    assert (refused_note({}), opposite_yaw(None)) == ("", None)
 
 
 @pytest.mark.parametrize("name", ["rollpitch", "yaw_a", "hover"])
@@ -66,7 +67,6 @@ def test_real_flights(name, shared_flights):
     assert opposite_axes(parts, CRAZYFLIE) == []
     assert opposite_axes(parts, turned(CRAZYFLIE, "rotor_spins")) == ["yaw"]
     assert opposite_axes(parts, turned(CRAZYFLIE, "rotor_positions")) == ["roll", "pitch"]
-    assert motor_clock_note(parts, CRAZYFLIE) == ""  # the lag of commands is no error of clocks
 
 
 def test_inspect_questions_the_spins(run, tmp_path):
@@ -82,15 +82,15 @@ def test_inspect_questions_the_spins(run, tmp_path):
     assert "cannot identify" not in out
 
 
-@pytest.mark.parametrize(("shift", "words"), [(-9, "ms early"), (0, ""), (6, "ms late")])
+@pytest.mark.parametrize(("shift", "words"), [(-9, "early"), (0, ""), (6, "late")])
 def test_clocks_of_motors_and_gyro_are_compared(shift, words):
     """Measured rotor speeds, later than they were by `shift` samples of 4 ms. The rotors lag by 4 ms."""
     flight = flown(CRAZYFLIE, 0, gust=5.0, lag=0.004)._replace(commanded=False)
-    note = motor_clock_note([flight._replace(omega=np.roll(flight.omega, shift, axis=0))], CRAZYFLIE)
-    assert words in note
-    assert bool(note) == bool(words)
-    if note:
-        assert float(note.split("about ")[1].split()[0]) == pytest.approx(abs(4 - 4 * shift), abs=2)
+    late = flight._replace(omega=np.roll(flight.omega, shift, axis=0))
+    found = [each for each in self_checks(late, CRAZYFLIE) if each.name == "gyro_or_motors_clock"]
+    assert len(found) == bool(words)
+    for each in found:
+        assert f"the motors are recorded {abs(4 * shift)} ms {words}" in each.cause
 
 
 def test_rotors_at_their_limit_are_named(shared_flights):
@@ -143,7 +143,6 @@ def test_no_flight_of_another_laboratory_is_refused(shared_flights):
     vehicle = eqx.tree_at(lambda a: a.rotor_positions, CRAZYFLIE, scale * np.asarray(CRAZYFLIE.rotor_positions))
     for path in sorted((shared_flights / "nanobench").glob("*.csv")):
         parts = parts_of(path, vehicle)
-        assert motor_clock_note(parts, CRAZYFLIE) == ""
         for airframe in (vehicle, turned(vehicle, "rotor_spins")):
             assert refused_note(opposites(parts, airframe)) == ""
         assert refused_note(opposites(parts, turned(vehicle, "rotor_positions")))

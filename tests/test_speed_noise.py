@@ -6,7 +6,7 @@ import scipy.signal
 from helpers import CRAZYFLIE
 
 from jaxos4.logs import Recording
-from jaxos4.recording.speed_noise import without_noise
+from jaxos4.recording.noise import without_noise
 
 DT = 0.004
 

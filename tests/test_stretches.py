@@ -10,8 +10,7 @@ from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.recording import Recording, read_recording, stretches
 from jaxos4.recording.motion import excitation
-from jaxos4.recording.pieces import cut
-from jaxos4.recording.usable import Stretch, nothing_usable
+from jaxos4.recording.stretches import Stretch, cut, nothing_usable
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)

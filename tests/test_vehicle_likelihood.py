@@ -20,8 +20,9 @@ from jaxos4.identification.fit import fit_case
 from jaxos4.identification.results import Constant, HeldParameter, SampleTime
 from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, shortest
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.recording.pieces import as_recordings, averaged
-from jaxos4.recording.preparation import prepare
+from jaxos4.logs import as_recordings
+from jaxos4.recording import averaged
+from jaxos4.recording.prepared import prepare
 from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.gains import LogNoise
 from jaxos4.shooting.innovations import SETTLING

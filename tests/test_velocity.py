@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxos4.recording import Recording
-from jaxos4.recording.velocity import measures_velocity, velocity_of
+from jaxos4.recording.motion import measures_velocity, velocity_of
 
 G, FORGETS, SECONDS = 9.81, 2.0, 20.0
 ANGLES, VELOCITY, RATES = [6, 8, 10], [1, 3, 5], [7, 9, 11]

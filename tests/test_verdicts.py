@@ -24,8 +24,8 @@ from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, headline, outcome, verdict_of
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
-from jaxos4.recording.pieces import cut
-from jaxos4.recording.preparation import prepare
+from jaxos4.recording.prepared import prepare
+from jaxos4.recording.stretches import cut
 
 pytestmark = pytest.mark.slow
 

@@ -20,7 +20,7 @@ import jaxos4
 from jaxos4.errors import InputError
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.recording import Recording
-from jaxos4.recording.velocity import rotations_to_body
+from jaxos4.recording.motion import rotations_to_body
 from jaxos4.results import NINETY_FIVE
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "closed_loop"), str(Path(__file__).resolve().parents[1])]

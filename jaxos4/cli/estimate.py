@@ -96,9 +96,8 @@ def _subject(
     `given`: whether the user gave the airframe.
     """
     from ..models import MODELS
-    from ..recording.pieces import vehicle_evidence
 
-    shown = (f"{each.name} {why}" for each in recordings if (why := vehicle_evidence(each)))
+    shown = (f"{each.name} {why}" for each in recordings if (why := each.vehicle_evidence))
     evidence = next(shown, "") if model is None else ""
     if model != "flight" and not evidence:
         return MODELS[model or _PUBLISHED](vehicle), ""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..flight import STATE_NAMES, Flight
-from ..recording.motion import white_noise
+from ..recording.noise import white_noise
 from .motion import PARTS, departures, inverse, product, turned
 from .prediction import known_mean
 

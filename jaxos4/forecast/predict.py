@@ -12,10 +12,9 @@ from jaxtyping import Float, Int
 from .._custom_types import as_float
 from ..errors import InputError
 from ..identification import Identification
+from ..logs import Recording, Source, as_recording
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
-from ..recording import preparation
-from ..recording.pieces import Recording, Source, as_recording
-from ..recording.preparation import Prepared
+from ..recording.prepared import Prepared, prepare
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .measured import Measured, constant_rates, regressed
@@ -118,7 +117,7 @@ def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) 
     if sample_time is not None and not sample_time >= 0.99 * recording.dt:
         raise InputError(f"`sample_time` {sample_time:g}: {name} has one sample every {recording.dt:.4g} s; give that.")
     step = max(vehicle.sample_time, recording.dt) if sample_time is None else sample_time
-    (prepared,) = preparation.prepare([recording], airframe, sample_time=step, holdout=0.0, predicted=True)
+    (prepared,) = prepare([recording], airframe, sample_time=step, holdout=0.0, predicted=True)
     for term in vehicle.model.terms:
         if lacking := (TERMS[term].needs & _INPUTS) - prepared.available:
             raise InputError(f"{name}: has no {' and '.join(sorted(lacking))}, which the term {term} needs; log it.")

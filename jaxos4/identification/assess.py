@@ -10,8 +10,8 @@ from ..analysis.evaluation import evaluate
 from ..analysis.identifiability import Identifiability, identifiability
 from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
+from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
-from ..recording.pieces import Recording, as_recordings
 from .fit import fit_flight
 from .problem import Intervals, bracket_of, flight_problem
 from .results import finite_or_none, has_answer

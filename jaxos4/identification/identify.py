@@ -12,9 +12,9 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..flight import CHANNEL_NAMES
+from ..logs import Source, as_recording, as_recordings
 from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
-from ..recording.pieces import Source, as_recording, as_recordings
 from .answers import channel_fits
 from .fit import Fit, fit_case
 from .judge import judge

@@ -11,7 +11,7 @@ from .._custom_types import as_float
 from ..analysis.frequency_response import frequency_response
 from ..analysis.prediction import Predictions
 from ..models.flight_model import FlightModel
-from ..recording.motion import OVER_NOISE, WEAK
+from ..recording.motion import EXCITED
 from ..results import meaning, result_names
 from ..shooting import with_room
 from .answers import AXES, INVERSE, overwhelmed, parameter_table, rigid_body, vehicle_constants
@@ -140,6 +140,6 @@ def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:
     for (rate, axis), measured in zip(AXES.items(), np.moveaxis(predicted.measured, 2, 0), strict=True):
         noise = fit.disturbances[rate].sensor if rate in fit.disturbances else 0.0
         seen = measured[np.isfinite(measured)]
-        if not seen.size or seen.std() < max(WEAK, OVER_NOISE * noise):
+        if not seen.size or seen.std() < max(EXCITED.weak, EXCITED.over_noise * noise):
             still.append(axis)
     return tuple(still)

@@ -13,13 +13,13 @@ from ..airframe import PRESETS, Airframe
 from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, Hybrid, make_estimator
+from ..logs import Recording
 from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..networks.file import load_network
 from ..recording.checks import KINEMATIC, Finding, self_checks
-from ..recording.pieces import Recording
 from ..shooting import InnovationsProblem, ShootingProblem
 from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, network_for, network_provenance
 from .results import Provenance

@@ -14,11 +14,11 @@ from .._custom_types import as_float
 from ..bracket import Bracket
 from ..errors import InputError, named, shortened
 from ..flight import STATE_NAMES
+from ..logs import Recording
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
 from ..noise import SENSOR_SIGMA
-from ..recording.pieces import Recording
 from ..shooting import ShootingProblem, Unknowns
 
 # A bracket, or `[lower, upper]` by parameter name; the model's default for all others.

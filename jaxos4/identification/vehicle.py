@@ -16,11 +16,10 @@ from ..errors import InputError, TrainingError, shortened
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
+from ..logs import Recording
 from ..models.flight_model import FlightModel
 from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
-from ..recording import preparation
-from ..recording.pieces import Recording
-from ..recording.preparation import Prepared
+from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import input_innovations
 from .prepare import Case, Progress, VehicleSettings, airframe_name, name_and_class, versions
@@ -58,9 +57,9 @@ def prepare_vehicle(
         )
     if network is not None or isinstance(estimator, Hybrid):
         raise InputError("`network`: a vehicle's network is trained for its own flights; use `estimator` hybrid.")
-    by_default = preparation.HOLDOUT if validate is None else 0.0
+    by_default = HOLDOUT if validate is None else 0.0
     holdout = by_default if settings.holdout is None else settings.holdout
-    prepared = preparation.prepare(
+    prepared = prepare(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
     # All sample times share one program, with room for the shortest.
@@ -202,7 +201,7 @@ def _prepare_other(
             f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
         )
     step = float(prepared.fitted.dt)
-    (other,) = preparation.prepare([validate], model.airframe, sample_time=step, holdout=0.0, predicted=True)
+    (other,) = prepare([validate], model.airframe, sample_time=step, holdout=0.0, predicted=True)
     for term in model.terms:
         if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
             raise InputError(

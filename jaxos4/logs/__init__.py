@@ -5,13 +5,17 @@ Each log format is one file and one line in `FORMATS`, or an entry point of anot
 
 import itertools
 import os
+import re
 import warnings
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
 
 from .._registry import Registry
 from ..airframe import Airframe
 from ..errors import printable
-from ..flight import Flight
+from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from .ardupilot import ARDUPILOT
 from .assemble import recording_of
 from .blackbox import BLACKBOX
@@ -30,13 +34,31 @@ from .table import (
     refuse,
 )
 from .ulog import ULOG
-from .unread import unread_kind
+from .values import without_impossible
 
 FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
 _OTHERS: Registry[LogFormat] = Registry("jaxos4.log_formats", {})
 
-_FIRST_BYTES = 1 << 18
+# Files that no reader takes, by their first bytes: what they are, and how to make a log of them that is read.
+_IN_PYTHON = "read it in Python, and give its arrays to jaxos4.read_log"
+_UNREAD = {
+    rb"PK\x03\x04": ("an archive (zip, or .xlsx, .npz)", f"unpack it, export its table as CSV, or {_IN_PYTHON}"),
+    rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|\x04\x22\x4d\x18": ("a compressed file", "unpack it"),
+    rb"\x89HDF": ("an HDF5 file (netCDF, MATLAB 7.3)", f"{_IN_PYTHON} (xarray.open_dataset, h5py)"),
+    rb"MATLAB 5": ("a MATLAB file", f"{_IN_PYTHON} (scipy.io.loadmat), or export CSV by `writetable`"),
+    rb"\x93NUMPY": ("a NumPy file", f"{_IN_PYTHON} (numpy.load)"),
+    rb"PAR1|ARROW1|FEA1": ("a Parquet or Arrow file", f"{_IN_PYTHON} (pandas.read_parquet, pandas.read_feather)"),
+    rb"\xd0\xcf\x11\xe0": ("an Excel file", "export it as CSV"),
+    rb"\xff\xfe|\xfe\xff": ("text in UTF-16", "save it as CSV in UTF-8"),
+    rb"FMT, ": ("a text log of ArduPilot", "give the .BIN file of which it was made"),
+    rb"\0[\x03-\x07].{6}[\xfd\xfe]": ("a telemetry log of MAVLink (.tlog)", "give the log of the vehicle's own card"),
+    rb".{16}BUILD|.{242}DJI": ("a log of DJI", "decode it by DatCon, and give its CSV with a column map"),
+    rb"[^\n]{0,4000}[\0-\x08\x0e-\x1f]": ("of a kind that is not known", "export it as CSV, and give a column map"),
+}
+
+Source = Flight | Recording | str | os.PathLike[str] | Any
+"""A flight, the path of a log, or its arrays as `read_log` takes them."""
 
 
 def read_log(
@@ -108,9 +130,47 @@ def log_format(path: Path) -> LogFormat:
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
-        begin = file.read(_FIRST_BYTES) if file.seekable() else b""
+        begin = file.read(1 << 18) if file.seekable() else b""
     formats = itertools.chain(FORMATS[:-1], _OTHERS.values())
     kind = next((each for each in formats if each.recognises(begin)), FORMATS[-1])
-    if kind is FORMATS[-1] and (unread := unread_kind(begin)):
-        refuse(path, f"{unread}. Logs that are read: {', '.join(each.label for each in (*FORMATS, *_OTHERS.values()))}")
+    unread = (each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL))
+    if kind is FORMATS[-1] and (known := next(unread, None)):
+        what, remedy = known
+        labels = ", ".join(each.label for each in (*FORMATS, *_OTHERS.values()))
+        refuse(path, f"is {what}; {remedy}. Logs that are read: {labels}")
     return kind
+
+
+def as_recordings(
+    flights: Source | Sequence[Source], name: str = "flight", airframe: Airframe | None = None
+) -> tuple[Recording, ...]:
+    """One or several flights as recordings. A flight without a name is called `name`; several are numbered from 1.
+
+    `airframe`: of logs that are read, see `jaxos4.read_log`.
+    """
+    single = isinstance(flights, Recording | str) or not isinstance(flights, Sequence)
+    every = [flights] if single else cast(Sequence[Any], flights)
+    names = [f"{name} {i + 1}" if len(every) > 1 else name for i in range(len(every))]
+    return tuple(as_recording(each, one, airframe) for each, one in zip(every, names, strict=True))
+
+
+def as_recording(flight: Source, name: str = "flight", airframe: Airframe | None = None) -> Recording:
+    """A flight as a recording of this name, without impossible values. A recording stays as it is.
+
+    A path, or arrays by their names, are read as a log of this `airframe`.
+
+    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible, or if a log cannot be used.
+    """
+    if isinstance(flight, Recording):
+        return flight
+    if not isinstance(flight, Flight):
+        return read_recording(flight, airframe)
+    found = Recording.of(flight, name)
+    columns = {"t": found.time, **dict(zip(CHANNEL_NAMES, found.channels.T, strict=True))}
+    table = without_impossible(Table(name, columns, first_row=None))
+    if not table.impossible:
+        return found
+    channels = np.stack([table.columns[each] for each in CHANNEL_NAMES], axis=1)
+    states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
+    specific = None if found.specific_force is None else force
+    return found._replace(states=states, specific_force=specific, notes=(table.impossible_note,))

@@ -8,30 +8,23 @@ import numpy as np
 from ..airframe import Airframe
 from ..errors import printable
 from ..flight import CHANNEL_NAMES, STATE_NAMES
-from .sampling import UNIFORM, grid_size, held_regularly, logged_rate, resample, unwrap
-from .table import COMMAND_NAMES, LIMITS, MAX_ROWS, PITCH, SPEED_NAMES, Recording, Sampling, Table, counted, quoted
+from .sampling import UNIFORM, grid_size, held_regularly, last_measured, logged_rate, resample, unwrap
+from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, Recording, Sampling, Table, counted, listed
+from .values import LIMITS, PITCH, without_impossible
 
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
-
-_MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
-_STILL = 100  # samples of an accelerometer that never change: it is off
-_REPEATED = 0.9  # values that change at less than this share of the rate of their rows were repeated
-_SHORTEST_STEP, _LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
 
 
 def recording_of(
     table: Table, notes: tuple[str, ...] = (), airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> Recording:
     """Make a recording from the columns of a log and the `notes` of its reader; see `read_log`."""
-    shown = ", ".join(map(quoted, table.unknown[:8])) + ", ..." * (len(table.unknown) > 8)
-    found = [*notes, *([f"unknown columns are ignored: {shown}"] if table.unknown else [])]
+    found = [*notes, *([f"unknown columns are ignored: {listed(table.unknown, 8)}"] if table.unknown else [])]
     table = table._replace(columns={n: column for n, column in table.columns.items() if not np.isnan(column).all()})
     if not table.holds("t"):
-        names = ", ".join(map(quoted, [*(table.names.get(each, each) for each in table.columns), *table.unknown][:20]))
-        table.refuse(
-            f"there is no time; each row needs its time [s]. There are {names}: rename one, or give a column map",
-            column="t",
-        )
+        names = listed([*(table.names.get(each, each) for each in table.columns), *table.unknown])
+        what = f"there is no time; each row needs its time [s]. There are {names}: rename one, or give a column map"
+        table.refuse(what, column="t")
     if not any(map(table.holds, STATE_NAMES)):
         table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
     # Cells that hold no value were not logged, also those of a rotor.
@@ -42,7 +35,7 @@ def recording_of(
     for name in filter(table.holds, motors):
         if np.isnan(table.columns[name][0]):
             table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
-    table = table.without_impossible(LIMITS | PITCH)
+    table = without_impossible(table, LIMITS | PITCH)
     _check_heading(table)
     if table.impossible:
         found.append(table.impossible_note)
@@ -53,7 +46,7 @@ def recording_of(
     t = table.columns["t"]
     table = table._replace(columns={"t": t})  # frees the memory of a long log
     samples = grid_size(t, dt)
-    if samples > min(MAX_ROWS, _MOST_SAMPLES + 10 * t.size):
+    if samples > min(MAX_ROWS, 10_000 + 10 * t.size):  # a log that consists mostly of gaps is more than one flight
         row = int(np.argmax(np.diff(t)))
         what = f"comes after a gap of {t[row + 1] - t[row]:.6g} s: at the median step of {dt:.3g} s the flight would "
         table.refuse(what + f"have {samples:.3g} samples; cut the file there", index=row + 1, column="t")
@@ -86,14 +79,17 @@ def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
         source, at = table.names.get(name, name), table.columns["t"][logged]
         changes = at[1:][np.diff(table.columns[name][logged]) != 0]
         rate, of_changes = logged_rate(at), logged_rate(changes)
-        if held_regularly(changes) and of_changes < _REPEATED * rate:
+        if held_regularly(changes) and of_changes < 0.9 * rate:
             source, rate = f"the values of {source} change so often", of_changes
         found.append(Sampling(source, rate))
     return min(found, key=lambda each: each.rate, default=None)
 
 
-def _check_time(table: Table) -> float:
-    """The median time between rows [s]. Refuses a time that is missing, does not increase, or is not in seconds."""
+def _check_time(table: Table, *, shortest: float = 1e-6, longest: float = 2.0) -> float:
+    """The median time between rows [s]. Refuses a time that is missing, does not increase, or is not in seconds.
+
+    `shortest`, `longest`: the limits of the median time [s].
+    """
     t = table.columns["t"]
     _refuse_any(table, "t", np.isnan(t), "is empty; each row needs its time")
     _refuse_any(table, "t", np.abs(t) > LIMITS["t"].largest, f"is {{:g}} s; {LIMITS['t'].advice}")
@@ -106,9 +102,9 @@ def _check_time(table: Table) -> float:
             what = f"repeats {t[index]:.9g} s of row {row}; time must increase: delete one of the two rows"
         table.refuse(what, index=index + 1, column="t")
     dt = float(np.median(step))
-    if dt < _SHORTEST_STEP:
+    if dt < shortest:
         table.refuse(f"has rows {dt:.3g} s apart, less than a microsecond; t is in seconds: multiply", column="t")
-    if dt > _LONGEST_STEP:
+    if dt > longest:
         what = f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide"
         table.refuse(what, column="t")
     return dt
@@ -160,7 +156,7 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
     if not empty.any():
         return column
     impossible, _ = table.impossible.get(name, (0, ""))
-    last = np.maximum.accumulate(np.where(empty, np.argmin(empty), np.arange(column.size)))
+    last = last_measured(~empty)
     longest, cells = (t - t[last]).max(), int(np.count_nonzero(empty)) - impossible
     if cells:
         filled = f"{counted(cells, 'empty cell')} filled with the value before, for up to {longest:.3g} s"
@@ -179,8 +175,8 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
             notes.append(f"{name}: {counted(jumps, 'jump')} of 2 pi removed")
     force = channels[:, len(STATE_NAMES) :]
     measured = force[:, np.isfinite(force).any(axis=0)]
-    # No accelerometer lies still to the last bit.
-    if len(measured) >= _STILL and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
+    # No accelerometer lies still to the last bit for so many samples.
+    if len(measured) >= 100 and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
         notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
         force[:] = np.nan
     return channels

@@ -16,24 +16,19 @@ import numpy as np
 from ..airframe import STANDARD_GRAVITY
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
-from .sampling import HALF_TURN, attitude, in_order
+from .messages import ANGLES, FORCES, RATES
+from .sampling import HALF_TURN, euler_angles, in_order
 from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, opened, order_note, read_bytes, refuse
 
 _MAGIC = b"H Product:Blackbox"
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
-_MOST_SETTINGS = 5000  # lines above the header
-_LONGEST_LINE = 1 << 16
-_LARGEST = 1 << 29  # bytes of a file: more than an hour of flight
-_BETWEEN = 1.0  # [s], put between sessions
+_LONGEST_HEADER = 5000, 1 << 16  # lines of settings, and characters of one
 _DEGREE = math.pi / 180
 _NONE = np.zeros(0)
-_POLES = 14
-_COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
 _TIMES = ("time (us)", "time")
-_RATES = ("gyroUnfilt", "gyroADCafterRpm", "gyroADC")
+_GYROS = ("gyroUnfilt", "gyroADCafterRpm", "gyroADC")
 _SPEEDS = ("omegaUnfiltered", "omega", "eRPM")  # of Indiflight in rad/s
 _ATTITUDES = {"quat": 4, "imuQuaternion": 3, "attitude": 3}  # of Indiflight, Betaflight, INAV: so many numbers
-_UNIT_QUATERNION = 0x7FFF
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
 _VOLTAGE, _KNOWN_UNIT = "vbatLatest", re.compile(r"Betaflight ([4-9]|\d{2,})\.")
 _EXPORT = "export it as CSV by Blackbox Explorer"
@@ -41,7 +36,7 @@ _DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _KNOWN = (
     *_TIMES,
-    *(f"{name}[{i}]" for name in (*_RATES, "accSmooth") for i in range(3)),
+    *(f"{name}[{i}]" for name in (*_GYROS, "accSmooth") for i in range(3)),
     *(f"{name}[{i}]" for name, count in _ATTITUDES.items() for i in range(count)),
     _VOLTAGE,
     *(f"{name}[{i}]" for name in (*_SPEEDS, "motor") for i in range(8)),
@@ -112,7 +107,7 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
 
 def _recognises(begin: bytes) -> bool:
     lines = begin.decode("utf-8-sig", errors="replace").splitlines()
-    return begin.startswith(_MAGIC) or any(_is_header(line) for line in lines[:_MOST_SETTINGS])
+    return begin.startswith(_MAGIC) or any(_is_header(line) for line in lines[: _LONGEST_HEADER[0]])
 
 
 BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
@@ -134,8 +129,8 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
     """The settings above the header, and the number of their lines."""
     settings: Settings = {}
     with opened(path) as file:
-        for number in range(_MOST_SETTINGS):
-            line = file.readline(_LONGEST_LINE)
+        for number in range(_LONGEST_HEADER[0]):
+            line = file.readline(_LONGEST_HEADER[1])
             if _is_header(line):
                 return settings, number
             if not line:
@@ -152,12 +147,12 @@ def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
 
     A header ends at the first line that does not begin with `H `, or is not text.
     """
-    content, found = read_bytes(path, _LARGEST), []
+    content, found = read_bytes(path, 1 << 29), []  # more than an hour of flight
     places = [match.start() for match in re.finditer(_MAGIC, content)]
     for at, end in itertools.pairwise([*places, len(content)]):
         settings: Settings = {}
         while content.startswith(b"H ", at, end):
-            stop = content.find(b"\n", at, min(at + _LONGEST_LINE, end))
+            stop = content.find(b"\n", at, min(at + _LONGEST_HEADER[1], end))
             line = content[at:stop]
             if stop < 0 or not line.isascii():
                 break
@@ -168,8 +163,8 @@ def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
     return found
 
 
-def _decoded(path: Path) -> _Log:
-    """A `.bbl` or `.BFL` file: all sessions, one after the other. Raises `InputError`."""
+def _decoded(path: Path, *, between: float = 1.0) -> _Log:
+    """A `.bbl` or `.BFL` file: all sessions, with a time `between` [s] them. Raises `InputError`."""
     notes: list[str] = []
     found: list[tuple[Settings, Columns]] = []
     every = _sessions(path)
@@ -189,11 +184,11 @@ def _decoded(path: Path) -> _Log:
         notes.append(f"{other} sessions are ignored: their settings are not those of the longest one")
     if len(same) > 1:
         lengths = ", ".join(f"{columns['time'][-1] / 1e6:.1f}" for columns in same)
-        notes.append(f"{len(same)} sessions, of {lengths} s, follow each other with {_BETWEEN:g} s between them")
+        notes.append(f"{len(same)} sessions, of {lengths} s, follow each other with {between:g} s between them")
     begin = 0.0
     for columns in same:
         columns["time"] += begin
-        begin = columns["time"][-1] + 1e6 * _BETWEEN
+        begin = columns["time"][-1] + 1e6 * between
     joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
     return _Log(path, None, longest, joined, {}, {}, notes)
 
@@ -214,16 +209,16 @@ def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
 
 
 def _add_rates(log: _Log) -> None:
-    field = next((name for name in _RATES if log.raw.keys() >= {f"{name}[{i}]" for i in range(3)}), None)
+    field = next((name for name in _GYROS if log.raw.keys() >= {f"{name}[{i}]" for i in range(3)}), None)
     if field is None:
         refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
     fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
     log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}"])
     unit = _DEGREE / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-    log.add({name: f"{field}[{i}]" for i, name in enumerate("pqr")}, unit)
+    log.add({name: f"{field}[{i}]" for i, name in enumerate(RATES)}, unit)
 
 
-def _add_rotors(log: _Log) -> None:
+def _add_rotors(log: _Log, *, usual: int = 14) -> None:
     raw = log.raw
     more = (f"{name}[{i}]" for name in (*_SPEEDS, "motor") for i in range(4, 8))
     if any(np.ptp(_finite(raw[name])) > 0 for name in more if name in raw):
@@ -234,8 +229,8 @@ def _add_rotors(log: _Log) -> None:
     if (field := next(turning, None)) is not None:
         poles = log.setting("motor_poles", 2, 100)
         if field == "eRPM" and poles is None:
-            log.notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle")
-        unit = 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60 if field == "eRPM" else 1.0
+            log.notes.append(f"eRPM is turned into speeds with {usual} motor poles, the default: check the vehicle")
+        unit = 100 / ((poles or usual) / 2) * 2 * math.pi / 60 if field == "eRPM" else 1.0
         log.add(dict(zip(SPEED_NAMES, every[field], strict=True)), unit)
         return
     for name in commands:
@@ -263,25 +258,25 @@ def _add_force(log: _Log) -> None:
     one = log.setting("acc_1G", 1, 65535)
     if one is None:
         median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
-        one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
+        one = min((256, 512, 1024, 2048, 4096, 8192), key=lambda g: abs(math.log(g / max(median, 1e-9))))
         log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
-    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), STANDARD_GRAVITY / one)
+    log.add(dict(zip(FORCES, names, strict=True)), STANDARD_GRAVITY / one)
 
 
 def _add_attitude(log: _Log) -> None:
     """Roll, pitch and yaw, if the log holds an attitude. That of Indiflight has y to the right and z down."""
     field, values = next(((f, v) for f, n in _ATTITUDES.items() if (v := log.vector(f, n)) is not None), ("", _NONE))
     if field == "quat":
-        angles = attitude(values) * HALF_TURN
+        angles = euler_angles(values) * HALF_TURN
     elif field == "imuQuaternion":
-        vector = values / _UNIT_QUATERNION
-        angles = attitude(np.column_stack([np.sqrt(np.maximum(1 - (vector**2).sum(axis=1), 0.0)), vector]))
+        vector = values / 0x7FFF
+        angles = euler_angles(np.column_stack([np.sqrt(np.maximum(1 - (vector**2).sum(axis=1), 0.0)), vector]))
     elif field == "attitude":
         angles = values * _DEGREE / 10 * [1, 1, -1]
     else:
         return
-    log.names.update(dict.fromkeys(("phi", "theta", "psi"), field))
-    log.columns.update(zip(("phi", "theta", "psi"), angles.T, strict=True))
+    log.names.update(dict.fromkeys(ANGLES, field))
+    log.columns.update(zip(ANGLES, angles.T, strict=True))
 
 
 def _turn(log: _Log) -> None:

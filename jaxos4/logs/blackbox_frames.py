@@ -84,10 +84,10 @@ def _kinds(settings: dict[str, str]) -> dict[int, _Kind]:
         if not same or (letter == "P" and _I in kinds and len(predictors) != len(kinds[_I].names)):
             raise BadHeader(_BAD)
         groups: list[tuple[int, int]] = []
-        for encoding, run in itertools.groupby(encodings):
+        for encoding, group in itertools.groupby(encodings):
             if encoding not in _TOGETHER:
                 raise BadHeader(f"its frames have an encoding that is not known, {encoding}")
-            count, most = len(list(run)), _TOGETHER[encoding]
+            count, most = len(list(group)), _TOGETHER[encoding]
             groups += [(encoding, min(most, count - done)) for done in range(0, count, most)]
         if _TAG8_4 in encodings and settings.get("Data version", "2") != "2":
             raise BadHeader("its frames are of version 1")
@@ -215,7 +215,7 @@ class _Stream:
         Frames are trusted when the next complete one follows the last of them: else one was lost among them.
         """
         data, size = self.data, len(self.data)
-        block: list[list[int]] = []  # a complete frame, and the differences after it
+        run: list[list[int]] = []  # a complete frame, and the differences after it
         intact = False  # no difference can be trusted before the first complete frame
         while self.numbers.at < size and not self.ended:
             begin, letter = self.numbers.at, data[self.numbers.at]
@@ -228,23 +228,23 @@ class _Stream:
             if values is None or self.numbers.at - begin > _LONGEST_FRAME or not whole:
                 following = _MARKER.search(data, begin + 1)
                 self.numbers.at = following.start() if following else size
-                self.damaged += intact or not block
+                self.damaged += intact or not run
                 intact = False
             elif letter == _I:
                 self._complete(values, _I, values, values)
                 last = self.last
                 if intact and last is not None and values[self.iteration] != last[0] + self._step(last[0]):
                     self.damaged += 1  # a frame is missing between the last one and this one
-                    del block[1:]
-                yield from block
+                    del run[1:]
+                yield from run
                 intact = self._follows(values)
-                block = [values] if intact else []
+                run = [values] if intact else []
             elif letter == _P and intact:
-                self._complete(values, _P, block[-1], block[max(len(block) - 2, 0)])
+                self._complete(values, _P, run[-1], run[max(len(run) - 2, 0)])
                 intact = self._follows(values)
                 self.damaged += not intact
-                block += [values] * intact
-        yield from block
+                run += [values] * intact
+        yield from run
 
     def _follows(self, values: list[int]) -> bool:
         """Whether a frame comes a moment after the last one; it is then the last one."""

@@ -11,14 +11,15 @@ import numpy as np
 from .._files import check_plain, read_toml
 from ..airframe import STANDARD_GRAVITY
 from ..flight import CHANNEL_NAMES, FORCE_NAMES
-from .sampling import Series, attitude, gyro_rows, logged_rate, unwrapped
-from .table import COMMAND_NAMES, SPEED_NAMES, LogFacts, Path, Sampling, Table, needed, quoted, refuse
+from .messages import ANGLES
+from .sampling import euler_angles
+from .table import COMMAND_NAMES, SPEED_NAMES, Path, Table, listed, quoted, refuse
 
 ColumnsGiven = Path | Mapping[str, Any] | None
 """A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
 
 PRESETS = {path.stem: path for path in sorted(FilePath(__file__).with_name("presets").glob("*.toml"))}
-QUATERNION, ANGLES = ("qw", "qx", "qy", "qz"), ("phi", "theta", "psi")
+QUATERNION = ("qw", "qx", "qy", "qz")
 _COLUMNS = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, *QUATERNION, "voltage")
 _DEGREE, _PWM = math.pi / 180, "PWM"
 _UNITS = {  # by the unit of a column: other units, in the column's
@@ -43,8 +44,6 @@ _UNIT_OF = {
     **dict.fromkeys(QUATERNION, "of a quaternion"),
 }
 _TURNED = {"q", "r", "theta", "psi", "y", "z", "vy", "vz", "ay", "az", "qy", "qz"}  # by half a turn about x
-_PWM_LEAST = 1000.0  # [us]
-_MOST_SHOWN = 20
 _REMEDY = "correct its unit or sign in the column map"
 
 
@@ -86,9 +85,8 @@ class ColumnMap(NamedTuple):
             if place is not None:
                 found[column] = place
             elif column in self.needed:
-                shown = ", ".join(map(quoted, names[:_MOST_SHOWN])) + ", ..." * (len(names) > _MOST_SHOWN)
                 what = f"there is no {quoted(source.names[0])}, which {self.name} names for {column}"
-                refuse(path, f"{what}. There are {shown}: name one of them")
+                refuse(path, f"{what}. There are {listed(names)}: name one of them")
         return found
 
     def converted(self, column: str, values: np.ndarray) -> np.ndarray:
@@ -156,7 +154,7 @@ def _source(name: str, column: str, value: Any) -> Source:
         refuse(
             name, f"may have a source, a unit ({units}, or a factor) and a sign (1 or -1); correct it", column=column
         )
-    return Source(tuple(names), float(factor) * sign, _PWM_LEAST if unit == _PWM else 0.0)
+    return Source(tuple(names), float(factor) * sign, 1000.0 if unit == _PWM else 0.0)  # [us] of no thrust
 
 
 def mapped_rows(table: Table, columns: ColumnMap) -> Table:
@@ -165,64 +163,12 @@ def mapped_rows(table: Table, columns: ColumnMap) -> Table:
     chosen = columns.chosen(table.path, lambda name: name if name in raw else None, names)
     found = {column: columns.converted(column, raw[place]) for column, place in chosen.items()}
     if found.keys() >= set(QUATERNION):
-        angles = attitude(np.column_stack([found[name] for name in QUATERNION]))
+        angles = euler_angles(np.column_stack([found[name] for name in QUATERNION]))
         found |= {name: x for name, x in zip(ANGLES, angles.T, strict=True) if name not in found}
         chosen |= dict.fromkeys(ANGLES, chosen["qw"])
     found = {name: values for name, values in found.items() if name not in QUATERNION}
     unknown = tuple(name for name in names if name not in chosen.values())
     return table._replace(columns=found, names=chosen, unknown=unknown, remedy=_REMEDY)
-
-
-def mapped_series(
-    path: Path, columns: ColumnMap, found: dict[str, Series], names: dict[str, str], notes: list[str]
-) -> Table:
-    """The table of columns that have times of their own.
-
-    **Arguments:**
-
-    - `found`: by column, its samples as the log holds them, in increasing time.
-    - `names`: the log's names of the columns.
-    - `notes`: to which this function adds.
-
-    **Raises:** `InputError` if body rates or rotors are missing, or do not overlap.
-    """
-    found = {name: Series(s.t, columns.converted(name, s.values)) for name, s in found.items()}
-
-    def together(*names: str) -> Series | None:
-        """Several columns at the times of the first."""
-        if not found.keys() >= set(names):
-            return None
-        t = found[names[0]].t
-        same = (found[name] for name in names)
-        values = [s.values[:, 0] if s.t is t else np.interp(t, s.t, s.values[:, 0]) for s in same]
-        return Series(t, np.column_stack(values))
-
-    rates = needed(path, together("p", "q", "r"), "body rates", f"name p, q and r in {columns.name}")
-    motors = [(kind, s) for kind in (SPEED_NAMES, COMMAND_NAMES) if (s := _turning(together(*kind))) is not None]
-    remedy = f"name omega1..4 or command1..4 in {columns.name}"
-    kind, rotors = needed(path, motors[0] if motors else None, "rotor speeds or commands", remedy)
-    quaternion, angles = together(*QUATERNION), together(*ANGLES)
-    if angles is None and quaternion is not None:
-        angles = Series(quaternion.t, attitude(quaternion.values))
-        names |= dict.fromkeys(ANGLES, names["qw"])
-    single = [n for n in found if n not in (*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, "p", "q", "r", "t")]
-    others = {
-        ANGLES: None if angles is None else unwrapped(angles.t, angles.values),
-        **{(n,): found[n] for n in single},
-    }
-    if kind is COMMAND_NAMES:
-        notes.append(f"commands are {names[kind[0]]}.., taken as fractions of full-scale rotor speed")
-    facts = LogFacts(Sampling(names[kind[0]], logged_rate(rotors.t)), Sampling(names["p"], logged_rate(rates.t)))
-    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=facts)
-    return gyro_rows(table, rates, rotors, measured=kind is SPEED_NAMES, others=others)[1]
-
-
-def _turning(rotors: Series | None) -> Series | None:
-    """The samples with all four rotors; `None` if one of them never turns."""
-    if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
-        return None
-    whole = np.isfinite(rotors.values).all(axis=1)
-    return Series(rotors.t[whole], rotors.values[whole]) if np.count_nonzero(whole) > 1 else None
 
 
 def array_table(data: Any, columns: ColumnMap) -> Table:
@@ -243,8 +189,8 @@ def array_table(data: Any, columns: ColumnMap) -> Table:
         if values.dtype.kind == "M":
             values = (values - values.flat[0]) / np.timedelta64(1, "s") if values.size else np.empty(0)
         if values.dtype.kind in "fiu" and values.ndim in (1, 2):
-            parts = values.T.astype(float) if values.ndim == 2 else [values.astype(float)]
-            raw |= {f"{name}[{i}]" if values.ndim == 2 else str(name): part for i, part in enumerate(parts)}
+            every = np.atleast_2d(values.T).astype(float)
+            raw |= {f"{name}[{i}]" if values.ndim == 2 else str(name): own for i, own in enumerate(every)}
     unread = tuple(str(name) for name in names if not any(key.partition("[")[0] == str(name) for key in raw))
     table = mapped_rows(Table("data", raw, unread, first_row=None), columns)
     sizes = {name: values.size for name, values in table.columns.items()}

@@ -21,7 +21,6 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # floa
 _IN_NUMBERS = dict.fromkeys(map(ord, "-+.0123456789eE,\n"))
 # An empty cell becomes NaN: in its first and second neighbour, at the end of a line, at its beginning.
 _FILLED = ((",,", ",nan,"), (",,", ",nan,"), (",\n", ",nan\n"), ("\n,", "\nnan,"))
-_BLOCK = 10_000  # lines that are read at once
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
@@ -44,10 +43,19 @@ def _read_neurobem(path: Path) -> tuple[Table, tuple[str, ...]]:
 
 
 NEUROBEM = LogFormat("NeuroBEM", "NeuroBEM CSV", _is_neurobem, _read_neurobem, read_mapped)
-CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()), read_mapped)
+CSV = LogFormat(
+    "CSV",
+    "flight CSV",
+    lambda begin: True,
+    lambda path: (read_table(path, COLUMN_NAMES), ()),
+    read_mapped,
+    of_vehicles=False,
+)
 
 
-def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = ()) -> Table:
+def read_table(
+    path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = (), lines_at_once: int = 10_000
+) -> Table:
     """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
 
     The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored.
@@ -56,6 +64,7 @@ def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Co
 
     - `skip`: number of lines before the header.
     - `missing`: cells that mean "not measured", in addition to the empty cell.
+    - `lines_at_once`: for the memory; it changes no number.
 
     **Raises:** `InputError`, one line with file, row and column, whatever the file contains.
     """
@@ -66,10 +75,10 @@ def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Co
         header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
         wanted = {name: header.index(name) for name in header if name in known}
         lines = iter(functools.partial(file.readline, _LONGEST_LINE), "")
-        while block := list(itertools.islice(lines, _BLOCK)):
-            numbers = _plain_numbers(block, len(header), missing)
+        while batch := list(itertools.islice(lines, lines_at_once)):
+            numbers = _plain_numbers(batch, len(header), missing)
             if numbers is None:
-                rows = [*_rows(path, block, lines, len(header), skip + 2 + count)]
+                rows = [*_rows(path, batch, lines, len(header), skip + 2 + count)]
                 numbers = np.array([_numbers(path, wanted, missing, *row) for row in rows])
                 found.append(numbers.reshape(len(rows), len(wanted)))
             else:
@@ -170,11 +179,11 @@ def _array(text: str) -> np.ndarray:
     return np.loadtxt(text.splitlines(), delimiter=",", comments=None, ndmin=2)
 
 
-def _rows(path: Path, block: list[str], rest: Iterable[str], width: int, row: int) -> Iterator[tuple[list[str], int]]:
-    """The cells of each line of a block, and its row, from `row` on; without the blank lines at the end of the file."""
-    for i, line in enumerate(block):
+def _rows(path: Path, batch: list[str], rest: Iterable[str], width: int, row: int) -> Iterator[tuple[list[str], int]]:
+    """The cells of each line of a batch, and its row, from `row` on; without the blank lines at the end of the file."""
+    for i, line in enumerate(batch):
         if line.isspace():
-            if not all(map(str.isspace, itertools.chain(block[i:], rest))):
+            if not all(map(str.isspace, itertools.chain(batch[i:], rest))):
                 refuse(path, "is blank; delete it", row=row + i)
             return
         cells = _cells(path, line.rstrip("\n"), row + i)

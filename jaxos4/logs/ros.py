@@ -5,23 +5,37 @@ A column's source is `/topic.field.field[0]`. A topic may have a namespace befor
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from ..errors import InputError
-from .columns import PRESETS, ColumnMap, column_map, mapped_series
-from .sampling import Series, in_order
-from .table import MAX_ROWS, LogFormat, Path, Table, opened, quoted, refuse
+from .columns import PRESETS, QUATERNION, ColumnMap, column_map
+from .messages import ANGLES, RATES, Fields, Messages, Names
+from .sampling import Series, euler_angles
+from .table import (
+    COMMAND_NAMES,
+    MAX_ROWS,
+    SPEED_NAMES,
+    LogFormat,
+    Path,
+    Table,
+    in_words,
+    listed,
+    needed,
+    opened,
+    quoted,
+    refuse,
+)
 
 _ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"rosbag2_bagfile_information:"
 _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it
 _FIELD = re.compile(r"[^.\[\]]+")
-_SAME_CLOCK = 0.5  # [s]: topics whose stamps are so far apart from when they were recorded have clocks of their own
 _STAMPS = (("timestamp_sample", 1000), ("timestamp", 1000))  # of PX4, and their unit [ns]
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
+_REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
 _NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag record -s mcap`), or convert it"
 
 
@@ -74,8 +88,7 @@ def _reader(path: Path) -> Any:
 
 
 def _refuse_damage(path: Path, error: Exception) -> NoReturn:
-    what = " ".join(str(error).split())[:120] or type(error).__name__
-    refuse(path, f"cannot be decoded ({what}); {_REPAIR}")
+    refuse(path, f"cannot be decoded ({in_words(error)}); {_REPAIR}")
 
 
 def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
@@ -92,16 +105,13 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
         fitting = (each for each in map(column_map, PRESETS) if _fits(each.chosen(path, held, topics)))
         columns = next(fitting, None)
         if columns is None:
-            shown = ", ".join(map(quoted, topics[:20])) + ", ..." * (len(topics) > 20)
-            what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {shown or 'none'}"
+            what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {listed(topics) or 'none'}"
             refuse(path, f"{what}: say in a column map which hold rates and motors, and give --columns map.toml")
         notes.append(f"columns are those of the preset {columns.name}")
     chosen = columns.chosen(path, held, topics)
-    found = _messages(path, reader, {*chosen.values()})
-    series = _series(path, found, notes, recorded=columns.recorded)
-    return mapped_series(
-        path, columns, {c: series[place] for c, place in chosen.items() if place in series}, chosen, notes
-    ), tuple(notes)
+    found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
+    log = Messages(path, found, _REMEDY, notes, prefixed=False)
+    return _table(log, columns, chosen), tuple(notes)
 
 
 def _fits(chosen: dict[str, str]) -> bool:
@@ -194,29 +204,69 @@ def _stamp(message: Any) -> int:
     return next((t * unit for name, unit in _STAMPS if (t := getattr(message, name, 0))), 0)
 
 
-def _series(path: Path, found: dict[str, _Topic], notes: list[str], *, recorded: bool) -> dict[str, Series]:
-    """By place, its samples. Times are stamps if all topics have some, of one clock; else those of the recorder."""
-    times = {
-        topic: (np.array(t.recorded, float), np.array(t.stamps, float)) for topic, t in found.items() if t.recorded
-    }
-    apart = [float(np.median(stamps - at)) for at, stamps in times.values()]
-    stamped = all((stamps > 0).all() for _, stamps in times.values())
-    if not recorded and not (stamped and np.ptp(apart or [0.0]) < _SAME_CLOCK * 1e9):
+def _timed(
+    found: dict[str, _Topic], notes: list[str], *, recorded: bool, clock: float = 0.5
+) -> dict[str, dict[int, Fields]]:
+    """The topics as messages. Times are stamps if all topics have some, of one clock; else those of the recorder.
+
+    Topics whose stamps are more than `clock` [s] apart from when they were recorded have clocks of their own.
+    """
+    found = {topic: each for topic, each in found.items() if each.recorded}
+    times = [(np.array(each.recorded, float), np.array(each.stamps, float)) for each in found.values()]
+    apart = [float(np.median(stamps - at)) for at, stamps in times]
+    stamped = all((stamps > 0).all() for _, stamps in times)
+    if not recorded and not (stamped and np.ptp(apart or [0.0]) < clock * 1e9):
         notes.append("times are those of the recorder, because not all topics have stamps of one clock")
         recorded = True
-    series: dict[str, Series] = {}
-    begin = min((min(t.recorded if recorded else t.stamps) for t in found.values() if t.recorded), default=0)
-    for topic, each in found.items():
-        if len(each.recorded) < 2:
-            continue
-        t = 1e-9 * np.array([at - begin for at in (each.recorded if recorded else each.stamps)], float)
-        kept = in_order(t)
-        if kept is None:
-            refuse(path, f'time runs backward in {topic}; give time = "recorded" in a column map, or record again')
-        if not kept.all():
-            notes.append(f"{topic}: {np.count_nonzero(~kept)} late messages are ignored")
-        same = t[kept]
-        for field, values in each.fields.items():
-            column = np.array(values, float)[kept]
-            series[f"{topic}.{field}"] = Series(same, np.where(np.isfinite(column), column, np.nan)[:, None])
-    return series
+    every = {topic: each.recorded if recorded else each.stamps for topic, each in found.items()}
+    begin = min(map(min, every.values()), default=0)
+    messages = {}
+    for topic, at in every.items():
+        fields = {f"{topic}.{field}": np.array(values, float) for field, values in found[topic].fields.items()}
+        messages[topic] = {0: fields | {"t": 1e-9 * np.array([each - begin for each in at], float)}}
+    return messages
+
+
+def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
+    """The table of the columns that a map has `chosen`. Raises `InputError` if body rates or rotors are missing."""
+    found: dict[str, Series] = {}
+    for topic in sorted({place.partition(".")[0] for place in chosen.values()}):
+        own = {column: place for column, place in chosen.items() if place.partition(".")[0] == topic}
+        series = log.series(topic, [*own.values()])
+        if series is not None:
+            numbers = {column: columns.converted(column, x) for column, x in zip(own, series.values.T, strict=True)}
+            found |= {column: Series(series.t, x[:, None]) for column, x in numbers.items()}
+
+    def together(names: Sequence[str]) -> Series | None:
+        """Several columns at the times of the first."""
+        if not found.keys() >= set(names):
+            return None
+        log.names.update((name, chosen[name]) for name in names)
+        t = found[names[0]].t
+        same = (found[name] for name in names)
+        values = [s.values[:, 0] if s.t is t else np.interp(t, s.t, s.values[:, 0]) for s in same]
+        return Series(t, np.column_stack(values))
+
+    rates = needed(log.path, together(RATES), "body rates", f"name p, q and r in {columns.name}")
+    turning = (_turning(together(kind)) for kind in (SPEED_NAMES, COMMAND_NAMES))
+    remedy = f"name omega1..4 or command1..4 in {columns.name}"
+    rotors = needed(log.path, next(filter(None, turning), None), "rotor speeds or commands", remedy)
+    if "command1" in log.names:
+        for name in SPEED_NAMES:  # named, but at rest
+            log.names.pop(name, None)
+        log.note_commands()
+    quaternion, angles = together(QUATERNION), together(ANGLES)
+    if angles is None and quaternion is not None:
+        angles = Series(quaternion.t, euler_angles(quaternion.values))
+        log.names.update(dict.fromkeys(ANGLES, chosen["qw"]))
+    single = found.keys() - {*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, *RATES, "t"}
+    others: dict[Names, Series | None] = {ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)}
+    return log.table(rates, rotors, others)[1]
+
+
+def _turning(rotors: Series | None) -> Series | None:
+    """The samples with all four rotors; `None` if one of them never turns."""
+    if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
+        return None
+    whole = np.isfinite(rotors.values).all(axis=1)
+    return Series(rotors.t[whole], rotors.values[whole]) if np.count_nonzero(whole) > 1 else None

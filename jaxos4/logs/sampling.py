@@ -1,23 +1,18 @@
 """Samples at any times, brought to other times: integrals, means, interpolation. Gaps stay unmeasured (NaN)."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, Table, counted, refuse
+from .table import counted
 
 UNIFORM = 0.01  # of a step: rows this close to a grid keep their values
-_REACH = 1.5  # times the step: measured samples further apart have a gap between them
+REACH = 1.5  # times the step: measured samples further apart have a gap between them
 _ROUNDING = 1e-6  # of a step: a smaller difference from a grid is a rounding error
 _FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
-_MEASURED = 0.45  # of a longer sample must be measured: below one half, because the ends have half of their rows
-_DISORDER = 0.01  # share of samples that may be late or repeated in an intact log
-_FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
-_PAUSE = 0.9  # [s]; a longer time between samples is a pause of the log, and not its rate
-_FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up to this share, are a rate
 
 HALF_TURN = np.array([1.0, -1.0, -1.0])
 """About x: from x forward, y right, z down to x forward, y left, z up."""
@@ -27,7 +22,7 @@ Rotors = Float[np.ndarray, "samples 4"]
 RowPositions = Float[np.ndarray, " rows"]
 Resampled = tuple[RowPositions, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
 PARTS = 4
-"""The parts of an averaged sample in which its rotor speeds are kept. Two of them are half of a sample."""
+"""The quarters of an averaged sample in which its rotor speeds are kept. Two of them are half of a sample."""
 
 
 class Series(NamedTuple):
@@ -122,7 +117,8 @@ def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Calla
         covered[:, some & gaps] = np.diff(share(edges), axis=0)
         means = np.full((grid.size, channels.shape[1]), np.nan)
         means[:, some] = np.diff(total(edges), axis=0)
-        means /= np.where(covered > _MEASURED * dt, covered, np.nan)
+        # Below one half, because the samples at the ends have half of their rows.
+        means /= np.where(covered > 0.45 * dt, covered, np.nan)
         return grid, speeds(grid), means
 
     return average
@@ -138,79 +134,34 @@ def at_rows(rows: RowPositions, series: Series, *, step: float | None = None) ->
     `step`: the rows are a uniform grid of this step [s]. Every row between neighbours within 1.5 steps then gets a
     value, and nothing is averaged.
     """
-    own = step or _step(rows)
+    own = step or median_step(rows)
     out = np.full((rows.size, series.values.shape[1]), np.nan)
     for column, values in enumerate(series.values.T):
         measured = np.isfinite(values)
         t, values = series.t[measured], values[measured]
-        if step is None and t.size > 1 and _step(t) < _FASTER * own:
+        if step is None and t.size > 1 and median_step(t) < _FASTER * own:
             out[:, column] = _means(rows, own, Series(t, values[:, None]))[:, 0]
         elif t.size:
             row, near = _around(rows, t)[2], np.zeros(rows.size, dtype=bool)
             near[row[np.abs(rows[row] - t) <= (own / 2 if step else own)]] = True
             left, right, nearest = _around(t, rows)
             apart, between = t[right] - t[left], (t[left] <= rows) & (rows <= t[right])
-            joined = near & (apart <= _REACH * max(_step(t), own)) | ((apart <= _REACH * own) if step else False)
+            joined = near & (apart <= REACH * max(median_step(t), own)) | ((apart <= REACH * own) if step else False)
             exact = near & ~(between & joined) & (np.abs(t[nearest] - rows) <= UNIFORM * own)
             out[:, column] = np.where(between & joined, np.interp(rows, t, values), np.nan)
             out[exact, column] = values[nearest[exact]]
     return out
 
 
-def _averaged(series: Series, step: float = _FASTEST_ROWS) -> Series:
-    """The series, averaged to one sample each `step` [s] if it is faster. Gaps stay gaps."""
+def at_most(series: Series, step: float) -> Series:
+    """The series, averaged to one sample every `step` [s] if it is faster. Gaps stay gaps."""
     kept = np.isfinite(series.values).all(axis=1)
-    if series.t.size < 2 or _step(series.t) >= _FASTER * step or np.count_nonzero(kept) < 2:
+    if series.t.size < 2 or median_step(series.t) >= _FASTER * step or np.count_nonzero(kept) < 2:
         return series
     grid = series.t[0] + step * (np.unique(np.floor((series.t - series.t[0]) / step)) + 0.5)
     means = _means(grid, step, Series(series.t[kept], series.values[kept]))
     measured = np.isfinite(means).all(axis=1)
     return Series(grid[measured], means[measured]) if np.count_nonzero(measured) > 1 else series
-
-
-def gyro_rows(
-    table: Table, rates: Series, rotors: Series, *, measured: bool, others: Mapping[tuple[str, ...], Series | None]
-) -> tuple[RowPositions, Table]:
-    """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
-
-    Impossible samples are taken out before, so that no row takes a part of them. A gyro that is faster than 1 kHz is
-    averaged to 1 kHz.
-
-    **Arguments:**
-
-    - `table`: without columns.
-    - `rotors`: `measured` speeds [rad/s], or commands [0..1].
-    - `others`: the other sensors, by the names of their columns; `None`: not logged.
-
-    **Returns:** the times of the rows [s], and the table with columns; `t` is 0 in the first row.
-
-    **Raises:** `InputError` if rates and rotors do not overlap in time, if there are more than `MAX_ROWS` rows, or for
-    too many impossible samples.
-    """
-    start, rotor_names = rates.t[rates.t < rotors.t[0]].size, SPEED_NAMES if measured else COMMAND_NAMES
-    begin = rates.t[min(start, rates.t.size - 1)]
-
-    def possible(names: tuple[str, ...], series: Series) -> Series:
-        nonlocal table
-        columns = {"t": series.t - begin} | dict(zip(names, series.values.T, strict=True))
-        table = table._replace(columns=columns).without_impossible()
-        return Series(series.t, np.column_stack([table.columns[name] for name in names]))
-
-    rates, rotors = _averaged(possible(("p", "q", "r"), rates)), possible(rotor_names, rotors)
-    turning = np.isfinite(rotors.values).all(axis=1)
-    rotors = Series(rotors.t[turning], rotors.values[turning])
-    inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + _REACH * _step(rotors.t))
-    if np.count_nonzero(inside) < 2:
-        refuse(table.path, "rates and motors were not logged at the same time; record both in one flight")
-    rows = rates.t[inside]
-    if rows.size > MAX_ROWS:
-        refuse(table.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
-    columns = {"t": rows - rows[0]} | dict(zip("pqr", rates.values[inside].T, strict=True))
-    columns |= zip(rotor_names, root_mean_square(rotors, linear=measured)(rows).T, strict=True)
-    for names, series in others.items():
-        if series is not None:
-            columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
-    return rows, table._replace(columns=columns, held=True)
 
 
 def grid_size(t: Times, dt: float) -> float:
@@ -232,8 +183,8 @@ def resample(t: Times, omega: Rotors, channels: Columns, dt: float, *, held: boo
     off = np.abs(t - grid).max()
     if off <= UNIFORM * own:
         return (t if off <= max(_ROUNDING * own, 4 * np.spacing(np.abs(t).max())) else grid, omega, channels), ""
-    grid, step = _grid(t, dt), np.diff(t)
-    gap = step > _REACH * dt
+    grid, step = t[0] + dt * np.arange(int(grid_size(t, dt))), np.diff(t)
+    gap = step > REACH * dt
     jitter = np.std(step[~gap])
     note = (
         f"t is not uniform (jitter {1e3 * jitter * (jitter > _ROUNDING * dt):.3g} ms, standard deviation): {t.size} "
@@ -260,71 +211,70 @@ def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"
     return unwrapped, int(np.count_nonzero(np.abs(np.diff(angle[measured])) > math.pi))
 
 
-def unwrapped(t: Times, angles: Float[np.ndarray, "samples 3"]) -> Series:
-    """Roll, pitch, yaw [rad] as a series, with the jumps of 2 pi removed from roll and yaw."""
-    return Series(t, np.column_stack([unwrap(angles[:, 0])[0], angles[:, 1], unwrap(angles[:, 2])[0]]))
-
-
 def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarray, "*samples 3"]:
-    """Roll, pitch, yaw [rad] of unit quaternions (w, x, y, z), without unwrapping."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z) of any length, without unwrapping; of zeros, NaN."""
+    with np.errstate(all="ignore"):
+        w, x, y, z = np.moveaxis(quaternion / np.sqrt((quaternion**2).sum(axis=-1, keepdims=True)), -1, 0)
     phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     return np.stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
 
 
-def attitude(quaternion: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "samples 3"]:
-    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z) of any length, without unwrapping; of zeros, NaN."""
-    with np.errstate(all="ignore"):
-        unit = quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
-    return euler_angles(unit)
-
-
-def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:
-    """Which samples are later than all samples before them. None if more than 1 % are not: the log is corrupt."""
+def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"] | None:
+    """Which samples are later than all before them. `None` if the share `disorder` of them, or more, are not."""
     if not np.isfinite(t).all():
         return None
     later = np.ones(t.size, dtype=bool)
     later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
-    return later if np.count_nonzero(~later) <= max(_DISORDER * t.size, 1) else None
+    return later if np.count_nonzero(~later) <= max(disorder * t.size, 1) else None
 
 
-def logged_rate(t: Times) -> float:
+def logged_rate(t: Times, *, pause: float = 0.9) -> float:
     """How often samples at the times `t` [s] were written [Hz]. For half of the time, samples come at least this often.
 
-    A burst is no high rate. Pauses of more than a second do not count, unless there is nothing else.
+    A burst is no high rate. A longer time than `pause` [s] does not count, unless there is nothing else.
     """
     steps = np.diff(t)
-    steps = np.sort(steps[(steps > 0) & (steps <= _PAUSE)] if (steps <= _PAUSE).any() else steps)
+    steps = np.sort(steps[(steps > 0) & (steps <= pause)] if (steps <= pause).any() else steps)
     total = np.cumsum(steps)
     if total.size == 0 or total[-1] <= 0:
         return 0.0
     return 1.0 / float(steps[np.searchsorted(total, total[-1] / 2)])
 
 
-def held_regularly(t: Times) -> bool:
-    """Whether values that change at the times `t` [s] were written at a fixed rate and held in between."""
+def held_regularly(t: Times, *, fewest: int = 20, regular: float = 0.6) -> bool:
+    """Whether values that change at the times `t` [s] were written at a fixed rate and held in between.
+
+    That is so for at least the `fewest` steps, most of which are equal up to the share `regular`.
+    """
     steps = np.diff(t)
-    if steps.size < _FEWEST_CHANGES:
+    if steps.size < fewest:
         return False
     low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
-    return bool(high - low <= _REGULAR * middle)
+    return bool(high - low <= regular * middle)
 
 
-def _step(t: np.ndarray) -> float:
+def last_measured(measured: Bool[np.ndarray, "samples *columns"]) -> Int[np.ndarray, "samples *columns"]:
+    """The last measured sample up to each sample; before the first one, the first."""
+    own = np.arange(len(measured)).reshape(-1, *[1] * (measured.ndim - 1))
+    return np.maximum(np.maximum.accumulate(np.where(measured, own, -1), axis=0), measured.argmax(axis=0))
+
+
+def filled(values: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
+    """Each gap gets the value before it, or the first one."""
+    return np.take_along_axis(values, last_measured(~np.isnan(values)), axis=0)
+
+
+def median_step(t: Times) -> float:
     """The median time between samples [s]; 0 for one sample."""
     return float(np.median(np.diff(t))) if t.size > 1 else 0.0
-
-
-def _grid(t: np.ndarray, dt: float) -> np.ndarray:
-    return t[0] + dt * np.arange(int(grid_size(t, dt)))
 
 
 def _means(rows: np.ndarray, width: float, series: Series) -> np.ndarray:
     """Means over `width` around each row, of values interpolated linearly. NaN at the ends and across a gap."""
     t, (begin, end) = series.t, (rows - width / 2, rows + width / 2)
     steps = np.diff(t)
-    gaps = np.append(0, np.cumsum(steps > _REACH * np.median(steps)))
+    gaps = np.append(0, np.cumsum(steps > REACH * np.median(steps)))
     first, last = (np.clip(np.searchsorted(t, edge, side="right") - 1, 0, t.size - 2) for edge in (begin, end))
     whole = (begin >= t[0]) & (end <= t[-1]) & (gaps[last + 1] == gaps[first])
     total = integral(series, linear=True)

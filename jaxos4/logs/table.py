@@ -1,9 +1,8 @@
 """Shared by all log formats: columns as a `Table`, facts beside them, a flight as a `Recording`, refusing a file."""
 
 import contextlib
-import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import IO, Any, NamedTuple, NoReturn, TypeVar
 
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import InputError, printable, shortened
-from ..flight import FORCE_NAMES, Flight, with_force
+from ..flight import Flight, with_force
 
 Path = str | os.PathLike[str]
 Found = TypeVar("Found")
@@ -25,11 +24,6 @@ Rotors follow their commands with a lag of 20 to 80 ms. Commands one lag apart o
 between them. In closed loop, with the lag and delay that fit best, commands at 10 Hz make inertias 1.4 to 2.1 times too
 large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 """
-
-_JITTER = 0.95  # a log at a nominal rate may be this much slower
-_AT_ONCE = 1 << 20  # bytes
-_MOST_IMPOSSIBLE = 0.01  # share of the values of a column: more are a wrong unit, and not samples that went wrong
-_FARTHEST = 10.0  # a rotor turns at most so many times as fast as in all but 1 % of its flight
 
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
 COMMAND_NAMES = ("command1", "command2", "command3", "command4")
@@ -71,44 +65,8 @@ class LogFacts(NamedTuple):
 
 
 def fast_enough(rate: float) -> bool:
-    """Whether samples at this rate [Hz] identify a vehicle."""
-    return rate >= _JITTER * SLOWEST_RATE
-
-
-class Limit(NamedTuple):
-    """The values that a column can have, their unit, and advice on larger values, and on smaller ones if it differs."""
-
-    least: float
-    largest: float
-    unit: str
-    advice: str
-    below: str = ""
-
-
-_TIME = "t is in seconds: if these are milli-, micro- or nanoseconds, divide"
-_COMMAND = "commands are fractions 0..1: divide by full scale (100, 65535)"
-_SPEED = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
-_SIGN = "drop the sign, because rotor_spins gives the direction"
-_POSITION = "positions are in metres from a point near the flight; subtract an offset"
-_VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
-_FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
-_VOLTAGE = "the battery's voltage is in volts: if these are mV, divide by 1000"
-_PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
-_RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
-LIMITS = {
-    "t": Limit(-1e11, 1e11, "s", _TIME),
-    **dict.fromkeys(SPEED_NAMES, Limit(0, 1e5, "rad/s", _SPEED, _SIGN)),
-    **dict.fromkeys(COMMAND_NAMES, Limit(0, 1, "of full scale", _COMMAND)),
-    **dict.fromkeys("xyz", Limit(-1e6, 1e6, "m", _POSITION)),
-    **dict.fromkeys(("vx", "vy", "vz"), Limit(-1e3, 1e3, "m/s", _VELOCITY)),
-    **dict.fromkeys("pqr", Limit(-60.0, 60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
-    **dict.fromkeys(("phi", "theta", "psi"), Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")),
-    **dict.fromkeys(FORCE_NAMES, Limit(-1e3, 1e3, "m/s^2", _FORCE)),
-    "voltage": Limit(-200.0, 200.0, "V", _VOLTAGE),
-}
-"""A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
-PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
-"""The pitch of a log: one that was not read from a file may be any number."""
+    """Whether samples at this rate [Hz] identify a vehicle. A log at a nominal rate may be 5 % slower."""
+    return rate >= 0.95 * SLOWEST_RATE
 
 
 class Table(NamedTuple):
@@ -122,7 +80,7 @@ class Table(NamedTuple):
     - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
     - `held`: whether measured rotor speeds are means until the next row, and not those at the time of their row.
-    - `impossible`: by column, how many values `without_impossible` took out, and the first of them.
+    - `impossible`: by column, how many values `jaxos4.logs.values` took out, and the first of them.
     """
 
     path: Path
@@ -149,40 +107,9 @@ class Table(NamedTuple):
 
     @property
     def impossible_note(self) -> str:
-        """The values that `without_impossible` took out, in words."""
+        """The impossible values that were taken out, in words."""
         what = [f"{self.names.get(name, name)}: {k} (first {first})" for name, (k, first) in self.impossible.items()]
         return f"impossible values count as not measured, in {', '.join(what)}"
-
-    def without_impossible(self, limits: Mapping[str, Limit] = LIMITS) -> "Table":
-        """The table without the values outside of `limits`: they count as not measured.
-
-        **Raises:** `InputError` if they are more than 1 % of the values of a column.
-        """
-        columns, impossible = dict(self.columns), dict(self.impossible)
-        for name, limit in limits.items():
-            values = columns.get(name, np.empty(0))
-            largest = _most_of_rotor(values) if name in SPEED_NAMES else limit.largest
-            wrong = (values < limit.least) | (values > min(limit.largest, largest))
-            if name == "t" or not wrong.any():
-                continue
-            index, count = int(np.argmax(wrong)), int(np.count_nonzero(wrong))
-            first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
-            if count > _MOST_IMPOSSIBLE * every:
-                low = values[index] < limit.least
-                share = f"{count} of {every} values, more than {100 * _MOST_IMPOSSIBLE:g} %"
-                what = f"is {first}, beyond {limit.least if low else limit.largest:.4g} {limit.unit} ({share}); "
-                advice = (low and limit.below) or self.remedy or limit.advice
-                self.refuse(what + advice, index=index, column=name)
-            columns[name] = np.where(wrong, np.nan, values)
-            before, begin = impossible.get(name, (0, f"{first} at {self.columns['t'][index]:.6g} s"))
-            impossible[name] = before + count, begin
-        return self._replace(columns=columns, impossible=impossible)
-
-
-def _most_of_rotor(speeds: np.ndarray) -> float:
-    """The largest speed that is possible beside the others: so few are faster that they are not a wrong unit."""
-    turning = speeds[speeds > 0]
-    return _FARTHEST * float(np.quantile(turning, 1 - _MOST_IMPOSSIBLE)) if turning.size else math.inf
 
 
 class LogFormat(NamedTuple):
@@ -196,6 +123,7 @@ class LogFormat(NamedTuple):
     - `read`: takes a path; returns the columns and the notes on what the reader assumed, one line each. Raises
       `InputError` (by `refuse`) for a file that cannot be used.
     - `mapped`: takes a path and a column map, and returns the same; `None` if the format has columns of its own.
+    - `of_vehicles`: whether only real vehicles write it.
     """
 
     name: str
@@ -203,6 +131,7 @@ class LogFormat(NamedTuple):
     recognises: Callable[[bytes], bool]
     read: Callable[[Path], tuple[Table, tuple[str, ...]]]
     mapped: Callable[[Path, Any], tuple[Table, tuple[str, ...]]] | None = None
+    of_vehicles: bool = True
 
 
 _ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocity", "stretch", "within")
@@ -262,9 +191,23 @@ class Recording(NamedTuple):
         """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
         return with_force(self.states, self.specific_force, np)
 
-    def rows(self, part: slice) -> "Recording":
+    def rows(self, which: slice) -> "Recording":
         """Some samples of the recording; their time stays as recorded."""
-        return self._replace(**{f: x[part] for f in _ARRAYS if (x := getattr(self, f)) is not None})
+        return self._replace(**{f: x[which] for f in _ARRAYS if (x := getattr(self, f)) is not None})
+
+    @property
+    def vehicle_evidence(self) -> str:
+        """The evidence that this is the log of a real vehicle, as the end of a sentence; empty if there is none.
+
+        A simulation of the OS4 has rotor speeds and states. A vehicle logs commands, or has an accelerometer, or writes
+        a format of its own.
+        """
+        if self.commanded:
+            return "has commands, not rotor speeds"
+        if self.specific_force is not None:
+            return "has an accelerometer"
+        kind = self.facts.format
+        return f"is a log of a vehicle ({kind.label})" if kind and kind.of_vehicles else ""
 
     @property
     def named_notes(self) -> tuple[str, ...]:
@@ -314,8 +257,8 @@ def read_bytes(path: Path, most: int) -> bytes:
     """The content of a log. Raises `InputError` if it has more than `most` bytes."""
     content = bytearray()
     with opened(path, "rb") as file:
-        while part := file.read(_AT_ONCE):
-            content += part
+        while more := file.read(1 << 20):
+            content += more
             if len(content) > most:
                 refuse(path, f"has more than {most:,} bytes, far more than one flight; cut the log into flights")
     return bytes(content)
@@ -332,6 +275,17 @@ def refuse(
 def quoted(text: str) -> str:
     """`text` in quotes, on one line, with at most 40 characters."""
     return repr(shortened(text, 40))
+
+
+def in_words(error: Exception) -> str:
+    """What an error of a decoder says, on one line."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+def listed(names: Iterable[str], most: int = 20) -> str:
+    """The first names in quotes."""
+    every = [*names]
+    return ", ".join(map(quoted, every[:most])) + ", ..." * (len(every) > most)
 
 
 def counted(number: int, noun: str) -> str:

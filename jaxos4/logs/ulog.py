@@ -1,79 +1,98 @@
-"""ULog: the logs of PX4. Topics, frames and commands: docs/logs.md.
+"""ULog: the logs of PX4, decoded by pyulog. Topics, frames and commands: docs/logs.md.
 
 Reference: `FunctionMotors::updateValues`, `MixingOutput` and `logged_topics.cpp` of PX4.
 """
 
+import contextlib
+import functools
+import io
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .sampling import HALF_TURN, Series, attitude, gyro_rows, logged_rate, unwrapped
-from .table import LIMITS, LogFacts, LogFormat, Path, Sampling, Table, fast_enough, needed, order_note, refuse
-from .ulog_file import MAGIC, Topics, decoded
+from .._files import BROKEN
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Names
+from .sampling import HALF_TURN, Series, euler_angles, logged_rate
+from .table import LogFormat, Path, Table, fast_enough, in_words, needed, order_note, read_bytes, refuse
 
-_RATES = {"vehicle_angular_velocity": "xyz", "sensor_combined": "gyro_rad"}
-_FORCES = {"sensor_combined": "accelerometer_m_s2", "vehicle_acceleration": "xyz"}
+_MAGIC = b"ULog"
+_MOVING = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
+_GYROS = {"vehicle_angular_velocity": "xyz", "sensor_combined": "gyro_rad"}
+_ACCELEROMETERS = {"sensor_combined": "accelerometer_m_s2", "vehicle_acceleration": "xyz"}
+
+
+def _items(field: str, count: int) -> list[str]:
+    """The names of the numbers in an array."""
+    return [f"{field}[{i}]" for i in range(count)]
+
+
+_SOURCES = {  # by our columns: topics, and the fields along the body's axes
+    RATES: [(topic, _items(field, 3), HALF_TURN) for topic, field in _GYROS.items()],
+    FORCES: [(topic, _items(field, 3), HALF_TURN) for topic, field in _ACCELEROMETERS.items()],
+    ("voltage",): [("battery_status", ("voltage_v",), 1.0)],
+}
 _TOPICS = (
-    *(*_RATES, *_FORCES),
-    *("esc_status", "actuator_motors", "actuator_outputs"),
-    *("vehicle_attitude", "vehicle_local_position", "vehicle_status", "vehicle_land_detected", "battery_status"),
+    *(kind for sources in _SOURCES.values() for kind, *_ in sources),
+    *("esc_status", "actuator_motors", "actuator_outputs", "vehicle_attitude", "vehicle_local_position"),
+    *("vehicle_status", "vehicle_land_detected"),
 )
-_ANGLES = ("phi", "theta", "psi")
-_FLAGS = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
-_REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
-_MOTORS = 12  # the most that PX4 can drive
 # Types of MAVLink, of PX4's control allocation and of its state that are no quadrotors. Others can be quadrotors.
 _OTHER_MAV_TYPES = {1, 3, 4, 7, *range(10, 16), *range(19, 26), 29, 35}
 _OTHER_AIRFRAMES, _OTHER_VEHICLES = {1, 2, 3, 4, 5, 6, 8, 10, 11, 12}, {2, 3, 4}
-_GROUND = ("landed", "maybe_landed", "ground_contact")
-_FIRST_MOTOR = 101  # PX4's number of the output function "Motor 1"
-_RPM = 2 * math.pi / 60
-_OUTPUTS, _TIMERS = 16, 8  # of one driver
+_MOTORS = range(101, 105)  # PX4's numbers of the output functions "Motor 1" to "Motor 4"
 _BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
 _OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other units
-_LEAST_PWM, _HIGHEST_PWM = 800.0, 2200.0  # [us]
-_PWM, _DSHOT, _UAVCAN = (1000.0, 2000.0), 1999.0, (1.0, 8191.0)
-_CAN, _DSHOT_LINK = 4, 5  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
+_REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
+
+
+class _Protocol(NamedTuple):
+    """How the outputs of motors are coded: idle and full speed by default, and parameters that hold others.
+
+    - `possible`: the smallest and the largest value of such a parameter.
+    - `parameters`: the beginnings of their names, before MIN or MAX.
+    """
+
+    name: str
+    ends: tuple[float, float]
+    possible: tuple[float, float] = (0.0, 0.0)
+    parameters: tuple[str, ...] = ()
+
+
+_PWM = _Protocol("PWM", (1000.0, 2000.0), (800.0, 2200.0), ("{bank}_", "PWM_"))
+_UAVCAN = _Protocol("UAVCAN", (1.0, 8191.0), (0.0, 8191.0), ("UAVCAN_EC_",))
+_DSHOT = _Protocol("DShot", (0.0, 1999.0))
 _DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TIM0 and so on
+_LINKS = {4: _UAVCAN, 5: _DSHOT}  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
 
 
 def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a PX4 log, and notes on what was assumed. Raises `InputError`."""
-    log = decoded(path, _TOPICS)
+    log = _decoded(path)
     _check_vehicle(log)
     remedy = "log vehicle_angular_velocity or sensor_combined (SDLOG_PROFILE)"
-    rates, gyro = needed(path, log.fastest(_RATES, ("p", "q", "r")), "body rates", remedy)
+    found: dict[Names, Series | None] = {columns: log.fastest(columns, each) for columns, each in _SOURCES.items()}
+    rates = needed(path, found.pop(RATES), "body rates", remedy)
     remedy = "log esc_status, actuator_motors or actuator_outputs"
     rotors = needed(path, _rotors(log), "rotor speeds or commands", remedy)
-    names = [f"{rotors.topic}.{field}" for field in rotors.fields]
-    prefix = "omega" if rotors.measured else "command"
-    log.names.update((f"{prefix}{i}", name) for i, name in enumerate(names, start=1))
-    force = log.fastest(_FORCES, ("ax", "ay", "az"))
-    others = {
-        ("ax", "ay", "az"): None if force is None else force[0],
-        _ANGLES: _attitude(log),
-        tuple(_FLAGS): _position(log),
-        ("voltage",): _voltage(log),
-    }
-    table = Table(path, {}, first_row=None, names=log.names, remedy=_REMEDY)
-    rows, table = gyro_rows(table, rates, rotors.series, measured=rotors.measured, others=others)
-    log.notes.extend(filter(None, (rotors.note, order_note(names[0]))))
-    sampling = {"motors": Sampling(rotors.topic, rotors.rate), "gyro": Sampling(gyro, logged_rate(rates.t))}
-    facts = _facts(log, rows)._replace(**sampling)
-    return table._replace(facts=facts), tuple(log.notes)
+    log.name([f"{'omega' if rotors.measured else 'command'}{i}" for i in range(1, 5)], rotors.topic, rotors.fields)
+    found |= {ANGLES: _attitude(log), tuple(_MOVING): _position(log)}
+    rows, table = log.table(rates, rotors.series, found, **_facts(log))
+    table = table._replace(facts=table.facts._replace(landed=_landed(log, rows)))
+    log.notes.extend(filter(None, (rotors.note, order_note(f"{rotors.topic}.{rotors.fields[0]}"))))
+    return table, tuple(log.notes)
 
 
-ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(MAGIC[:4]), read_ulog)
+ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(_MAGIC), read_ulog)
 
 
-def _check_vehicle(log: Topics) -> None:
+def _check_vehicle(log: Messages) -> None:
     """Refuse a vehicle that is not a quadrotor: servos and more motors would be read as rotors. Raises `InputError`."""
-    status, get, motors = "vehicle_status", log.parameters.get, log.fields("actuator_motors")
-    more = [i for i in range(4, _MOTORS) if np.nan_to_num(motors.get(f"control[{i}]", np.zeros(1))).any()]
+    status, get, motors = "vehicle_status", log.parameters.get, log.of("actuator_motors")
+    more = [i for i in range(4, 12) if np.nan_to_num(motors.get(f"control[{i}]", np.zeros(1))).any()]
     others = {
-        f"field {status}.is_vtol": log.fields(status).get("is_vtol", np.zeros(1)).any(),
+        f"field {status}.is_vtol": log.of(status).get("is_vtol", np.zeros(1)).any(),
         f"field {status}.system_type": log.latest(status, "system_type") in _OTHER_MAV_TYPES,
         f"field {status}.vehicle_type": log.latest(status, "vehicle_type") in _OTHER_VEHICLES,
         "parameter MAV_TYPE": get("MAV_TYPE") in _OTHER_MAV_TYPES,
@@ -86,38 +105,27 @@ def _check_vehicle(log: Topics) -> None:
             refuse(log.path, f"{place}: this is no quadrotor; give the log of a quadrotor")
 
 
-def _attitude(log: Topics) -> Series | None:
-    series = log.series("vehicle_attitude", [f"q[{i}]" for i in range(4)])
-    if series is None:
-        return None
-    log.names.update(dict.fromkeys(_ANGLES, "vehicle_attitude.q"))
-    return Series(series.t, unwrapped(series.t, attitude(series.values)).values * HALF_TURN)
+def _attitude(log: Messages) -> Series | None:
+    log.names.update(dict.fromkeys(ANGLES, "vehicle_attitude.q"))
+    series = log.series("vehicle_attitude", _items("q", 4))
+    return None if series is None else Series(series.t, euler_angles(series.values) * HALF_TURN)
 
 
-def _position(log: Topics) -> Series | None:
+def _position(log: Messages) -> Series | None:
     topic = "vehicle_local_position"
-    flags = {column: flag for column, flag in _FLAGS.items() if flag in log.fields(topic)}
-    series = log.series(topic, (*_FLAGS, *flags.values()))
+    flags = {column: flag for column, flag in _MOVING.items() if flag in log.of(topic)}
+    series = log.series(topic, (*_MOVING, *flags.values()))
     if series is None:
         return None
     values = series.values[:, :6] * np.tile(HALF_TURN, 2)
     for i, column in enumerate(flags):
-        values[series.values[:, 6 + i] == 0, list(_FLAGS).index(column)] = np.nan
-    log.names.update((name, f"{topic}.{name}") for name in _FLAGS)
+        values[series.values[:, 6 + i] == 0, list(_MOVING).index(column)] = np.nan
+    log.name(tuple(_MOVING), topic, tuple(_MOVING))
     return Series(series.t, values)
 
 
-def _voltage(log: Topics) -> Series | None:
-    series = log.series("battery_status", ("voltage_v",))
-    if series is None:
-        return None
-    log.names["voltage"] = "battery_status.voltage_v"
-    possible = (series.values > 0) & (series.values < LIMITS["voltage"].largest)
-    return Series(series.t, np.where(possible, series.values, np.nan))
-
-
-def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
-    """The facts of the log; `rows`: the times of the flight's samples [s], in the log's time."""
+def _facts(log: Messages) -> dict[str, Any]:
+    """What the parameters say beside the flight, as fields of `LogFacts`."""
     get = log.parameters.get
     positions = [[get(f"CA_ROTOR{i}_P{axis}", math.nan) for axis in "XY"] for i in range(4)]
     moments = [get(f"CA_ROTOR{i}_KM", math.nan) for i in range(4)]
@@ -129,19 +137,19 @@ def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
     faster = f"set SDLOG_PROFILE to {profile | high_rate} (which includes {high_rate}, 'high rate'), and fly again"
     if profile & high_rate:
         faster = "log esc_status or actuator_motors at full rate (logger_topics.txt on the card), and fly again"
-    return LogFacts(
-        faster=faster,
-        landed=_landed(log, rows),
-        rotor_positions=tuple((float(x), -float(y)) for x, y in positions) if placed else None,
-        rotor_spins=tuple(math.copysign(1.0, moment) for moment in moments) if spun else None,
-    )
+    return {
+        "faster": faster,
+        "rotor_positions": tuple((float(x), -float(y)) for x, y in positions) if placed else None,
+        "rotor_spins": tuple(math.copysign(1.0, moment) for moment in moments) if spun else None,
+    }
 
 
-def _landed(log: Topics, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """When PX4's land detector says that the vehicle touches the ground [s], from the first row on."""
-    names = [name for name in _GROUND if name in log.fields("vehicle_land_detected")]
-    series = log.series("vehicle_land_detected", names) if names else None
-    if series is None:
+def _landed(log: Messages, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """When PX4's land detector says that the vehicle touches the ground [s], from the first of the `rows` on."""
+    topic = "vehicle_land_detected"
+    states = {"landed", "maybe_landed", "ground_contact"} & log.of(topic).keys()
+    series = log.series(topic, sorted(states), fewest=1)
+    if series is None or not series.values.size:
         return ()
     changes = np.flatnonzero(np.diff((series.values > 0).any(axis=1), prepend=False, append=False))
     times = np.append(series.t, np.inf)[changes]  # a state holds until the next one
@@ -156,17 +164,14 @@ class _Rotors(NamedTuple):
     topic: str
     fields: Sequence[str]
     note: str = ""
-
-    @property
-    def measured(self) -> bool:
-        return self.topic == "esc_status"
+    measured: bool = False
 
     @property
     def rate(self) -> float:
         return logged_rate(self.series.t)
 
 
-def _rotors(log: Topics) -> _Rotors | None:
+def _rotors(log: Messages) -> _Rotors | None:
     """Measured speeds, or the motors' commands, or the outputs: the first that was logged often enough.
 
     If none was, the one that was logged most often.
@@ -179,10 +184,10 @@ def _rotors(log: Topics) -> _Rotors | None:
     return chosen
 
 
-def _speeds(log: Topics) -> _Rotors | None:
+def _speeds(log: Messages) -> _Rotors | None:
     names = [f"esc[{i}].esc_rpm" for i in range(4)]
     series = log.series("esc_status", names)
-    if series is None or series.t.size < 2:
+    if series is None:
         return None
     if not (np.abs(series.values) > 0).any(axis=0).all():
         log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
@@ -192,14 +197,14 @@ def _speeds(log: Topics) -> _Rotors | None:
     measured = np.isfinite(series.values).all(axis=1)
     if np.count_nonzero(measured) < 2:
         return None
-    speeds = Series(series.t[measured], np.abs(series.values[measured])[:, order] * _RPM)
-    return _Rotors(speeds, "esc_status", [names[i] for i in order])
+    speeds = Series(series.t[measured], np.abs(series.values[measured])[:, order] * (2 * math.pi / 60))
+    return _Rotors(speeds, "esc_status", [names[i] for i in order], measured=True)
 
 
-def _motors(log: Topics) -> _Rotors | None:
-    names = [f"control[{i}]" for i in range(4)]
+def _motors(log: Messages) -> _Rotors | None:
+    names = _items("control", 4)
     series = log.series("actuator_motors", names)
-    if series is None or series.t.size < 2 or not np.isfinite(series.values).any():
+    if series is None or not np.isfinite(series.values).any():
         return None
     shares = np.clip(np.nan_to_num(series.values), 0.0, 1.0)  # NaN means not armed
     curve, what = _thrust_curve(log)
@@ -207,13 +212,13 @@ def _motors(log: Topics) -> _Rotors | None:
     return _Rotors(Series(series.t, np.sqrt(shares) if curve else shares), "actuator_motors", names, note)
 
 
-def _outputs(log: Topics) -> _Rotors | None:
+def _outputs(log: Messages) -> _Rotors | None:
     place = _bank_of_motors(log)
     if place is None:
         return None
-    names = [f"output[{i}]" for i in place[1]]
-    found = [log.series("actuator_outputs", names, i) for i in range(len(log.topics.get("actuator_outputs", [])))]
-    found = [s for s in found if s is not None and s.t.size > 1 and np.isfinite(s.values).all()]
+    topic, names = "actuator_outputs", [f"output[{i}]" for i in place[1]]
+    found = [log.series(topic, names, instance) for instance in log.fields.get(topic, ())]
+    found = [s for s in found if s is not None and np.isfinite(s.values).all()]
     if not found:
         return None
     series = max(found, key=lambda each: float(each.values.std(axis=0).min()))
@@ -221,11 +226,11 @@ def _outputs(log: Topics) -> _Rotors | None:
     shares = np.clip((series.values - low) / (high - low), 0.0, 1.0)
     curve, what = _thrust_curve(log)
     speeds = np.sqrt(curve * shares**2 + (1 - curve) * shares) if curve else shares
-    note = f"commands are actuator_outputs.output, {kind} {low.min():g}..{high.max():g}, {what}"
-    return _Rotors(Series(series.t, speeds), "actuator_outputs", names, note)
+    note = f"commands are {topic}.output, {kind} {low.min():g}..{high.max():g}, {what}"
+    return _Rotors(Series(series.t, speeds), topic, names, note)
 
 
-def _thrust_curve(log: Topics) -> tuple[float, str]:
+def _thrust_curve(log: Messages) -> tuple[float, str]:
     """THR_MDL_FAC, 0 if it is not known, and what follows for the speeds."""
     curve = log.parameters.get("THR_MDL_FAC", 0.0)
     if 0 < curve <= 1:
@@ -236,13 +241,13 @@ def _thrust_curve(log: Topics) -> tuple[float, str]:
     )
 
 
-def _bank_of_motors(log: Topics) -> tuple[str, list[int]] | None:
+def _bank_of_motors(log: Messages) -> tuple[str, list[int]] | None:
     """The beginning of the parameters' names of the outputs of motors 1 to 4, and these outputs.
 
     None if the log says which motor an output drives, but no driver has all four motors. Old PX4: the first of MAIN.
     """
     for bank in _BANKS:
-        order = _motor_order([int(log.parameters.get(f"{bank}_FUNC{i + 1}", 0.0)) for i in range(_OUTPUTS)])
+        order = _motor_order([int(log.parameters.get(f"{bank}_FUNC{output}", 0.0)) for output in range(1, 17)])
         if order is not None:
             return bank, order
     unknown = not any(f"{bank}_FUNC1" in log.parameters for bank in (*_BANKS, *_OTHER_BANKS))
@@ -251,27 +256,94 @@ def _bank_of_motors(log: Topics) -> tuple[str, list[int]] | None:
 
 def _motor_order(functions: list[int]) -> list[int] | None:
     """The places of motors 1 to 4 among the outputs with these functions; None if one of them is missing."""
-    motors = range(_FIRST_MOTOR, _FIRST_MOTOR + 4)
-    return [functions.index(motor) for motor in motors] if set(motors) <= set(functions) else None
+    return [functions.index(motor) for motor in _MOTORS] if {*_MOTORS} <= {*functions} else None
 
 
-def _limits(log: Topics, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
+def _limits(log: Messages, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
     """The protocol, and the values of each output at which its motor idles and is at full speed."""
     turning, get = values[values > 1], log.parameters.get
-    small, link = (turning < _LEAST_PWM).any(), log.latest("esc_status", "esc_connectiontype")
-    timers = {get(f"{bank}_TIM{i}") for i in range(_TIMERS)}
-    kind, names, possible, default = "PWM", [f"{bank}_", "PWM_"], (_LEAST_PWM, _HIGHEST_PWM), _PWM
-    if bank == "UAVCAN_EC" or (turning > _HIGHEST_PWM).any() or (small and link == _CAN):
-        kind, names, possible, default = "UAVCAN", ["UAVCAN_EC_"], (0.0, 8191.0), _UAVCAN
-    elif small or link == _DSHOT_LINK or get("DSHOT_CONFIG", 0.0) > 0 or timers & set(_DSHOT_TIMERS):
-        least = get("DSHOT_MIN", 0.0)
-        kind, names, default = "DShot", [], (_DSHOT * least if 0 <= least < 0.5 else 0.0, _DSHOT)
+    least, most = _PWM.possible
+    small, link = (turning < least).any(), _LINKS.get(int(log.latest("esc_status", "esc_connectiontype") or 0))
+    timers = {get(f"{bank}_TIM{i}") for i in range(8)}
+    kind = _PWM
+    if bank == "UAVCAN_EC" or (turning > most).any() or (small and link is _UAVCAN):
+        kind = _UAVCAN
+    elif small or link is _DSHOT or get("DSHOT_CONFIG", 0.0) > 0 or timers & {*_DSHOT_TIMERS}:
+        idle = get("DSHOT_MIN", 0.0)
+        kind = _DSHOT._replace(ends=(_DSHOT.ends[1] * idle if 0 <= idle < 0.5 else 0.0, _DSHOT.ends[1]))
 
     def known(end: int, channel: int) -> float:
         """By the output's number, else of the bank, else the default."""
-        every = [get(f"{name}{('MIN', 'MAX')[end]}{number}") for name in names for number in (channel + 1, "")]
-        return next((each for each in every if each is not None and possible[0] <= each <= possible[1]), default[end])
+        names = [f"{name.format(bank=bank)}{('MIN', 'MAX')[end]}" for name in kind.parameters]
+        every = [get(f"{name}{number}") for name in names for number in (channel + 1, "")]
+        possible = (each for each in every if each is not None and kind.possible[0] <= each <= kind.possible[1])
+        return next(possible, kind.ends[end])
 
     low, high = (np.array([known(end, channel) for channel in channels]) for end in (0, 1))
-    right = low < high
-    return kind, np.where(right, low, default[0]), np.where(right, high, default[1])
+    return kind.name, *np.where(low < high, [low, high], np.array(kind.ends)[:, None])
+
+
+def _decoded(path: Path) -> Messages:
+    """The topics that are needed. Raises `InputError`, one line, for a file that cannot be decoded."""
+    try:
+        from pyulog.core import ULog
+        from pyulog.exceptions import ULogException
+    except ImportError:
+        refuse(path, "reading a ULog file needs pyulog; install jaxos4[ulog]")
+    content = read_bytes(path, 1 << 31)
+    if content.endswith(bytes(64)):  # a loss of power leaves zeros at the end
+        content = content.rstrip(b"\0")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
+            log = ULog(_Content(content), sorted({*_TOPICS}))
+    except (*BROKEN, ULogException) as error:
+        refuse(path, f"cannot be decoded ({in_words(error)}); copy the log again from the vehicle")
+    if log.file_corruption:
+        refuse(path, "is corrupt; copy the log again from the vehicle, or repair it")
+    found: dict[str, dict[int, Fields]] = {}
+    for data in sorted(log.data_list, key=lambda data: data.multi_id):
+        if "timestamp" in data.data:
+            stamp = data.data.get("timestamp_sample", data.data["timestamp"])
+            stamp = np.asarray(stamp if np.all(stamp > 0) else data.data["timestamp"], dtype=float)
+            instances = found.setdefault(data.name, {})
+            instances[len(instances)] = data.data | {"t": stamp / 1e6}
+    changed = {name: value for _, name, value in log.changed_parameters}
+    numbers = {k: v for k, v in (log.initial_parameters | changed).items() if isinstance(v, int | float)}
+    return Messages(path, found, _REMEDY, parameters={k: float(v) for k, v in numbers.items() if math.isfinite(v)})
+
+
+class _Content(io.BytesIO):
+    """Ends the search for the next message in a corrupt file, because pyulog tries every byte.
+
+    pyulog seeks for each corrupt byte, and a few times in an intact file.
+    """
+
+    seeks = 0
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        self.seeks += 1
+        if self.seeks > 1000:
+            raise EOFError("it is corrupt")
+        return super().seek(offset, whence)
+
+
+def _check_formats(formats: Mapping[str, Any], *, most: int = 1024, deepest: int = 3) -> None:
+    """Refuse formats with too many fields, or levels: pyulog makes an object of each, also of arrays inside arrays.
+
+    The largest messages of PX4 have about 200 fields.
+    """
+
+    @functools.cache
+    def count(name: str, depth: int) -> int:
+        if depth > deepest:
+            raise ValueError("messages are nested too deeply")
+        total = sum(
+            max(size, 1) * (count(kind, depth + 1) if kind in formats else 1) for kind, size, _ in formats[name].fields
+        )
+        if total > most:
+            raise ValueError(f"a message has more than {most} fields")
+        return max(total, 1)
+
+    for name in formats:
+        count(name, 0)

@@ -11,15 +11,13 @@ from .._templates import templates
 from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
 from ..flight import CHANNEL_NAMES
-from .checks import CLOCK, Finding, self_checks
-from .motion import Excitation, excitation, motor_clock_note, opposite_axes, refused_note, rotor_signs, yaw_doubt
-from .pieces import Recording, Stretch, cut
-from .usable import nothing_usable, stretches
+from ..logs import Recording
+from .checks import Finding, opposite_yaw, self_checks
+from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
+from .stretches import cut, nothing_usable, stretches, usable
 
 FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
-
-_PLAUSIBLE = (0.5, 2.0)  # [g], the median of the accelerometer in flight
 
 
 class Channel(msgspec.Struct, frozen=True):
@@ -31,7 +29,7 @@ class Channel(msgspec.Struct, frozen=True):
     most: float
 
 
-class Part(msgspec.Struct, frozen=True):
+class InspectedStretch(msgspec.Struct, frozen=True):
     """A stretch of the log [s]: whether it can be used, why not, and the excitation by axis if it can."""
 
     begin: float
@@ -63,7 +61,7 @@ class Inspection(msgspec.Struct, frozen=True):
     findings: tuple[str, ...]
     checks: tuple[Finding, ...]
     notes: tuple[str, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[InspectedStretch, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings, ready for JSON."""
@@ -77,17 +75,15 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
 
     - `recording`: of a file, read with the same `airframe`, and with `full_scale=1.0`.
     """
-    found, usable, parts = stretches(recording, airframe), [], []
-    for begin, end, reason in found:
-        if not reason:
-            usable.append(cut(recording, Stretch(begin, end)))
-        parts.append(Part(begin, end, not reason, reason, {} if reason else excitation(usable[-1], airframe)))
-    nothing = "" if usable else f"{nothing_usable(found)}; give the log of a flight"
-    opposite = {} if airframe is None else opposite_axes(usable, airframe)
-    doubt = yaw_doubt(opposite)
-    checks = self_checks(recording, airframe)
-    clocked = any(finding.name.endswith(CLOCK) for finding in checks)
-    clock = "" if airframe is None or clocked else motor_clock_note(usable, airframe)
+    found, flown, parts = stretches(recording, airframe), [], []
+    for stretch in found:
+        if not stretch.reason:
+            flown.append(cut(recording, stretch))
+        excited = {} if stretch.reason else excitation(flown[-1], airframe)
+        parts.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
+    nothing = "" if flown else f"{nothing_usable(found)}; give the log of a flight"
+    opposite = {} if airframe is None else opposite_axes(flown, airframe)
+    yaw = opposite_yaw(opposite.get("yaw"))
     findings = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
@@ -98,8 +94,8 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         measured=_measured(recording),
         findings=findings,
-        checks=checks,
-        notes=(*recording.notes, *filter(None, (doubt and "{} ({}); {}".format(*doubt), clock))),
+        checks=self_checks(recording, airframe),
+        notes=recording.notes if yaw is None else (*recording.notes, str(yaw)),
         parts=tuple(parts),
     )
 
@@ -130,8 +126,8 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     **Returns:** the text, and the keys that must be filled in before it can be used.
     """
     facts, full = recording.facts, FULL_SCALE if recording.commanded else 1.0
-    parts = [cut(recording, part) for part in stretches(recording) if not part.reason]
-    signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
+    flown = usable(recording)
+    signs, hover = None if facts.too_slow else rotor_signs(flown), _hover(flown)
     forward, left, spins = signs or ((), (), None)
     spins = facts.rotor_spins or spins
     text = (
@@ -144,7 +140,7 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
             spins=None if spins is None else [int(spin) for spin in spins],
             hover=hover,
             full=full,
-            seconds=sum(float(np.ptp(part.time)) for part in parts),
+            seconds=sum(float(np.ptp(each.time)) for each in flown),
             commanded=recording.commanded,
             guess=GUESS,
             short=lambda value: np.vectorize(lambda x: float(f"{x:.4g}"))(value).tolist(),
@@ -154,16 +150,17 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     return text, ("mass", *(key for key, value in known.items() if value is None))
 
 
-def _hover(parts: Sequence[Recording]) -> tuple[float, bool] | None:
+def _hover(flown: Sequence[Recording]) -> tuple[float, bool] | None:
     """The rotor speed at which thrust is as large as the weight, in the unit of the flight, and whether it was felt.
 
-    It is felt by a plausible accelerometer. If there is none, the median thrust in flight counts as the weight.
+    It is felt by an accelerometer with a median of half to twice gravity in flight. If there is none, the median thrust
+    in flight counts as the weight.
     """
-    if not parts:
+    if not flown:
         return None
-    squares = np.concatenate([(part.omega**2).mean(axis=1) for part in parts])
-    force = [part.specific_force[:, 2] for part in parts if part.specific_force is not None]
-    vertical = np.concatenate(force) if len(force) == len(parts) else np.full(1, np.nan)
+    squares = np.concatenate([(each.omega**2).mean(axis=1) for each in flown])
+    force = [each.specific_force[:, 2] for each in flown if each.specific_force is not None]
+    vertical = np.concatenate(force) if len(force) == len(flown) else np.full(1, np.nan)
     share = float(np.median(vertical[np.isfinite(vertical)])) / GRAVITY if np.isfinite(vertical).any() else np.nan
-    felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
+    felt = bool(0.5 < share < 2)
     return float(np.sqrt(np.median(squares) / (share if felt else 1.0))), felt

@@ -1,7 +1,7 @@
 """Logs of ArduPilot."""
 
 import numpy as np
-from recorded_logs import FRD, attitude, dataflash, force, rates
+from recorded_logs import FRD, RPM, attitude, commands, dataflash, force, position, rates, speeds, velocity
 from scipy.spatial.transform import Rotation
 
 T = 0.0025 * np.arange(1200)  # the main loop runs at 400 Hz
@@ -29,8 +29,27 @@ def outputs(t, order=(0, 1, 2, 3)):
     return ("RCOU", "HHHHHHHH", ",".join(f"C{i}" for i in range(1, 9)), t, (pwm,))
 
 
-def commands(t):
-    return 0.3 + 0.1 * np.arange(4) + 0.05 * np.sin(2 * t)[:, None]
+def rate(t):
+    return ("RATE", "fff", "R,P,Y", t, (np.rad2deg(rates(t) @ FRD),))
+
+
+def ekf(t, core=0, shift=0.0):
+    values = (np.full(t.size, core), velocity(t) @ FRD, position(t) @ FRD + shift)
+    return ("XKF1", "Bffffff", "C,VN,VE,VD,PN,PE,PD", t, values)
+
+
+def escs(t, order=(0, 1, 2, 3)):
+    """One message for each motor, at times of its own."""
+    each = [np.column_stack([np.full(t.size, o), speeds(t + 5e-4 * i)[:, i] / RPM]) for i, o in enumerate(order)]
+    times = np.concatenate([t + 5e-4 * i for i in range(4)])
+    return ("ESC", "Bf", "Instance,RPM", times, (np.concatenate(each),))
+
+
+def everything(t=T):
+    slow = t[::4]
+    messages = [imu(t), rate(slow), angles(t, "ANG", "f"), ekf(t[::8]), escs(slow), outputs(t[::40])]
+    messages.append(("BAT", "Bf", "Inst,Volt", t[::40], (np.zeros(t[::40].size), 16.0 - 0.1 * t[::40])))
+    return dataflash(messages, {"FRAME_CLASS": 1.0, "LOG_BITMASK": 176126})
 
 
 FEW = T[:40]

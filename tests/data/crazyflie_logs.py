@@ -7,6 +7,7 @@ from recorded_logs import (
     GRAVITY,
     RPM,
     attitude,
+    commands,
     crazyflie,
     crazyflie_2019,
     force,
@@ -39,7 +40,7 @@ def state(t):
 
 
 def ratios(t):
-    return np.rint(65535 * (0.3 + 0.1 * np.arange(4) + 0.05 * np.sin(2 * t)[:, None]))
+    return np.rint(65535 * commands(t))
 
 
 def one_event(t, **options):

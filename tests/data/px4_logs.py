@@ -3,8 +3,7 @@
 import struct
 
 import numpy as np
-from recorded_logs import FRD, RPM, attitude, force, message, position, rates, speeds, ulog, velocity
-from scipy.spatial.transform import Rotation
+from recorded_logs import FRD, RPM, force, message, position, quaternions, rates, speeds, ulog, velocity
 
 T = 2500.0  # the test airframe's full scale [rad/s]
 ESC = b"esc_report:uint64_t timestamp;int32_t esc_rpm;uint8_t actuator_function;uint8_t[3] _padding0;"
@@ -28,8 +27,8 @@ def combined(t, gyro=rates, accelerometer=force):
 
 
 def vehicle_attitude(t):
-    q = Rotation.from_matrix(FRD @ attitude(t) @ FRD).as_quat()[:, [3, 0, 1, 2]]
-    return "vehicle_attitude", "uint64_t timestamp;float[4] q;", "Qffff", q.tolist(), t
+    turn = quaternions(t, turned=True).tolist()
+    return "vehicle_attitude", "uint64_t timestamp;float[4] q;", "Qffff", turn, t
 
 
 def local_position(t, valid=True):

@@ -34,6 +34,17 @@ def attitude(t):
     return Rotation.from_euler("ZYX", angles).as_matrix()
 
 
+def quaternions(t, turned=False):
+    """w, x, y, z, from the body to the earth, in our frame; or `turned`: both with y to the right and z down."""
+    rotation = FRD @ attitude(t) @ FRD if turned else attitude(t)
+    return Rotation.from_matrix(rotation).as_quat()[:, [3, 0, 1, 2]]
+
+
+def commands(t):
+    """Shares of full scale."""
+    return 0.3 + 0.1 * np.arange(4) + 0.05 * np.sin(2 * t)[:, None]
+
+
 def euler(t):
     """phi, theta, psi of the project: yaw first, then pitch, then roll."""
     return Rotation.from_matrix(attitude(t)).as_euler("ZYX")[:, ::-1]

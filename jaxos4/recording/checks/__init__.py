@@ -1,7 +1,88 @@
 """A log is checked against itself: faults that it shows, with cause, size and remedy."""
 
-from .between import different_vehicles as different_vehicles
-from .clocks import CLOCK as CLOCK
-from .finding import Finding as Finding, Limits as Limits
-from .table import CHECKS as CHECKS, KINEMATIC as KINEMATIC, self_checks as self_checks
-from .values import Plausible as Plausible, plausible as plausible
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ...airframe import Airframe
+from ...logs import Recording
+from .channels import (
+    clipped_values,
+    impossible_values,
+    rare_motors,
+    sensor_clocks,
+    short_flight,
+    uneven_time,
+    velocity_axes,
+    wrong_axes,
+    wrong_scale,
+)
+from .evidence import INERTIAS as INERTIAS, LIMITS, Evidence as Evidence, Finding as Finding, Limits as Limits
+from .mounting import (
+    different_thrust as different_thrust,
+    earth_axes,
+    opposite_yaw as opposite_yaw,
+    thrust_direction,
+    turned_about_vertical,
+    wrong_thrust,
+)
+
+Check = Callable[[Evidence], Finding | None]
+
+CHECKS: tuple[Check, ...] = (
+    uneven_time,
+    wrong_scale,
+    wrong_axes,
+    sensor_clocks,
+    turned_about_vertical,
+    earth_axes,
+    thrust_direction,
+    velocity_axes,
+    clipped_values,
+    rare_motors,
+    impossible_values,
+    short_flight,
+    wrong_thrust,
+)
+"""Each check looks for one fault. A new check is one function, and one line here."""
+
+KINEMATIC: tuple[Check, ...] = (wrong_scale, wrong_axes)
+"""The checks that hold for a flight without a controller too, which may turn far and drift away."""
+
+
+def self_checks(
+    recording: Recording,
+    airframe: Airframe | None = None,
+    *,
+    limits: Limits = LIMITS,
+    checks: Sequence[Check] = CHECKS,
+) -> tuple[Finding, ...]:
+    """Check a log against itself, before anything is fitted.
+
+    **Arguments:**
+
+    - `recording`: as it was logged, of one vehicle.
+    - `airframe`: without it, gyro and accelerometer are not compared with the rotors.
+    - `limits`: what counts as a finding.
+    - `checks`: of the table.
+
+    **Returns:** the findings; those that contradict quantities come first.
+    """
+    return findings(Evidence(recording, airframe, limits), checks)
+
+
+def findings(evidence: Evidence, checks: Sequence[Check] = CHECKS) -> tuple[Finding, ...]:
+    """What the checks find in the evidence of a log, see `self_checks`."""
+    with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
+        found = [finding for check in checks if (finding := check(evidence)) is not None]
+    return tuple(sorted(found, key=lambda finding: not finding.contradicted))
+
+
+def different_vehicles(
+    recordings: Sequence[Recording], airframe: Airframe, *, limits: Limits = LIMITS
+) -> Finding | None:
+    """Compare the thrust of recordings that should be of one vehicle: the force that each felt for its rotor speeds.
+
+    Without an accelerometer, thrust is compared with the weight.
+    """
+    return different_thrust([Evidence(recording, airframe, limits) for recording in recordings])

@@ -1,22 +1,14 @@
 """Checks of how the sensors are mounted, by the rotors, the attitude and the thrust in hover; and of the thrust."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from ...airframe import GRAVITY
-from ...flight import ANGLES
-from ...logs.sampling import averages
-from .evidence import Evidence
-from .finding import INERTIAS, Finding, Measured
+from .estimates import BATCHES, Measured, batched
+from .evidence import INERTIAS, Evidence, Finding
 
-_COHERENT = 0.1  # the least share of both angular accelerations that the rotors explain
-_VAGUE = 0.2  # [rad]; a larger error of the angle by the rotors is that of another airframe
-_ALONG = 0.17  # [rad]; a rotation turns roll and pitch by the same angle, up to this
-_SLOW, _BLOCKS = 0.1, 12  # [s], samples whose tilt is compared; blocks of the jackknife
-_EARTH = 0.6  # slope of the horizontal force on the tilt: 1 along the earth's axes, 0 or less along the body's
-_STEADY = 0.9  # of the force in a hand or in rolls, the mean vector is shorter than this share of the mean size
-_UNIT_G = (0.8, 1.25)  # mean force in units of g
 _TURN = "turn p, q and ax, ay of the log"
 
 
@@ -51,17 +43,32 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     return Finding("mounting", cause, ways, remedy, quantities, True)
 
 
+def opposite_yaw(correlation: float | None) -> Finding | None:
+    """The vehicle seems to yaw against the torque, see `jaxos4.recording.motion.opposite_axes`; `None`: it does not."""
+    if correlation is None:
+        return None
+    return Finding(
+        "yaw_sign",
+        "yaw answers the rotors with the opposite sign",
+        f"torque and angular acceleration correlate by {-correlation:.2f}",
+        "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
+        "all four signs",
+        ("Iz",),
+        True,
+    )
+
+
 def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     """The angle of the gyro about z and its error [rad], by roll and pitch torque. `None`: unknown, or no rotation."""
-    response = evidence.response
-    if response is None or response.coherent[:2].sum() < 2 * _COHERENT:
+    response, limits = evidence.response, evidence.limits
+    if response is None or response.coherent[:2].sum() < limits.coherent[0]:
         return None
     sizes = np.hypot(*response.turning.value)
     (a, b), (c, d) = response.turning.value / sizes
     errors = response.turning.error / sizes
     apart = abs(math.remainder(math.atan2(-c, a) - math.atan2(b, d), math.tau))
     across = math.hypot(errors[0, 1], errors[1, 0])
-    if not apart < max(_ALONG, evidence.limits.standard_errors * across) or across > _VAGUE:
+    if not apart < max(limits.same_angle, limits.standard_errors * across) or across > limits.vague:
         return None
     return math.atan2(b - c, a + d), across / 2
 
@@ -80,43 +87,20 @@ def _by_attitude(evidence: Evidence) -> tuple[float, float] | None:
 
 def earth_axes(evidence: Evidence) -> Finding | None:
     """Specific force along the axes of the earth: its horizontal part follows the tilt."""
-    slope = _on_tilt(evidence)
-    if slope is None or slope.value < max(_EARTH, evidence.limits.standard_errors * slope.error):
+    if evidence.tilt is None:
+        return None
+    slope, error = float(evidence.tilt.value[0]), float(evidence.tilt.error[0])
+    if slope < max(evidence.limits.along_earth, evidence.limits.standard_errors * error):
         return None
     return Finding(
         "earth_axes",
         "the specific force is along the axes of the earth, and not of the body",
-        f"its horizontal part follows the tilt with a slope of {slope.value:.2f} +- {2 * slope.error:.2g}: 1 along the "
+        f"its horizontal part follows the tilt with a slope of {slope:.2f} +- {2 * error:.2g}: 1 along the "
         "axes of the earth, 0 or less along those of the body",
         "log the accelerometer along the body's axes, or turn it by the attitude",
         ("thrust", *INERTIAS),
         True,
     )
-
-
-def _on_tilt(evidence: Evidence) -> Measured | None:
-    """The slope of ax and ay on what they are if the thrust, along the body's z axis, is given along the earth's."""
-    every = []
-    for piece in evidence.pieces:
-        if piece.specific_force is None or np.isnan(piece.states[:, ANGLES]).all(axis=0).any():
-            continue
-        columns = np.hstack([piece.states[:, ANGLES], piece.specific_force])
-        _, _, means = averages(piece.time, piece.omega, columns, held=piece.held)(max(_SLOW, piece.dt))
-        roll, pitch, yaw, ax, ay, az = means[np.isfinite(means).all(axis=1)].T
-        tilt_x = np.cos(yaw) * np.tan(pitch) + np.sin(yaw) * np.tan(roll) / np.cos(pitch)
-        tilt_y = np.sin(yaw) * np.tan(pitch) - np.cos(yaw) * np.tan(roll) / np.cos(pitch)
-        every.append(np.concatenate([np.stack([az * tilt_x, az * tilt_y]), np.stack([ax, ay])]))
-    tilts, forces = np.split(np.concatenate(every, axis=1), 2) if every else (np.empty((2, 0)),) * 2
-    if tilts.shape[1] < 4 * _BLOCKS:
-        return None
-    tilts, forces = (x - x.mean(axis=1, keepdims=True) for x in (tilts, forces))
-    products, squares = ((tilts * x).sum(axis=0) for x in (forces, tilts))
-    blocks = [(products[part].sum(), squares[part].sum()) for part in np.array_split(np.arange(products.size), _BLOCKS)]
-    product, square = np.array(blocks).T
-    if square.sum() <= 0:
-        return None
-    without = (product.sum() - product) / (square.sum() - square)
-    return Measured.of(np.asarray(product.sum() / square.sum()), without)
 
 
 def thrust_direction(evidence: Evidence) -> Finding | None:
@@ -129,15 +113,15 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
     gravity = GRAVITY if evidence.airframe is None else float(evidence.airframe.gravity)
     share = f"mean specific force {size:.3g} m/s^2"
     if abs(size / gravity - 1) > limits.gravity:
-        if _UNIT_G[0] < size < _UNIT_G[1]:
+        if 0.8 < size < 1.25:
             cause, remedy = "the accelerometer is in units of g", "multiply by 9.80665"
-        elif size < _UNIT_G[0]:
+        elif size <= 0.8:
             cause, remedy = "gravity was subtracted from the accelerometer", "log what the accelerometer measures"
         else:
             cause, remedy = "the scale of the accelerometer is wrong", "give m/s^2: it measures gravity in hover"
         return Finding("force_scale", cause, share, remedy, ("thrust",), True)
     tilt = math.acos(min(max(mean[2] / max(size, 1e-300), -1.0), 1.0))
-    if tilt < limits.tilt or size < _STEADY * sizes:
+    if tilt < limits.tilt or size < limits.steady * sizes:
         return None
     along = ", ".join(f"{x:.2f}" for x in mean / size)
     return Finding(
@@ -152,7 +136,7 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
 
 def wrong_thrust(evidence: Evidence) -> Finding | None:
     """The airframe's thrust does not carry the vehicle, by the accelerometer or by its weight."""
-    every = [thrust for piece in evidence.pieces if (thrust := evidence.thrust(piece)) is not None]
+    every = [thrust for each in evidence.stretches if (thrust := evidence.thrust(each)) is not None]
     if not every or evidence.airframe is None:
         return None
     force, limits = evidence.force, evidence.limits
@@ -169,3 +153,44 @@ def wrong_thrust(evidence: Evidence) -> Finding | None:
         ("thrust",),
         False,
     )
+
+
+def different_thrust(every: Sequence[Evidence]) -> Finding | None:
+    """Recordings that are not of one vehicle: the force that each felt for its rotor speeds.
+
+    Without an accelerometer, thrust is compared with the weight.
+    """
+    with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
+        ratios = [ratio for evidence in every if (ratio := _thrust_ratio(evidence)) is not None]
+    if len(ratios) < 2:
+        return None
+    least, most = (choose(ratios, key=lambda ratio: float(ratio.value)) for choose in (min, max))
+    limits, apart = every[0].limits, float(most.value / least.value) - 1
+    error = limits.standard_errors * np.hypot(least.error / least.value, most.error / most.value)
+    commanded = any(evidence.logged.commanded for evidence in every)
+    if apart < max(limits.vehicles, error):
+        return None
+    return Finding(
+        "different_vehicles",
+        "the logs are of vehicles of different mass or thrust" + (", or of different batteries" if commanded else ""),
+        f"the same rotors lift {apart:.0%} more in one log than in another",
+        "fit them separately, each with its own mass" + ("; log the battery's voltage" if commanded else ""),
+        ("thrust", *INERTIAS),
+        bool(not commanded or apart > limits.commanded_vehicles),
+    )
+
+
+def _thrust_ratio(evidence: Evidence) -> Measured | None:
+    """The mean vertical specific force over the thrust per mass of the airframe."""
+    every = [np.empty((0, 2))]
+    for each in evidence.stretches:
+        thrust = evidence.thrust(each)
+        if thrust is None or evidence.airframe is None:
+            return None
+        weight = np.full(thrust.size, float(evidence.airframe.gravity))
+        force = weight if each.specific_force is None else each.specific_force[:, 2]
+        every.append(np.column_stack([force, thrust])[np.isfinite(force)])
+    both = np.concatenate(every)
+    if len(both) < BATCHES or both.mean(axis=0).min() <= 0:
+        return None
+    return Measured.of(batched(both), lambda sums: sums[0] / sums[1])

@@ -1,0 +1,192 @@
+"""Values that no sensor measured: beyond what any quadrotor does, far from all others, or stuck at the end of a range.
+
+They count as not measured. Many of them in a column are a wrong unit, and refuse the log.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..flight import CHANNEL_NAMES, FORCE_NAMES
+from .sampling import filled
+from .table import COMMAND_NAMES, SPEED_NAMES, Recording, Table
+
+
+class Limit(NamedTuple):
+    """The values that a column can have, their unit, and advice on larger values, and on smaller ones if it differs."""
+
+    least: float
+    largest: float
+    unit: str
+    advice: str
+    below: str = ""
+
+
+_TIME = "t is in seconds: if these are milli-, micro- or nanoseconds, divide"
+_COMMAND = "commands are fractions 0..1: divide by full scale (100, 65535)"
+_SPEED = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
+_SIGN = "drop the sign, because rotor_spins gives the direction"
+_POSITION = "positions are in metres from a point near the flight; subtract an offset"
+_VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
+_FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
+_VOLTAGE = "the battery's voltage is in volts: if these are mV, divide by 1000"
+_PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
+_RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
+LIMITS = {
+    "t": Limit(-1e11, 1e11, "s", _TIME),
+    **dict.fromkeys(SPEED_NAMES, Limit(0, 1e5, "rad/s", _SPEED, _SIGN)),
+    **dict.fromkeys(COMMAND_NAMES, Limit(0, 1, "of full scale", _COMMAND)),
+    **dict.fromkeys("xyz", Limit(-1e6, 1e6, "m", _POSITION)),
+    **dict.fromkeys(("vx", "vy", "vz"), Limit(-1e3, 1e3, "m/s", _VELOCITY)),
+    **dict.fromkeys("pqr", Limit(-60.0, 60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
+    **dict.fromkeys(("phi", "theta", "psi"), Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")),
+    **dict.fromkeys(FORCE_NAMES, Limit(-1e3, 1e3, "m/s^2", _FORCE)),
+    "voltage": Limit(-200.0, 200.0, "V", _VOLTAGE),
+}
+"""A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
+PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
+"""The pitch of a log: one that was not read from a file may be any number."""
+
+
+def without_impossible(
+    table: Table, limits: Mapping[str, Limit] = LIMITS, *, most: float = 0.01, farthest: float = 10.0
+) -> Table:
+    """The table without the values outside of `limits`: they count as not measured.
+
+    **Arguments:**
+
+    - `most`: the share of the values of a column that can be impossible. More are a wrong unit.
+    - `farthest`: a rotor turns at most so many times as fast as in all but this share of its flight.
+
+    **Raises:** `InputError` if more than this share of a column are impossible.
+    """
+    columns, impossible = dict(table.columns), dict(table.impossible)
+    for name, limit in limits.items():
+        values, largest = columns.get(name, np.empty(0)), limit.largest
+        if name in SPEED_NAMES and (values > 0).any():
+            largest = min(largest, farthest * float(np.quantile(values[values > 0], 1 - most)))
+        wrong = (values < limit.least) | (values > largest)
+        if name == "t" or not wrong.any():
+            continue
+        index, count = int(np.argmax(wrong)), int(np.count_nonzero(wrong))
+        first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
+        if count > most * every:
+            low = values[index] < limit.least
+            share = f"{count} of {every} values, more than {100 * most:g} %"
+            what = f"is {first}, beyond {limit.least if low else limit.largest:.4g} {limit.unit} ({share}); "
+            advice = (low and limit.below) or table.remedy or limit.advice
+            table.refuse(what + advice, index=index, column=name)
+        columns[name] = np.where(wrong, np.nan, values)
+        before, begin = impossible.get(name, (0, f"{first} at {table.columns['t'][index]:.6g} s"))
+        impossible[name] = before + count, begin
+    return table._replace(columns=columns, impossible=impossible)
+
+
+class Plausible(NamedTuple):
+    """A recording in which faulty values count as not measured, and how many they are, by channel.
+
+    - `impossible`: by channel, how many values, and the most extreme of them.
+    - `clipped`: by channel, how many values are stuck at the end of the range, their share, and the end.
+    """
+
+    recording: Recording
+    impossible: Mapping[str, tuple[int, float]]
+    clipped: Mapping[str, tuple[int, float, float]]
+
+
+class Rules(NamedTuple):
+    """What is implausible in a channel, by its usual range, from the quantile 0.005 to 0.995.
+
+    - `fewest`: values; fewer have no usual range.
+    - `spread`: a value is impossible if it lies so many times further from the median than the end of the range, and
+      most of the six `neighbours` around it do not. Fast manoeuvres last for more than three samples.
+    - `times`, `equal`: values are clipped if so many are equal to the largest one, and so many times more than lie
+      just below, within a share `near` of the range. A signal without limits has a single largest value. A value that
+      is held counts once.
+    - `levels`: with more repeated values than this, a signal is coarse, and the level below the largest counts as near.
+    """
+
+    fewest: int = 20
+    spread: float = 8.0
+    neighbours: tuple[int, ...] = (-3, -2, -1, 1, 2, 3)
+    times: float = 3.0
+    equal: int = 4
+    near: float = 0.01
+    levels: int = 10
+
+
+RULES = Rules()
+
+
+def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
+    """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before.
+
+    A rotor at its limit is a fact, and not an error of its sensor.
+    """
+    channels, omega = recording.channels.copy(), recording.omega.copy()
+    impossible, clipped = {}, {}
+    names = (*CHANNEL_NAMES, *(f"rotor {i + 1}" for i in range(4)))
+    for name, column in zip(names, (*channels.T, *omega.T), strict=True):
+        wrong = _isolated(column, rules)
+        if wrong.any():
+            worst = column[wrong][np.argmax(np.abs(column[wrong]))]
+            impossible[name] = int(wrong.sum()), float(worst)
+            column[wrong] = np.nan
+        if name not in ("p", "q", "r", *FORCE_NAMES):
+            continue
+        known = np.count_nonzero(np.isfinite(column))
+        for sign in (1.0, -1.0):
+            stuck = _stuck(sign * column, rules)
+            if stuck.any():
+                end, number = float(column[stuck][0]), int(stuck.sum())
+                count, share, before = clipped.get(name, (0, 0.0, end))
+                clipped[name] = count + number, share + number / known, max(before, end, key=abs)
+                column[stuck] = np.nan
+    if not impossible and not clipped:
+        return Plausible(recording, {}, {})
+    force = None if recording.specific_force is None else channels[:, 12:]
+    clean = recording._replace(omega=filled(omega), states=channels[:, :12], specific_force=force)
+    return Plausible(clean, impossible, clipped)
+
+
+def _isolated(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:
+    """Which values lie far outside of the usual range, while most of those around them do not."""
+    out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
+    if known.size < rules.fewest:
+        return out
+    x = values[known]
+    least, middle, most = np.quantile(x, (0.005, 0.5, 0.995))
+    far = (x < middle - rules.spread * (middle - least)) | (x > middle + rules.spread * (most - middle))
+    if least == most or not far.any():
+        return out
+    at, around = np.flatnonzero(far), np.array(rules.neighbours)
+    wild = far[np.clip(at[:, None] + around, 0, x.size - 1)].sum(axis=1)
+    out[known[at[wild < around.size / 2]]] = True
+    return out
+
+
+def _stuck(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:
+    """Which values are equal to the largest one, if these are too many to be chance."""
+    out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
+    if known.size < rules.fewest:
+        return out
+    x = values[known]
+    near = rules.near * float(np.subtract(*np.quantile(x, (0.995, 0.005))))
+    top = x >= x.max() - 1e-4 * near
+    if near <= 0 or top.sum() < rules.equal:
+        return out
+    held = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]])))
+    usual = float(np.quantile(held, 0.9))  # samples for which a value is held
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], top.astype(int), [0]])))
+    at_top = np.ceil((edges[1::2] - edges[::2]) / usual).sum()
+    levels, counts = np.unique(x, return_counts=True)
+    levels = levels[counts > 1]
+    if levels.size > rules.levels:
+        near = max(near, 1.01 * float(np.median(np.diff(levels))))
+    beside = np.count_nonzero(x[~top] >= x.max() - near) / usual
+    if at_top >= max(rules.equal, rules.times * (beside + 1)):
+        out[known[top]] = True
+    return out

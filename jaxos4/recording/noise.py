@@ -1,0 +1,151 @@
+"""White noise of sensors, and the rotor speeds that are expected given all measured ones.
+
+A noisy input makes the slope of a regression too small: moments of inertia come out too large, and true parameters
+predict worse than shrunken ones. The expectation of the speeds given the measurements has no such bias: what it misses
+does not correlate with it, and acts as a disturbance. It is the Wiener filter, which has no delay.
+
+Thrust and the torques of roll, pitch and yaw are filtered separately: rotors answer some of them more than others, and
+the noise is the same in all.
+
+Reference: Carroll, Ruppert, Stefanski and Crainiceanu 2006, Measurement Error in Nonlinear Models, ch. 4.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..airframe import Airframe
+from ..logs import Recording
+
+Changes = Float[np.ndarray, "frequencies 4"]
+
+
+def white_noise(values: Float[np.ndarray, " samples"], order: int) -> float:
+    """The standard deviation of white noise, from the median size of differences of this order; NaN without any.
+
+    Motion is smooth from sample to sample, noise is not. A higher order tolerates faster motion. Jumps between
+    stretches, and of angles by a turn, do not count.
+    """
+    size = np.diff(values, order)
+    size = np.abs(size[np.isfinite(size)])
+    return float(np.median(size)) / 0.6745 / math.sqrt(math.comb(2 * order, order)) if size.size else math.nan
+
+
+def force_noise(recording: Recording, step: float, *, share: float = 0.5) -> Float[np.ndarray, "3"]:
+    """The least white noise of means over samples of `step` [s]: by second differences, and by one count of the sensor.
+
+    Vibration is not smooth from row to row, and so no disturbance. Without this limit, a fit may take it for one.
+    `share`: the least noise as a share of that by second differences.
+    """
+    least, force = np.zeros(3), recording.specific_force
+    for axis, values in enumerate([] if force is None else force.T):
+        size = np.abs(np.diff(values))
+        rounding = 1e-6 * np.nanmax(np.abs(values), initial=1.0)
+        count = np.min(size[size > rounding], initial=np.inf)
+        noise = max(share * white_noise(values, 2), count if np.isfinite(count) else 0.0)
+        least[axis] = np.nan_to_num(noise) * math.sqrt(min(recording.dt / step, 1.0))
+    return least
+
+
+class SpeedNoise(NamedTuple):
+    """How the noise of rotor speeds is found.
+
+    - `seconds`, `fewest`: how long the samples of one spectrum last [s], and how many they are at least.
+    - `neighbours`: spectra are averaged over so many neighbouring frequencies to either side.
+    - `band`: in which changes of speeds are divided into motion and noise, as shares of the highest frequency.
+    - `written`: rates at which the speeds may have been written before they were interpolated, of which one is chosen,
+      in units of the highest frequency.
+    - `passes`: of the weighted fit.
+    - `negligible`: noise with a smaller share of the power of the changes is none: it changes no answer.
+    """
+
+    seconds: float = 1.0
+    fewest: int = 32
+    neighbours: int = 2
+    band: tuple[float, float] = (0.25, 0.9)
+    written: tuple[float, ...] = (np.inf, 4.0, 2.8, 2.0, 1.7, 1.4, 1.2, 1.0)
+    passes: int = 20
+    negligible: float = 1e-3
+
+
+SETTINGS = SpeedNoise()
+
+
+def without_noise(
+    stretches: Sequence[Recording], airframe: Airframe, settings: SpeedNoise = SETTINGS
+) -> tuple[list[Recording], float, float]:
+    """The stretches of one recording with the expected rotor speeds. Commands have no noise.
+
+    **Returns:** also the standard deviation of the noise [rad/s], and the share of its power in the changes from sample
+    to sample.
+    """
+    if any(each.commanded for each in stretches):
+        return list(stretches), 0.0, 0.0
+    axes = np.linalg.qr(np.asarray(airframe.mixer, dtype=float).T)[0]
+    power = _power([each.omega @ axes for each in stretches], stretches[0].dt, settings)
+    if power is None:
+        return list(stretches), 0.0, 0.0
+    noise = _noise(power, settings)
+    kept = 1 - noise[:, None] / np.maximum(power, noise[:, None] + np.finfo(float).tiny)
+    share = float(noise.sum() / max(power.mean(axis=1).sum(), np.finfo(float).tiny))
+    if share < settings.negligible:
+        return list(stretches), 0.0, 0.0
+    speeds = [np.maximum(_filtered(each.omega @ axes, kept) @ axes.T, 0.0) for each in stretches]
+    smooth = [each._replace(omega=speed) for each, speed in zip(stretches, speeds, strict=True)]
+    return smooth, float(np.sqrt(noise.mean() / 2)), share
+
+
+def _power(signals: Sequence[Float[np.ndarray, "samples 4"]], dt: float, settings: SpeedNoise) -> Changes | None:
+    """The mean power of the changes from sample to sample, by frequency; that of white changes is their variance."""
+    length = 2 * (max(round(settings.seconds / dt), settings.fewest) // 2)
+    weight, spectra = np.hanning(length + 1)[:-1, None], []
+    for signal in signals:
+        changes = np.diff(signal, axis=0)
+        for first in range(0, len(changes) - length + 1, length // 2):
+            own = changes[first : first + length]
+            spectra.append(np.abs(np.fft.rfft(weight * (own - own.mean(axis=0)), axis=0)) ** 2)
+    if not spectra:
+        return None
+    power = np.mean(spectra, axis=0) / np.square(weight).sum()
+    around = np.pad(power, ((settings.neighbours, settings.neighbours), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(around, 2 * settings.neighbours + 1, axis=0)
+    return windows.mean(axis=-1)
+
+
+def _noise(power: Changes, settings: SpeedNoise) -> Float[np.ndarray, " frequencies"]:
+    """The power of the noise in the changes of each direction.
+
+    Motors follow their commands with a lag, so the power of the changes of true speeds does not grow with frequency: it
+    is taken as a constant and a part that falls with the square, for each direction. That of white noise grows, and
+    falls again near the highest frequency if the speeds were interpolated between packets.
+    """
+    from scipy.optimize import nnls  # slow to import
+
+    frequency = np.linspace(0, 1, len(power))
+    growth = 4 * np.sin(np.pi / 2 * frequency) ** 2
+    some = slice(*(round(edge * (len(power) - 1)) for edge in settings.band))
+    directions, wanted = np.eye(power.shape[1]), np.maximum(power[some].T.ravel(), np.finfo(float).tiny)
+    motion = np.hstack([np.kron(directions, growth[some, None] ** order) for order in (0, -1)])
+
+    def fitted(rate: float) -> tuple[float, Float[np.ndarray, " frequencies"]]:
+        shape = growth * np.sinc(frequency / rate) ** 4
+        columns, model = np.hstack([motion, np.tile(shape[some], len(directions))[:, None]]), wanted
+        size = np.zeros(columns.shape[1])
+        for _ in range(settings.passes):
+            size, _ = nnls(columns / model[:, None], wanted / model)
+            model = np.maximum(columns @ size, np.finfo(float).tiny)
+        return float((np.log(model) + wanted / model).sum()), size[-1] * shape
+
+    return min(map(fitted, settings.written), key=lambda each: each[0])[1]
+
+
+def _filtered(signal: Float[np.ndarray, "samples 4"], kept: Changes) -> Float[np.ndarray, "samples 4"]:
+    """The signal times a share at each frequency. Its mirror images stand before and after it."""
+    mirrored = np.concatenate([signal, signal[::-1]])
+    frequencies = np.linspace(0, len(kept) - 1, len(mirrored) // 2 + 1)
+    share = np.column_stack([np.interp(frequencies, np.arange(len(kept)), each) for each in kept.T])
+    share[0] = 1.0
+    return np.fft.irfft(share * np.fft.rfft(mirrored, axis=0), len(mirrored), axis=0)[: len(signal)]

@@ -1,0 +1,343 @@
+"""Recordings of one vehicle as one flight to fit: usable stretches, longer samples, whole windows, some held out."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from ..airframe import Airframe
+from ..errors import InputError, named
+from ..flight import RATES, STATE_NAMES, Flight
+from ..logs import Recording
+from ..models.state import CASCADE_ORDER
+from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
+from .checks import INERTIAS, Evidence, Finding, different_thrust, findings, opposite_yaw
+from .motion import Ups, measures_velocity, opposite_axes, refused_note, velocity_of
+from .noise import force_noise, without_noise
+from .stretches import Stretch, cut, nothing_usable, stretches
+from .windows import averaged, hold_out, joined, whole_windows
+
+HOLDOUT = 0.25
+"""The share that is held out by default."""
+_NEARLY = 1.01  # sample times that differ by less than this factor count as equal
+
+
+class Preparation(NamedTuple):
+    """How recordings become a flight to fit.
+
+    - `window`: the length of a window [s].
+    - `fewest`: samples of a window.
+    - `shortest`: the shortest sample by default [s]: no quadrotor's motion needs shorter ones.
+    - `longest`: the longest sample at which an answer is compared with that of shorter ones [s].
+    - `whole`: a sample time that the user gives becomes a multiple of the log's if that changes it by less than this
+      share.
+    - `noisy`: noise of rotor speeds is noted from this share of their changes on.
+    - `full`, `often`: the share of full speed at which a rotor is at its limit, and the share of time that is noted.
+    """
+
+    window: float = 0.25
+    fewest: int = 4
+    shortest: float = 0.004
+    longest: float = 0.032
+    whole: float = 0.05
+    noisy: float = 0.1
+    full: float = 0.999
+    often: float = 0.01
+
+
+RULES = Preparation()
+
+
+class Prepared(NamedTuple):
+    """Recordings, ready to be fitted.
+
+    - `fitted`: one flight of all stretches; measurements that are held out are missing.
+    - `tested`: the same samples with only the held-out measurements; `None`: nothing is held out.
+    - `recordings`: for each stretch, the number of its recording, from 0.
+    - `time`: of each sample in its log [s].
+    - `length`: of a window, in samples.
+    - `available`: what every recording offers to the terms of a model, see `Term.needs`.
+    - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `_level`.
+      `None`: unknown.
+    - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
+    - `seconds`: how long the fitted and the tested measurements last [s].
+    - `notes`: what the reader changed, and which stretches are not used.
+    - `doubts`: what the logs show that concerns moments of inertia.
+    - `log_step`: the longest sample of the logs [s].
+    """
+
+    fitted: Flight
+    tested: Flight | None
+    recordings: tuple[int, ...]
+    time: Float[np.ndarray, " samples"]
+    length: int
+    available: frozenset[str]
+    level: tuple[float, float] | None
+    force_noise: Float[np.ndarray, "3"]
+    seconds: tuple[float, float]
+    notes: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
+    log_step: float = 0.0
+
+    @property
+    def windows(self) -> int:
+        """The number of windows; each lies in one stretch."""
+        return self.fitted.time.shape[0] // self.length
+
+    @property
+    def battery_voltage(self) -> float | None:
+        """The median of the battery's voltage [V]. `None`: not logged."""
+        return None if self.fitted.voltage is None else float(np.median(self.fitted.voltage))
+
+
+class _Cleaned(NamedTuple):
+    """One recording: its usable stretches with plausible values, and what the checks of it found."""
+
+    stretches: list[Recording]
+    notes: list[str]
+    doubts: list[Finding]
+    evidence: Evidence
+
+
+def prepare(
+    recordings: Sequence[Recording],
+    airframe: Airframe,
+    *,
+    begin: float | None = None,
+    end: float | None = None,
+    sample_time: float | None = None,
+    holdout: float = HOLDOUT,
+    predicted: bool = False,
+    rules: Preparation = RULES,
+) -> tuple[Prepared, ...]:
+    """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
+
+    `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors, and
+    messages do not name options of the fit.
+
+    **Returns:** the flight, averaged to `sample_time`, by default the shortest, and to each longer one at which an
+    answer is compared with the others.
+
+    **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
+    """
+    _check_options(begin, end, sample_time, holdout)
+    for number, recording in enumerate(recordings):
+        if any(recording.same_data(earlier) for earlier in recordings[:number]):
+            raise InputError(f"{recording.name}: given twice; give each log once.")
+    every = [_cleaned(each, airframe, begin, end, predicted=predicted, rules=rules) for each in recordings]
+    if len({stretch.commanded for each in every for stretch in each.stretches}) > 1:
+        raise InputError(
+            f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
+        )
+    different = different_thrust([each.evidence for each in every])
+    doubts = [*(doubt for each in every for doubt in each.doubts), *([] if different is None else [different])]
+    notes, stretched = [note for each in every for note in each.notes], []
+    for number, (recording, each) in enumerate(zip(recordings, every, strict=True)):
+        smooth, noise, share = without_noise(each.stretches, airframe)
+        stretched += [(number, stretch) for stretch in smooth]
+        if share > rules.noisy:
+            how = f"white noise of {noise:.2g} rad/s, {share:.0%} of their changes from sample to sample"
+            notes.append(f"{recording.name}: rotor speeds have {how}; their expected values are used")
+    slowest = max(stretch.dt for _, stretch in stretched)
+    steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted, rules=rules)
+    coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
+    numbers = [number for number, _ in stretched]
+    return tuple(
+        _sampled(recordings, numbers, flown, airframe, step, holdout, rules)._replace(
+            notes=tuple(notes), doubts=tuple(doubts), log_step=slowest
+        )
+        for step, flown in zip(steps, coarse, strict=True)
+    )
+
+
+def _cleaned(
+    recording: Recording,
+    airframe: Airframe,
+    begin: float | None,
+    end: float | None,
+    *,
+    predicted: bool,
+    rules: Preparation,
+) -> _Cleaned:
+    """The usable stretches of one recording, and what its checks find. Raises `InputError` if it cannot be used."""
+    name, facts = recording.name, recording.facts
+    if np.isnan(recording.states[:, RATES]).all(axis=0).any():
+        raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
+    evidence = Evidence(recording, airframe)
+    found = [msgspec.structs.replace(each, cause=f"{name}: {each.cause}") for each in findings(evidence)]
+    doubts = [each for each in found if {*each.quantities} & {*INERTIAS}]
+    notes = [str(each) for each in found if each not in doubts]
+    slow = (facts._replace(gyro=None) if predicted else facts).too_slow
+    usable, note = _usable(evidence.plausible.recording, airframe, begin, end, slow, predicted=predicted)
+    if slow:
+        raise InputError(f"{name}: {slow}.")
+    if limited := at_limit(evidence.plausible.recording, airframe, rules):
+        notes.append("; ".join(limited))
+    opposite = opposite_axes(usable, airframe)
+    if refused := refused_note(opposite):
+        raise InputError(f"{name}: {refused}.")
+    if yaw := opposite_yaw(opposite.get("yaw")):
+        doubts.append(msgspec.structs.replace(yaw, cause=f"{name}: {yaw.cause}"))
+    return _Cleaned(usable, [*notes, *recording.named_notes, *note], doubts, evidence)
+
+
+def at_limit(recording: Recording, airframe: Airframe, rules: Preparation = RULES) -> tuple[str, str] | None:
+    """Cause and remedy, if rotors are at full speed for a noticeable time. These stretches are not used."""
+    shares = (recording.omega >= rules.full * float(airframe.max_rotor_speed)).mean(axis=0)
+    often = [
+        f"rotor {i + 1} is at its limit for {100 * share:.0f} % of the time"
+        for i, share in enumerate(shares)
+        if share > rules.often
+    ]
+    return (f"{recording.name}: {', '.join(often)}", "fly gentler, or with a fuller battery") if often else None
+
+
+def _usable(
+    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str, *, predicted: bool
+) -> tuple[list[Recording], list[str]]:
+    """The usable stretches, or what `begin` and `end` ask for; and notes about the stretches that are not used.
+
+    `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
+    """
+    name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
+    if begin is not None or end is not None:
+        with named(name):
+            return [cut(recording, Stretch(first if begin is None else begin, last if end is None else end))], []
+    every = stretches(recording, airframe)
+    usable = [stretch for stretch in every if not stretch.reason]
+    refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
+    if not usable:
+        remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
+        besides = f" Besides, {slow}." if slow else ""
+        raise InputError(f"{name}: {nothing_usable(every)}; {remedy}.{besides}")
+    if not refused:
+        return [recording], []
+    reasons = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in refused[:3])
+    seconds = sum(stretch.length for stretch in usable)
+    note = (
+        f"{name}: {seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {reasons}"
+        f"{'; ...' if len(refused) > 3 else ''}{'' if predicted else ' (`begin` and `end` override)'}"
+    )
+    return [cut(recording, stretch) for stretch in usable], [note]
+
+
+def _sample_times(
+    name: str, slowest: float, sample_time: float | None, *, predicted: bool, rules: Preparation
+) -> list[float]:
+    """The sample times at which answers are compared [s], the shortest first. `slowest`: of the logs."""
+    if slowest > _NEARLY * rules.window / rules.fewest:
+        least = f"log at {rules.fewest / rules.window:g} Hz or more"
+        raise InputError(f"{name}: has one sample every {slowest:.4g} s, too few for a vehicle; {least}.")
+    if sample_time is not None and slowest > sample_time * _NEARLY:
+        if predicted:
+            raise InputError(
+                f"{name}: has one sample every {slowest:.4g} s, the fitted logs one every "
+                f"{sample_time:.4g} s; give `sample_time` {slowest:.4g}, or another `validate`."
+            )
+        raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
+    shortest = max(rules.shortest if sample_time is None else sample_time, slowest)
+    whole = max(round(shortest / slowest), 1) * slowest
+    if not predicted and (sample_time is None or abs(whole - shortest) < rules.whole * shortest):
+        shortest = whole  # samples of whole rows
+    doublings = 0 if predicted else math.floor(math.log2(rules.longest * _NEARLY / shortest))
+    return [shortest * 2**k for k in range(max(doublings, 0) + 1)]
+
+
+def _sampled(
+    recordings: Sequence[Recording],
+    numbers: Sequence[int],
+    flown: Sequence[Recording],
+    airframe: Airframe,
+    step: float,
+    holdout: float,
+    rules: Preparation,
+) -> Prepared:
+    """One flight of stretches that are averaged to samples of `step` [s]. `numbers`: of their recordings."""
+    length = round(rules.window / step)
+    if length < rules.fewest:
+        least = rules.window / rules.fewest
+        raise InputError(f"`sample_time` {step:g}: too long for a vehicle; give at most {least:g}, or log faster.")
+    whole = [(number, whole_windows(each, length)) for number, each in zip(numbers, flown, strict=True)]
+    whole = [(number, each) for number, each in whole if each.time.size]
+    numbers, flown = tuple(number for number, _ in whole), [each for _, each in whole]
+    if unused := [recording for i, recording in enumerate(recordings) if i not in numbers]:
+        raise InputError(f"{unused[0].name}: no part is as long as a window, {rules.window:g} s; leave this log out.")
+    moved, ups = [velocity_of(each) for each in flown], []
+    if None not in moved:
+        velocities, ups = zip(*moved, strict=True)
+        flown = [each._replace(body_velocity=velocity) for each, velocity in zip(flown, velocities, strict=True)]
+    everything = joined(flown)
+    fitted, tested = hold_out(everything, length, holdout)
+    return Prepared(
+        fitted=fitted.flight,
+        tested=None if tested is None else tested.flight,
+        recordings=numbers,
+        time=np.concatenate([each.time for each in flown]),
+        length=length,
+        available=_available_inputs(everything, flown, airframe),
+        level=_level(fitted, ups, float(airframe.gravity)) if ups else None,
+        force_noise=np.min([force_noise(recording, step) for recording in recordings], axis=0),
+        seconds=(_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
+    )
+
+
+def _available_inputs(whole: Recording, flown: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
+    """The inputs for `Term.needs` that the joined recording offers. A force counts if every stretch measured it."""
+    force = np.all([~np.isnan(each.channels[:, len(STATE_NAMES) :]).all(axis=0) for each in flown], axis=0)
+    offers = {
+        COMMANDS: whole.commanded,
+        VELOCITY: whole.body_velocity is not None,
+        MEASURED_VELOCITY: all(map(measures_velocity, flown)),
+        LATERAL_FORCE: force[0] and force[1],
+        VERTICAL_FORCE: force[2],
+        FULL_SCALE: airframe.has_full_scale,
+        VOLTAGE: whole.voltage is not None,
+    }
+    return frozenset(name for name, offered in offers.items() if offered)
+
+
+def _level(
+    fitted: Recording,
+    every: Sequence[Ups],
+    gravity: float,
+    *,
+    gained: float = 1.0,
+    carried: float = 0.003,
+    upright: float = 0.5,
+) -> tuple[float, float] | None:
+    """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
+
+    Over a stretch of flight a vehicle gains little velocity, so all forces together carry its weight.
+
+    **Arguments:**
+
+    - `gained`: the velocity that a stretch gains [m/s].
+    - `carried`: the share of the weight that is carried by other causes.
+    - `upright`: the least mean cosine of the tilt of a vehicle whose weight says how its accelerometer errs.
+    """
+    force = fitted.specific_force
+    if force is None or not (known := np.isfinite(force).all(axis=1)).any():
+        return None
+    ups = [np.concatenate(each)[known] for each in zip(*every, strict=True)]
+    other, along = ((force[known] * up).sum(axis=1).mean() for up in ups)
+    cosine = ups[-1][:, 2].mean()
+    if cosine < upright or force[known, 2].mean() < 0:  # the second: the z axis points down
+        return None
+    drift = gained * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
+    return (along - gravity) / cosine, math.hypot(drift, carried * gravity, along - other) / cosine
+
+
+def _seconds(recording: Recording) -> float:
+    return float(np.count_nonzero(~np.isnan(recording.states[:, CASCADE_ORDER[0]])) * recording.dt)
+
+
+def _check_options(begin: float | None, end: float | None, sample_time: float | None, holdout: float) -> None:
+    if sample_time is not None and not 0 < sample_time < math.inf:
+        raise InputError(f"`sample_time`: must be a positive number of seconds, got {sample_time:g}.")
+    if not 0 <= holdout <= 0.5:
+        raise InputError(f"`holdout`: must be a share from 0 to 0.5, got {holdout:g}.")
+    if begin is not None and end is not None and not begin < end:
+        raise InputError(f"`begin` {begin:g} `end` {end:g}: must be in this order.")

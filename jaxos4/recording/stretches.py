@@ -1,0 +1,321 @@
+"""The stretches of a flight: which can be used for identification, and why not the others.
+
+A stretch is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, no
+samples are lost, and the vehicle does not crash. The rotors do not carry it if they are idle, or if the accelerometer
+does not feel them.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..airframe import STANDARD_GRAVITY, Airframe
+from ..errors import InputError
+from ..flight import RATES, Flight
+from ..logs import Recording, as_recording
+
+ON_GROUND = "on the ground"
+# Labels of samples; the last one that applies counts. The reason of a rotor at its limit names the rotor.
+_USABLE, _SHORT, _SATURATED, _LOST, _CRASHED, _GROUND = range(6)
+_REASONS = ("", "less than {:g} s between others", "", "nothing was measured", "an impact", ON_GROUND)
+
+Samples = Bool[np.ndarray, " samples"]
+
+
+class Stretch(NamedTuple):
+    """A stretch of a flight, from the sample at `begin` to the sample at `end` [s].
+
+    `reason`: why it is not usable; empty if it is.
+    """
+
+    begin: float
+    end: float
+    reason: str = ""
+
+    @property
+    def length(self) -> float:
+        """Its duration [s]."""
+        return self.end - self.begin
+
+
+class StretchRules(NamedTuple):
+    """What counts as a usable stretch. Times in seconds, forces in multiples of gravity, unless units are given.
+
+    - `shortest`: a usable stretch, and the rest of a vehicle that lies on its side or back.
+    - `moment`: a rotor may rest or be at its limit for this long: about its lag.
+    - `carries`: the share of the weight; with less thrust for `sustained`, the vehicle is on the ground. Shorter pauses
+      of thrust happen in flight, shorter bursts on the ground.
+    - `margin`: between the ground and free flight.
+    - `least_hover`: the share of full command; no vehicle has a thrust of 25 times its weight.
+    - `gap`: the longest without a measurement, or five samples of a slow sensor.
+    - `same`: differences below this share of a rotor's largest speed count as none.
+    - `full`: the share of the airframe's `max_rotor_speed` from which a rotor is at full speed.
+    - `impact_force`, `impact_rate`: [m/s^2], and [rad/s] within `impact_time`, that end a flight if the rotors stop
+      within `after_impact`. `before_impact` is not trusted.
+    - `bin`: means over this time; `smooth` of them are longer than the lag of any rotor.
+    - `rest`: a window in which thrust and force are compared; a gap between two resting windows is filled up to
+      `filled`.
+    - `varies`: the least standard deviation of thrust in a window, as a share of its mean.
+    - `unfelt`: the relative change of the vertical force for a relative change of thrust: 1 in flight.
+    - `steady`, `one_g`: the standard deviation of the force of a resting vehicle; the error of an accelerometer.
+    - `tilted`, `still`: the force along z of a vehicle on its side or back, and its rates [rad/s].
+    """
+
+    shortest: float = 1.0
+    moment: float = 0.1
+    carries: float = 0.3
+    sustained: float = 0.5
+    margin: float = 0.3
+    least_hover: float = 0.2
+    gap: float = 0.05
+    same: float = 1e-3
+    full: float = 0.995
+    impact_force: float = 50.0
+    impact_rate: float = 15.0
+    impact_time: float = 0.02
+    after_impact: float = 1.0
+    before_impact: float = 0.5
+    bin: float = 0.05
+    smooth: int = 4
+    rest: float = 2.0
+    filled: float = 5.0
+    varies: float = 0.2
+    unfelt: float = 0.1
+    steady: float = 0.1
+    one_g: float = 0.15
+    tilted: float = 0.5
+    still: float = 0.2
+
+
+RULES = StretchRules()
+
+
+def stretches(
+    flight: Flight | Recording, airframe: Airframe | None = None, *, rules: StretchRules = RULES
+) -> tuple[Stretch, ...]:
+    """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
+
+    **Arguments:**
+
+    - `flight`: one flight, not a batch.
+    - `airframe`: the weight, and the largest rotor speed. If there is none, or if it is evidently another vehicle's
+      (thrust below a third or above three times the weight), the median thrust is taken as the weight.
+    """
+    recording = as_recording(flight)
+    time, omega, dt, force = recording.time, recording.omega, recording.dt, recording.specific_force
+    rates = recording.states[:, RATES]
+    share = _thrust_share(recording, airframe, rules)
+    ground = _ground(share, dt, rules)
+    for begin, end in recording.facts.landed:  # as the vehicle itself says
+        ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
+    saturations = _saturations(omega, airframe, dt, rules)
+    labels = np.zeros(time.size, dtype=int)
+    labels[np.any([where.any(axis=1) for where in saturations.values()], axis=0)] = _SATURATED
+    labels[_lost(recording.states, dt, rules)] = _LOST
+    labels[_crashed(rates, force, share, ground, dt, rules)] = _CRASHED
+    labels[ground] = _GROUND
+    if force is not None:
+        labels[_resting(omega, force, rates, labels == _USABLE, dt, rules) & (labels != _LOST)] = _GROUND
+    for begin, end in _runs(labels == _USABLE):
+        if time[end - 1] - time[begin] < rules.shortest - dt / 2:
+            labels[begin:end] = _SHORT
+
+    def reason(begin: int, end: int) -> str:
+        if labels[begin] != _SATURATED:
+            return _REASONS[labels[begin]].format(rules.shortest)
+        rotors = {what: np.flatnonzero(where[begin:end].any(axis=0)) + 1 for what, where in saturations.items()}
+        return "; ".join(f"rotor {', '.join(map(str, which))} {what}" for what, which in rotors.items() if which.size)
+
+    edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), labels.size]
+    return tuple(
+        Stretch(float(time[begin]), float(time[end - 1]), reason(begin, end))
+        for begin, end in itertools.pairwise(edges)
+    )
+
+
+def nothing_usable(every: Sequence[Stretch]) -> str:
+    """Why none of these stretches of a flight can be used: the longest one, with its reason."""
+    longest = max(every, key=lambda stretch: stretch.length)
+    no_flight = (ON_GROUND, "less than", _REASONS[_LOST])
+    grounded = longest.reason == ON_GROUND and all(each.reason.startswith(no_flight) for each in every)
+    never = "the vehicle never flew" if grounded else "no part can be used"
+    return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
+
+
+def cut(flight: Recording, stretch: Stretch) -> Recording:
+    """The samples of a flight from `stretch.begin` to `stretch.end`; their time stays as recorded.
+
+    **Raises:** `InputError` if there are fewer than two samples.
+    """
+    time, half = flight.time, flight.dt / 2
+    inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
+    if inside.size < 2:
+        raise InputError(
+            f"from {stretch.begin:g} s to {stretch.end:g} s: fewer than two samples; the flight lasts from "
+            f"{time[0]:.6g} s to {time[-1]:.6g} s."
+        )
+    return flight.rows(slice(int(inside[0]), int(inside[-1]) + 1))
+
+
+def usable(recording: Recording, airframe: Airframe | None = None) -> list[Recording]:
+    """The usable stretches of a flight, each as a recording."""
+    return [cut(recording, stretch) for stretch in stretches(recording, airframe) if not stretch.reason]
+
+
+def _thrust_share(
+    recording: Recording, airframe: Airframe | None, rules: StretchRules
+) -> Float[np.ndarray, " samples"]:
+    """Thrust as a share of the weight. Commands below a tenth of full scale count as idle, whatever the weight."""
+    omega, commanded = recording.omega, recording.commanded
+    squares = (omega**2).sum(axis=1)
+    usual = squares[squares > 0.1 * squares.max(initial=0.0)]
+    usual = float(np.median(usual)) if usual.size else 1.0
+    if airframe is not None:
+        carries = float(airframe.mass * airframe.gravity / airframe.thrust_coefficient)
+        if 1 / 3 < usual / carries < 3:
+            usual = carries
+    full = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    if commanded and airframe is None and omega.max(initial=0.0) <= 1:
+        full = 1.0
+    if commanded and math.isfinite(full):
+        usual = max(usual, 4 * (rules.least_hover * full) ** 2)
+    return squares / max(usual, 1e-300)
+
+
+def _ground(share: Float[np.ndarray, " samples"], dt: float, rules: StretchRules) -> Samples:
+    """The samples on the ground, with a margin toward flight."""
+    carried = share >= rules.carries
+    for value in (True, False):  # short pauses in flight first, then short bursts on the ground
+        for begin, end in _runs(carried != value):
+            if (end - begin) * dt < rules.sustained and begin > 0 and end < carried.size:
+                carried[begin:end] = value
+    ground, margin = ~carried, _samples(rules.margin, dt)
+    for begin, end in _runs(~carried):
+        ground[max(begin - margin, 0) : end + margin] = True
+    return ground
+
+
+def _saturations(
+    omega: np.ndarray, airframe: Airframe | None, dt: float, rules: StretchRules
+) -> dict[str, Bool[np.ndarray, "samples 4"]]:
+    """The samples of each rotor in which it is at its limit, or rests, for longer than a moment."""
+    full_scale = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    found = {what: np.zeros(omega.shape, dtype=bool) for what in ("at full speed", "at rest or idle")}
+    for i, speed in enumerate(omega.T):
+        largest, least, usual = float(speed.max()), float(speed.min()), float(np.median(speed))
+        same = rules.same * largest
+        if largest <= 0:
+            continue
+        # Each sample that equals the one before or after it.
+        equal = np.abs(np.diff(speed)) <= same
+        steady = np.append(equal, False) | np.insert(equal, 0, False)
+        full, rest = speed >= rules.full * full_scale, speed <= same
+        if largest > 1.3 * usual > 0:
+            full |= steady & (speed >= largest - same)
+        if least < 0.5 * usual:
+            rest |= steady & (speed <= least + same)
+        for where, lasting in zip((full, rest), found.values(), strict=True):
+            lasting[:, i] = _lasting(where, rules.moment / dt)
+    return found
+
+
+def _lost(states: np.ndarray, dt: float, rules: StretchRules) -> Samples:
+    """The samples in gaps of the rates; without any rate, in gaps of all channels together."""
+    out, seen = np.zeros(states.shape[0], dtype=bool), np.isfinite(states)
+    for measured in [seen[:, c] for c in RATES if seen[:, c].any()] or [seen.any(axis=1)]:
+        at = np.flatnonzero(measured)
+        step = float(np.median(np.diff(at))) * dt if at.size > 1 else 0.0
+        out |= _lasting(np.asarray(~measured), max(rules.gap, 5 * step) / dt - 1)
+    return out
+
+
+def _crashed(
+    rates: np.ndarray, force: np.ndarray | None, share: np.ndarray, ground: Samples, dt: float, rules: StretchRules
+) -> Samples:
+    """The samples of a crash: from before an impact until the rotors stop, or the recording ends, soon after."""
+    out, impact = np.zeros((2, share.size), dtype=bool)
+    if force is not None:
+        impact = np.nan_to_num(np.linalg.norm(force, axis=1)) > rules.impact_force
+    measured, rates = np.asarray(np.isfinite(rates).all(axis=1)), np.nan_to_num(rates)
+    lag = min(max(_samples(rules.impact_time, dt), 1), share.size - 1)
+    most = rules.impact_rate * max(lag * dt / rules.impact_time, 1.0)
+    impact[lag:] |= (np.abs(rates[lag:] - rates[:-lag]).max(axis=1) > most) & measured[lag:] & measured[:-lag]
+    after, before = _samples(rules.after_impact, dt), _samples(rules.before_impact, dt)
+    for begin in np.flatnonzero(impact):
+        following = ground[begin : begin + after]
+        if following.any() or begin + after >= share.size:
+            stop = begin + int(np.argmax(following)) if following.any() else share.size
+            out[max(begin - before, 0) : max(stop, begin + 1)] = True
+    return out
+
+
+def _resting(
+    omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: Samples, dt: float, rules: StretchRules
+) -> Samples:
+    """Which samples are of a vehicle at rest, by its accelerometer; judged are those that may be in flight.
+
+    In flight the specific force along z is the thrust, divided by the mass. On the ground and in a hand it is that of
+    gravity, whatever the rotors do. And a vehicle that lies on its side or back measures gravity across its rotors'
+    axes. A window without changes of thrust proves nothing.
+    """
+    size = omega.shape[0]
+    length = max(round(rules.bin / dt), 1)
+    bins = size // length
+    if bins < 2 or np.ptp(np.nan_to_num(force), axis=0).max() == 0:  # no accelerometer lies still to the last bit
+        return np.zeros(size, dtype=bool)
+    sensed = np.column_stack([omega.mean(axis=1) ** 2, force / STANDARD_GRAVITY, np.abs(rates).max(axis=1)])
+    sensed[~airborne] = np.nan
+    means = sensed[: bins * length].reshape(bins, length, -1).mean(axis=1)  # NaN where a sample is
+    step, weight = length * dt, np.linalg.norm(means[:, 1:4], axis=1)
+    with np.errstate(invalid="ignore"):
+        lies = (np.abs(weight - 1) < rules.one_g) & (means[:, 3] < rules.tilted) & (means[:, 4] < rules.still)
+    found = _unfelt(means, step, rules) | _lasting(lies, math.ceil(rules.shortest / step) - 1)
+    return found[np.minimum(np.arange(size) // length, bins - 1)]
+
+
+def _unfelt(means: Float[np.ndarray, "bins 5"], step: float, rules: StretchRules) -> Bool[np.ndarray, " bins"]:
+    """The bins of windows in which thrust changes, and the accelerometer does not."""
+    kernel, edge = np.full(rules.smooth, 1 / rules.smooth), rules.smooth // 2
+    smooth = np.column_stack([np.convolve(column, kernel, "same") for column in means.T])
+    smooth[:edge] = smooth[-edge:] = np.nan
+    out, felt = np.zeros((2, means.shape[0]), dtype=bool)
+    wide = max(round(rules.rest / step), 4)
+    for begin in range(0, means.shape[0] - wide // 2, max(wide // 4, 1)):
+        window = smooth[begin : begin + wide]
+        window = window[np.isfinite(window[:, :4]).all(axis=1)]
+        if window.shape[0] < wide // 2:
+            continue
+        thrust, vertical, size = window[:, 0], window[:, 3], np.linalg.norm(window[:, 1:4], axis=1)
+        mean = thrust.mean()
+        if mean <= 0 or thrust.std() < rules.varies * mean:
+            continue
+        deviation = thrust - mean
+        follows = (deviation @ vertical) / (deviation @ deviation) * mean / max(abs(vertical.mean()), 0.1)
+        gravity = abs(size.mean() - 1) < rules.one_g and size.std() < rules.steady
+        (out if gravity and abs(follows) < rules.unfelt else felt)[begin : begin + wide] = True
+    for one, following in itertools.pairwise(np.flatnonzero(out)):
+        if 1 < following - one <= rules.filled / step and not felt[one + 1 : following].any():
+            out[one:following] = True
+    return out
+
+
+def _lasting(where: Samples, most: float) -> Samples:
+    """`where`, without runs of at most so many samples."""
+    out = np.zeros_like(where)
+    for begin, end in _runs(where):
+        out[begin:end] = end - begin > most
+    return out
+
+
+def _samples(seconds: float, dt: float) -> int:
+    return math.ceil(seconds / dt - 1e-6)
+
+
+def _runs(where: Samples) -> list[tuple[int, int]]:
+    """Begin and end (exclusive) of each run of `True`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
