@@ -131,6 +131,21 @@ def test_input_innovations_must_fit_the_flight(rng):
 
 
 @pytest.mark.slow
+def test_a_search_counts_as_noise_what_the_feedthroughs_that_it_found_explain(rng):
+    """A second search, in the likelihood with these feedthroughs, begins at its end."""
+    problem, search = standard(rng, passed=1), jaxos4.FilterError()
+    found = search(problem)
+    passed, nothing = found.parts.passed, np.zeros((3, 1))
+    std = found.std[-1]
+    assert 0 < np.abs(passed).max() < 5 * std  # noise, as there is no feedthrough
+    again = search(problem.passing(passed).starting_from(found.parameters))
+    assert again.sweeps < found.sweeps
+    np.testing.assert_array_equal(again.parts.passed, passed)
+    np.testing.assert_allclose(again.cost, found.cost, atol=3e-3)
+    assert search(problem.passing(nothing)).cost < found.cost
+
+
+@pytest.mark.slow
 def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias():
     """Commands every 4 ms, samples of 8 ms, a gyro with a noise of 0.05 rad/s.
 

@@ -16,10 +16,5 @@ from .innovations import InnovationsProblem as InnovationsProblem
 from .noise_unknowns import NoiseUnknowns as NoiseUnknowns
 from .padding import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded, with_room as with_room
 from .problem import ShootingProblem as ShootingProblem
-from .scans import (
-    FASTEST as FASTEST,
-    Length as Length,
-    Rows as Rows,
-)
+from .scans import FASTEST as FASTEST, Length as Length, Rows as Rows
 from .stages import ROUNDING as ROUNDING
-from .windows import each_window as each_window

@@ -19,9 +19,19 @@ from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS, midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stages, Unknowns, WindowUnknowns
-from .scans import Length, Rows, predict_window, shoot, shoot_with_derivatives, with_tangents
+from .scans import (
+    Length,
+    Rows,
+    cut,
+    each_window,
+    first_measured,
+    predict_window,
+    shoot,
+    shoot_with_derivatives,
+    windowed,
+    with_tangents,
+)
 from .stages import ROUNDING, Plan
-from .windows import cut, each_window, first_measured, windowed
 
 # How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
 _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
@@ -175,16 +185,14 @@ class ShootingProblem(AbstractProblem):
     def forced_rows(self) -> Callable[[Parameters], Rows]:
         """`rows` with the derivatives of the forcing, for a loop: what depends on no parameter is made once."""
         rows, inputs, index = self.rows(), self.flight.inputs, self.cut()[0]
+        places = self.model.forcing_parameters
 
         def forced(parameters: Parameters) -> Rows:
-            forcing, tangents = with_tangents(
-                lambda values: windowed(self.model.forcing(inputs, values), index),
-                parameters,
-                self.model.forcing_parameters,
-            )
+            of = functools.partial(self.model.forcing, inputs)
+            forcing, tangents = with_tangents(lambda x: windowed(of(x), index), parameters, places)
             return rows._replace(forcing=forcing, forcing_tangents=tangents)
 
-        return forced if self.model.forcing_parameters else lambda parameters: rows
+        return forced if places else lambda parameters: rows
 
     def split(self, initial_state: InitialStates) -> Float[Array, "windows size"]:
         """The initial state of each window."""
@@ -247,9 +255,8 @@ class ShootingProblem(AbstractProblem):
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """See `AbstractProblem`."""
         count, measured, known = self.unknowns.count, self.measured(), self.split(self.first_state()[0])
-        samples = measured.shape[0] if self.length is None else self.length
-        shares = tuple(share for share in shares if share == 1 or self.windows == 1)  # a window is short enough
-        plan = Plan.of(self.channels, shares, measured, self.sigma[self.columns], samples)
+        length = measured.shape[0] if self.length is None else self.length
+        plan = Plan.of(self.channels, shares, measured, self.sigma[self.columns], length, self.windows)
         number, place, forced = len(plan.place), jnp.asarray(plan.place), self.forced_rows()
         free, own = jnp.broadcast_to(self.unknowns.free, (number, count)), np.arange(self.free_size)
         searched = jnp.concatenate([free, own < plan.sizes[:, None]], axis=1)
@@ -264,8 +271,8 @@ class ShootingProblem(AbstractProblem):
             model = parts[0](*data) if len(parts) == 1 else jax.lax.switch(place[stage], parts, *data)
             return model.restricted(searched[stage])
 
-        off, measurements, smallest_step = self.initial_guess.off, plan.measurements, plan.smallest_step
-        return Stages(self.unknowns, off, number, 0, number - 1, local_model, searched, measurements, smallest_step)
+        off, last, counts = self.initial_guess.off, number - 1, plan.measurements
+        return Stages(self.unknowns, off, number, 0, last, local_model, searched, counts, plan.smallest_step)
 
     def _model_of_part(
         self, part: "ShootingProblem", rows: Rows, parameters: Array, own: Array, length: Length
@@ -273,11 +280,10 @@ class ShootingProblem(AbstractProblem):
         """The local model of the whole problem's `rows` on the channels of `part`, in all unknowns."""
         part = eqx.tree_at(lambda p: p.length, part, length, is_leaf=lambda leaf: leaf is None)
         compared = rows._replace(measured=rows.measured[: part.size] + rows.measured[self.size :])
-        cost, feasible, gradient, information, _ = each_window(
-            part.model_of_window, compared, parameters, own[:, : part.size]
-        )
+        model = each_window(part.model_of_window, compared, parameters, own[:, : part.size])
         none, more = (0, 0), (0, self.free_size - part.free_size)
-        return LocalModel(cost, feasible, jnp.pad(gradient, (none, more)), jnp.pad(information, (none, more, more)))
+        gradient, information = jnp.pad(model.gradient, (none, more)), jnp.pad(model.information, (none, more, more))
+        return model._replace(gradient=gradient, information=information)
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import InitialState, Parameters, Scalar
+from .._custom_types import InitialState, Numeric, Parameters, Scalar
 from ..models.state import Forcing, State, Translation, unstack
 from .abstract import LocalModel, Shot
 from .batching import computed_once, with_batch
@@ -27,6 +27,7 @@ FASTEST = 1e3
 # From a state, the forcing and the parameters: the state one sample later, and the output of noise-free sensors.
 Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
 Carry = TypeVar("Carry")
+Series = TypeVar("Series", Forcing, tuple[Array, ...])
 # One value, or one for each lane of a batch.
 Lanes = Float[Array, "*#lanes"]
 # The number of rows that count in a padded flight. It is data and not a shape, so that flights of different lengths
@@ -306,3 +307,37 @@ def _errors(
 
 def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
+
+
+def cut(samples: int, windows: int) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+    """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
+    ends = np.arange(windows + 1) * samples // windows
+    index = ends[:-1, None] + np.arange(np.diff(ends).max())
+    within = index < ends[1:, None]
+    return np.where(within, index, ends[1:, None] - 1), within
+
+
+def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
+    """The series of each window, from those of the flight. Windows of equal length need no copy."""
+
+    def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:
+        return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
+
+    return jax.tree.map(rows, series)
+
+
+def each_window(function: Callable, *arguments: Any) -> Any:
+    """`function` of each window. The only window of a flight needs no `vmap`, which takes long to trace."""
+    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
+        return jax.vmap(function)(*arguments)
+    only = jax.tree.map(lambda leaf: leaf[0], arguments)
+    return jax.tree.map(lambda leaf: leaf[None], function(*only))
+
+
+def first_measured(
+    measured: Float[Array, "windows length columns"],
+) -> tuple[Float[Array, "windows columns"], Bool[Array, "windows columns"]]:
+    """The first measurement of each window, or 0 if there is none; and whether it is that of the first sample."""
+    first = jnp.argmin(jnp.isnan(measured), axis=1)
+    value = jnp.take_along_axis(measured, first[:, None], axis=1)[:, 0]
+    return jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)

@@ -42,6 +42,7 @@ class Plan(NamedTuple):
         measured: Float[Array, "samples columns"],
         sigma: Float[Array, " columns"],
         samples: Count | int,
+        windows: int,
     ) -> "Plan":
         """The plan of a flight, whose last stage is the whole.
 
@@ -50,8 +51,10 @@ class Plan(NamedTuple):
         - `channels`: that are compared. `shares`: of the flight, to which the body rates are fitted first.
         - `measured`: states in cascade order, then specific force, which all stages compare. `sigma`: of their noise.
         - `samples`: how many count; the others are padding.
+        - `windows`: of the flight. One of several windows is short enough as a whole.
         """
-        rates = tuple(("rates", share) for share in shares if (channels, share) != ("rates", 1))
+        wanted = (share for share in shares if share == 1 or windows == 1)
+        rates = tuple(("rates", share) for share in wanted if (channels, share) != ("rates", 1))
         stages = (*rates, (channels, 1.0))
         names, size = tuple(dict.fromkeys(name for name, _ in stages)), CHANNELS[channels]
         sizes, columns = np.array([CHANNELS[name] for name, _ in stages]), np.arange(measured.shape[1])
