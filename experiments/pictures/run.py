@@ -125,7 +125,8 @@ def sweep_widths(problem: jaxos4.ShootingProblem) -> np.ndarray:
         while not solver.terminate(stage, state):
             opened = (state.brackets.highest - state.brackets.lowest)[0] / 2
             along = jnp.where(stage.searched[:count, None], state.directions.basis[0, :count], 0.0)
-            widths.append(np.asarray(jnp.abs(along * opened).sum(axis=1)))
+            if opened.any():  # the first shot of a stage needs no bracket
+                widths.append(np.asarray(jnp.abs(along * opened).sum(axis=1)))
             state = solver.step(stage, state)
         found = solver.postprocess(stage, state, found)._replace(done=jnp.zeros((), dtype=bool))
     return np.array(widths)

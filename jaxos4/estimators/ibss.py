@@ -15,13 +15,13 @@ from ..estimate import REACH
 from ..linalg import gram
 from ..shooting import LocalModel, Stage, WindowUnknowns
 from .bisection import Brackets, Directions, Flag, PerDirection
-from .solver import AbstractSolver, Found, chosen
+from .solver import AbstractSolver, Found, before_shots, chosen
 
 
 class State(NamedTuple):
     """The search of a stage before a sweep.
 
-    - `unknowns`, `model`: where it is, and the local model of the cost there. Before the first shot its cost is NaN.
+    - `unknowns`, `model`: where it is, and the local model of the cost there. See `before_shots`.
     - `directions`, `brackets`: of the next sweep.
     - `spread`: the covariance of the unknowns before the stage.
     - `growth`: how many times as wide each direction's bracket is.
@@ -110,11 +110,10 @@ class IBSS(AbstractSolver[State]):
         the search.
         """
         unknowns = jnp.clip(before.unknowns, *stage.limits(self.reach))
-        model = before.model._replace(cost=jnp.full_like(before.model.cost, jnp.nan))
         directions = Directions.none(unknowns)
         return State(
             unknowns=unknowns,
-            model=model,
+            model=before_shots(before.model),
             directions=directions,
             brackets=_open(directions, directions.above, directions.above),
             spread=before.spread,

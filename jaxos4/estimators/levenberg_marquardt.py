@@ -29,13 +29,13 @@ from ..shooting import (
     WindowUnknowns,
     in_blocks,
 )
-from .solver import AbstractSolver, Found, chosen, cost_of, solve
+from .solver import AbstractSolver, Found, before_shots, chosen, cost_of, solve
 
 
 class State(NamedTuple):
     """The search of a stage before a shot.
 
-    - `best`, `model`: the best unknowns so far, and the local model there. Before the first shot its cost is NaN.
+    - `best`, `model`: the best unknowns so far, and the local model there, see `before_shots`.
     - `trial`: where the shot will be.
     - `damping`: of the last step, or of the first one.
     - `shots`: how many there were.
@@ -92,7 +92,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
     def init(self, stage: Stage, before: Found) -> State:
         """The first trial is the start. Any cost is better than none."""
-        model = before.model._replace(cost=jnp.full_like(before.model.cost, jnp.nan))
+        model = before_shots(before.model)
         damping = jnp.full((), self.factor * self.damping, dtype=float)
         return State(before.unknowns, model, before.unknowns, damping, jnp.zeros((), dtype=int), before.done)
 

@@ -130,7 +130,7 @@ def solve(
         from_start = place < count
         own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameters) & (place > 0) & jnp.isfinite(best.cost)
         first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
-        before = chosen(from_start, first, best)._replace(model=begin.model, done=begin.done)
+        before = chosen(from_start, first, best)._replace(done=begin.done)
         stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
         state = jax.lax.while_loop(
             lambda state: ~solver.terminate(stage, state),
@@ -172,6 +172,11 @@ def _starts(problem: AbstractProblem, start: Array | None) -> Float[Array, "star
 def cost_of(model: LocalModel) -> Scalar:
     """The cost of all windows; infinite for a trajectory that fails."""
     return jnp.where(model.feasible.all() & jnp.isfinite(model.cost).all(), model.cost.sum(), jnp.inf)
+
+
+def before_shots(model: LocalModel) -> LocalModel:
+    """A local model before the first shot: its cost is NaN, and nothing is feasible. Any shot is better."""
+    return model._replace(cost=jnp.full_like(model.cost, jnp.nan), feasible=jnp.zeros_like(model.feasible))
 
 
 def chosen(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
