@@ -8,15 +8,13 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar
 from .bracket import NO_PRIOR, Bracket
 from .linalg import covariance_of_shared, invert
 from .results import RESULTS
-from .shooting import AbstractProblem, Curvature, Parts, ShootingProblem, in_blocks
-from .shooting.abstract import WindowUnknowns
+from .shooting import AbstractProblem, LocalModel, Parts, ShootingProblem, WindowUnknowns, in_blocks
 
 REACH = 4.0  # how many half-widths an answer may lie away from the center of its bracket
 # Gauss-Newton steps to an initial state, with the parameters known: the trajectory is nearly linear in that state.
@@ -41,7 +39,7 @@ _count = functools.partial(jnp.asarray, dtype=int)
 class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
-    - `parameters`: all unknowns that the problem's windows share; a held one has its value, and a variance of 0. If
+    - `parameters`: all unknowns that the problem's windows share; a fixed one has its value, and a variance of 0. If
       `result` says that there is no estimate: the bracket's center, or 0 if the bracket is invalid. The bracket of a
       network is its own.
     - `covariance`: of `parameters`; infinite without an estimate. It follows from the Fisher information at the
@@ -55,8 +53,6 @@ class Estimate(eqx.Module):
     - `calibration`: of the intervals, if they were calibrated on simulated flights; `None` means Gaussian.
     - `seed`: the bracket that the search began from, if another estimator gave one.
     - `history`: the parameters after each sample, from a recursive estimator.
-    - `brackets`: the lowest and highest value of each parameter inside the brackets that each sweep opens, if recorded;
-      NaN after the last sweep.
     - `parts`: the likelihood of each part of the flight, from a problem whose parts are compared.
     """
 
@@ -70,7 +66,6 @@ class Estimate(eqx.Module):
     calibration: Calibration | None = None
     seed: Bracket | None = None
     history: Float[Array, "samples parameters"] | None = None
-    brackets: Float[Array, "sweeps 2 parameters"] | None = None
     parts: Parts | None = None
 
     @property
@@ -120,16 +115,17 @@ def as_estimate(
 
     - `feasible`: whether the trajectory did not fail before its end. `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
-    - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`; by default as the problem does.
+    - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`; by default as the cost does.
     - The others are fields of an `Estimate`.
     """
-    unknowns, own = problem.unknowns, len(problem.model.parameter_names)
+    unknowns = problem.unknowns
+    own = unknowns.parameters
     valid, free = unknowns.valid, unknowns.free
     center, half_width = jnp.where(valid, unknowns.center, 0.0), jnp.where(valid, unknowns.half_width, 1.0)
     covariance = jnp.where(free & free[:, None], covariance, 0.0)
     std = jnp.sqrt(jnp.diagonal(covariance))
     far = (jnp.abs(parameters - center) > (reach - 1e-2) * half_width) & free
-    identifiable = unknowns.identifiable(std, problem.prior if prior is None else prior)
+    identifiable = unknowns.identifiable(std, prior)
     finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
     feasible = feasible & jnp.isfinite(cost) & finite
     result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
@@ -151,58 +147,29 @@ def as_estimate(
 
 def estimate_at(
     problem: AbstractProblem,
-    unknowns: WindowUnknowns,
-    curvature: Curvature,
+    x: WindowUnknowns,
+    model: LocalModel,
     rollouts: Int[Array, ""],
     sweeps: Int[Array, ""],
     *,
     done: Bool[Array, ""],
-    **more: Any,
+    reach: Scalar | float = REACH,
 ) -> Estimate:
-    """`as_estimate` of a search that ended at these unknowns, with this curvature of the cost."""
+    """`as_estimate` of a search that ended at the unknowns `x`, where the cost has this local model."""
     count = problem.unknowns.count
     return as_estimate(
         problem,
-        parameters=unknowns[0, :count],
-        covariance=covariance_of_shared(curvature.information, count),
-        initial_state=unknowns[:, count:].ravel() if problem.free_size else problem.first_state()[0],
-        cost=curvature.shot.cost.sum(),
+        parameters=x[0, :count],
+        covariance=covariance_of_shared(model.information, count),
+        initial_state=jnp.concatenate([problem.initial_guess.known, x[:, count:]], axis=1).ravel(),
+        cost=model.cost.sum(),
         rollouts=rollouts,
         sweeps=sweeps,
-        feasible=curvature.shot.feasible.all(),
+        feasible=model.feasible.all(),
         done=done,
-        parts=curvature.parts,
-        **more,
+        reach=reach,
+        parts=model.parts,
     )
-
-
-def from_starts(
-    problem: AbstractProblem, start: Float[Array, " unknowns"] | None, search: Callable[[Parameters], Estimate]
-) -> Estimate:
-    """The best answer of searches from each of the problem's starts, one after the other; equal starts count once.
-
-    `start`: where to start instead, unless it is NaN, or the unknown is held.
-    """
-    starts, own, count = problem.starts, len(problem.model.parameter_names), problem.unknowns.count
-    if start is not None and jnp.shape(start) != (count,):
-        raise ValueError(f"`start` must hold {count} unknowns, got shape {jnp.shape(start)}.")
-    firsts = starts if start is None else jnp.where(jnp.isnan(start) | ~problem.unknowns.free, starts, start)
-    if starts.shape[0] == 1:
-        return search(firsts[0])
-    search = jax.jit(search)  # traced once, although it is called twice
-    shapes = jax.eval_shape(search, firsts[0])
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-    def better(i: Int[Array, ""], found: Estimate) -> Estimate:
-        """A later search starts from the parameters of the best one so far."""
-        first = jnp.where((i > 0) & (np.arange(firsts.shape[1]) < own), found.parameters, firsts[i])
-        other = search(first)
-        best = jax.tree.map(lambda a, b: jnp.where((i == 0) | (other.cost < found.cost), a, b), other, found)
-        total = found.rollouts + other.rollouts, found.sweeps + other.sweeps
-        return eqx.tree_at(lambda e: (e.rollouts, e.sweeps), best, total)
-
-    searches = jnp.where((firsts == firsts[0]).all(), 1, firsts.shape[0])
-    return jax.lax.fori_loop(0, searches, better, nothing)
 
 
 def fit_start(
@@ -218,13 +185,13 @@ def fit_start(
     count, free = parameters.shape[0], problem.free_size
 
     def improve(start: Float[Array, " starts"], _) -> tuple[Float[Array, " starts"], None]:
-        _, gradient, information, _ = problem.curvatures(parameters, start)
-        covariance = jax.vmap(invert)(information[:, count:, count:] + jax.vmap(jnp.diag)(known))
-        slope = gradient[:, count:] + known * problem.split(start - first)
+        model = local_model(problem.join(parameters, start))
+        covariance = jax.vmap(invert)(model.information[:, count:, count:] + jax.vmap(jnp.diag)(known))
+        slope = model.gradient[:, count:] + known * problem.split(start - first)
         return start - (covariance * slope[:, None, :]).sum(axis=-1).ravel(), None
 
     if free:
-        first, known = start, 1 / jnp.square(problem.split(off))
+        first, known, local_model = start, 1 / jnp.square(problem.split(off)), problem.local_model
         start, _ = jax.lax.scan(improve, first, length=_START_STEPS)
     cost, feasible = problem.shots(parameters, start)
     return start, cost, feasible, 1 + (_START_STEPS * (count + free) if free else 0)

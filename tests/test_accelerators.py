@@ -87,8 +87,8 @@ def test_a_batch_of_shots_and_of_their_derivatives_and_bounds(foreign, free):
         def one(states, alpha):
             problem = problem_of(states, channels="all", free=free)
             start = problem.first_state()[0]
-            shot, *curvature = problem.shots(alpha, start), problem.curvatures(alpha, start)
-            return shot, curvature, problem.residuals(alpha), jaxos4.cramer_rao_bound(problem, alpha)
+            shot, model = problem.shots(alpha, start), problem.local_model(problem.join(alpha, start))
+            return shot, model, problem.residuals(alpha), jaxos4.cramer_rao_bound(problem, alpha)
 
         return jax.vmap(one)(states, alpha)
 

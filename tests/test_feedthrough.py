@@ -91,21 +91,21 @@ def test_the_likelihood_compares_innovations_less_the_feedthrough(rng):
     names, parameters = problem.unknowns.names, jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
     assert names[8:13] == ("log_p_strength", "log_p_time", "log_p_sensor", "p_feedthrough_1", "p_feedthrough_2")
     own = jnp.concatenate([jnp.stack(NOISE, axis=1), 0.01 * jnp.arange(6.0).reshape(3, 2)], axis=1)
-    values, nothing = jnp.concatenate([parameters, own.ravel()]), jnp.zeros(0)
+    values = jnp.concatenate([parameters, own.ravel()])
 
     @eqx.filter_jit
     def at(values):
-        return problem.curvatures(values, nothing)
+        return problem.local_model(values[None])
 
     found, step = at(values), 1e-4
     for name in ("p_feedthrough_2", "r_feedthrough_1", "alpha3", "log_q_sensor"):
         place = names.index(name)
         change = step * (abs(float(values[place])) + 0.01)
         up, down = (at(values.at[place].add(sign * change)) for sign in (1, -1))
-        slope = (up.shot.cost - down.shot.cost) / (2 * change)
+        slope = (up.cost - down.cost) / (2 * change)
         np.testing.assert_allclose(found.gradient[0, place], slope[0], rtol=1e-5, atol=1e-6)
         if "feedthrough" in name:
-            second = (up.shot.cost - 2 * found.shot.cost + down.shot.cost) / change**2
+            second = (up.cost - 2 * found.cost + down.cost) / change**2
             np.testing.assert_allclose(found.information[0, place, place], second[0], rtol=1e-3)
 
 
@@ -128,6 +128,21 @@ def test_input_innovations_must_fit_the_flight(rng):
     problem = standard(rng, passed=1).problem
     with pytest.raises(ValueError, match=r"`input_innovations` must have shape \(301, feedthroughs, 3\)"):
         InnovationsProblem(problem, input_innovations=rng.normal(size=(10, 1, 3)))
+
+
+@pytest.mark.slow
+def test_a_search_counts_as_noise_what_the_feedthroughs_that_it_found_explain(rng):
+    """A second search, in the likelihood with these feedthroughs, begins at its end."""
+    problem, search = standard(rng, passed=1), jaxos4.FilterError()
+    found = search(problem)
+    passed, nothing = found.parts.passed, np.zeros((3, 1))
+    std = found.std[-1]
+    assert 0 < np.abs(passed).max() < 5 * std  # noise, as there is no feedthrough
+    again = search(problem.passing(passed).starting_from(found.parameters))
+    assert again.sweeps < found.sweeps
+    np.testing.assert_array_equal(again.parts.passed, passed)
+    np.testing.assert_allclose(again.cost, found.cost, atol=3e-3)
+    assert search(problem.passing(nothing)).cost < found.cost
 
 
 @pytest.mark.slow

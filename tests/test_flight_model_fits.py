@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from flight_model_reference import FULL, VALUES, VOLTS, battery, commands, truth
-from helpers import curvatures, first_state, forcing_of
+from helpers import first_state, forcing_of, local_model
 
 import jaxos4
 from jaxos4.flight import Inputs, Stretches
@@ -165,7 +165,7 @@ def test_gradient_and_information_are_the_residuals_derivatives(recordings):
 
     jacobian, errors = map(np.asarray, jax.jit(jax.jacfwd(residuals, has_aux=True))(unknowns))
     scale = np.linalg.norm(jacobian, axis=0)
-    found = curvatures(problem, parameters, unknowns[count:])
+    found = local_model(problem, parameters, unknowns[count:])
     own = problem.size
     for w in range(4):
         columns = np.r_[:count, count + w * own : count + (w + 1) * own]
@@ -175,7 +175,7 @@ def test_gradient_and_information_are_the_residuals_derivatives(recordings):
         np.testing.assert_allclose(found.information[w] / size, expected.T @ expected / size, atol=1e-10)
         gradient = expected.T @ errors[rows] / scale[columns] / np.linalg.norm(errors)
         np.testing.assert_allclose(found.gradient[w] / scale[columns] / np.linalg.norm(errors), gradient, atol=1e-10)
-        assert float(found.shot.cost[w]) == pytest.approx(0.5 * float(errors[rows] @ errors[rows]), rel=1e-10)
+        assert float(found.cost[w]) == pytest.approx(0.5 * float(errors[rows] @ errors[rows]), rel=1e-10)
 
 
 def held_rigid(problem, values):

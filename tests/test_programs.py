@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import compiled_programs, noisy_states, standard_flight, standard_problem
+from helpers import compiled_programs, first_state, local_model, noisy_states, standard_flight, standard_problem
 
 import jaxos4
 from jaxos4.shooting import for_threads, padded
@@ -117,6 +117,26 @@ def test_padding_changes_no_result(channels):
     np.testing.assert_allclose(cost, own_cost, rtol=1e-12)
     np.testing.assert_allclose(residuals[:501], own, rtol=1e-9)
     assert not residuals[501:].any()
+
+
+@pytest.mark.parametrize("windows", [1, 5])
+def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
+    problem = standard_problem(states=noisy_states(1)[0], channels="attitude", free=True)
+    problem = jaxos4.ShootingProblem(
+        problem.model, problem.flight, sigma=problem.sigma, channels="attitude", windows=windows
+    )
+    found, start = jaxos4.evaluate(problem, problem.model.alpha), first_state(problem)
+    expected = local_model(problem, problem.model.alpha, start)
+    assert found.feasible
+    np.testing.assert_allclose(found.cost, expected.cost.sum(), rtol=1e-12)
+    scale = np.sqrt(np.abs(np.asarray(expected.information)).max())
+    np.testing.assert_allclose(found.information / scale**2, expected.information / scale**2, atol=1e-12)
+    bound = np.asarray(jaxos4.cramer_rao_bound(problem, problem.model.alpha))
+    unit = np.sqrt(np.diagonal(bound))
+    np.testing.assert_allclose(found.covariance / np.outer(unit, unit), bound / np.outer(unit, unit), atol=1e-9)
+    diverged = jaxos4.evaluate(problem, jnp.asarray(np.where(np.arange(8) == 2, 1e9, problem.model.alpha)))
+    assert not diverged.feasible
+    assert diverged.cost == float("inf")
 
 
 @pytest.mark.skipif("small_while_loop" not in os.environ["XLA_FLAGS"], reason="XLA_FLAGS are the user's own")

@@ -9,6 +9,8 @@ from helpers import documented_class, noisy_states, same, standard_flight, stand
 from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
+from jaxos4.estimators.ant_colony import Colony
+from jaxos4.shooting import LocalModel, Stage, Unknowns
 
 pytestmark = pytest.mark.slow
 
@@ -62,15 +64,15 @@ def broken(problem, lowest, highest, factor):
     """The slope of alpha3 is multiplied by `factor` between two values."""
 
     class Broken(jaxos4.ShootingProblem):
-        def stages(self, *, cascade):
-            stages = super().stages(cascade=cascade)
+        def stages(self, shares=()):
+            stages = super().stages(shares)
 
-            def evaluate(number, unknowns):
-                curvature, alpha = stages.evaluate(number, unknowns), unknowns[0, 2]
+            def local_model(number, before, unknowns):
+                model, alpha = stages.local_model(number, before, unknowns), unknowns[0, 2]
                 change = jnp.where((alpha > lowest) & (alpha < highest), factor, 1.0)
-                return curvature._replace(gradient=curvature.gradient.at[:, 2].multiply(change))
+                return model._replace(gradient=model.gradient.at[:, 2].multiply(change))
 
-            return stages._replace(evaluate=evaluate)
+            return stages._replace(local_model=local_model)
 
     return Broken(problem.model, problem.flight, sigma=problem.sigma, channels="rates", unknowns=problem.unknowns)
 
@@ -88,53 +90,42 @@ def test_slopes_that_are_wrong_end_no_search_as_a_success():
     assert names(jaxos4.IBSS()(broken(strides, -np.inf, np.inf, -1.0))) != "successful"
 
 
-def test_recorded_brackets_close_in_on_the_estimate():
-    """They are recorded as each sweep opened them. That of a held parameter has no width."""
-    problem = standard_problem(states=noisy_states(1)[0], channels="rates")
-    bracket = jaxos4.Bracket.around(problem.model.alpha + 0.5 * HALF, HALF)
-    found = jaxos4.IBSS(record=20)(problem.hold({"alpha2": 0.0}), bracket)
-    sweeps, brackets = int(found.sweeps), np.asarray(found.brackets)
-    assert 3 < sweeps < 20
-    assert np.isnan(brackets[sweeps:]).all()
-    (lower, upper), held = brackets[:sweeps].swapaxes(0, 1), np.asarray(problem.model.parameter_names) == "alpha2"
-    assert (lower[:, held] == 0).all()
-    assert (upper[:, held] == 0).all()
-    assert (lower[:, ~held] < upper[:, ~held]).all()
-    assert ((lower[-1] <= found.parameters) & (found.parameters <= upper[-1])).all()
-    assert ((upper - lower)[-1] < (upper - lower)[0])[~held].all()
-
-
-def test_rollouts_are_counted_right():
-    """Each simulated step calls back with its torque; the first torque starts a shot, on however many samples."""
-    torques = []
+def counting(torques):
+    """A model that tells the torque of each simulated step. The first torque of a flight starts a shot."""
 
     class Counting(PUBLISHED):
         def angular_acceleration(self, rates, forcing, parameters):
             jax.debug.callback(lambda torque: torques.append(float(torque)), forcing.roll)
             return super().angular_acceleration(rates, forcing, parameters)
 
-    flight = standard_flight(duration=0.5)
-    states = noisy_states(1, duration=0.5)[0]
+    return Counting()
+
+
+def shots_of(problem, torques):
+    """How many shots these torques were."""
+    jax.effects_barrier()
+    rolls = np.asarray(problem.forcing(problem.model.alpha).roll)
+    assert (rolls == rolls[0]).sum() == 1
+    return torques.count(float(rolls[0]))
+
+
+def problem_of(model, start, duration):
+    flight = eqx.tree_at(lambda f: f.states, standard_flight(duration=duration), noisy_states(1, duration=duration)[0])
+    return jaxos4.ShootingProblem(
+        model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", initial_state=start
+    ).within(jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF))
+
+
+def test_rollouts_are_counted_right():
+    """On however many samples."""
     free, slow = None, {"halvings": 3}
-    for start, unknowns, most, settings in ((flight.states[0], 8, 2, {}), (free, 11, 3, slow)):
-        problem = jaxos4.ShootingProblem(
-            Counting(),
-            eqx.tree_at(lambda f: f.states, flight, states),
-            sigma=jaxos4.SENSOR_SIGMA,
-            channels="rates",
-            initial_state=start,
-        )
-        torques.clear()
-        bracket = jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF)
-        estimate = jaxos4.IBSS(**settings)(problem, bracket)
-        jax.effects_barrier()
-        rolls = np.asarray(problem.forcing(problem.model.alpha).roll)
-        assert (rolls == rolls[0]).sum() == 1
-        shots = torques.count(float(rolls[0]))
-        sweeps = int(estimate.sweeps)
+    for start, unknowns, most, settings in ((np.zeros(12), 8, 2, {}), (free, 11, 3, slow)):
+        problem = problem_of(counting(torques := []), start, 0.5)
+        estimate = jaxos4.IBSS(**settings)(problem)
+        shots, sweeps = shots_of(problem, torques), int(estimate.sweeps)
         assert int(estimate.rollouts) == unknowns * shots  # each shot carries one tangent for every unknown
         assert sweeps > 3
-        # A sweep looks around and narrows each bracket; it ends early where the minimum is.
+        # A sweep narrows each bracket; it ends early where the minimum is.
         assert 2 * sweeps <= shots <= 3 + sweeps * (1 + most)
 
 
@@ -149,31 +140,31 @@ def test_the_colony_reaches_the_optimum_of_ibss_with_many_more_rollouts():
     assert (np.asarray(colony.rollouts) > 5 * np.asarray(ibss.rollouts)).all()
 
 
-def test_each_simulated_point_is_counted(monkeypatch):
-    """The count is that of calls while the program runs. A search that is stopped says so."""
-    calls, shots = [], jaxos4.ShootingProblem.shots
-
-    def counted(problem, parameters, initial_state):
-        jax.debug.callback(lambda _: calls.append(1), parameters)
-        return shots(problem, parameters, initial_state)
-
-    monkeypatch.setattr(jaxos4.ShootingProblem, "shots", counted)
-    problem = standard_problem(channels="rates")
-    # No other test has so many ants, and so the program that counts.
-    estimate = jaxos4.AntColony(ants=9, max_sweeps=3)(problem, jaxos4.Bracket.default(problem.model))
-    jax.effects_barrier()
-    assert len(calls) == 50 + 3 * 9
-    assert int(estimate.rollouts) == len(calls) + 1 + 8  # and the information: a shot with eight tangents
+def test_each_simulated_point_of_a_colony_is_counted():
+    """A search that is stopped says so."""
+    problem = problem_of(counting(torques := []), np.zeros(12), 5.0)
+    estimate = jaxos4.AntColony(ants=9, max_sweeps=3)(problem)
+    shots = 50 + 3 * 9 + 1  # and one at the answer, with eight tangents
+    assert shots_of(problem, torques) == shots
+    assert int(estimate.rollouts) == shots + 8
     assert (int(estimate.sweeps), str(names(estimate))) == (3, "max_sweeps")
 
 
-def test_new_points_have_the_distribution_of_the_reference():
+def test_new_points_of_a_colony_have_the_distribution_of_the_reference():
     """Socha and Dorigo 2008, sec. 3: a mixture of Gaussians, here of one unknown, against NumPy."""
-    k, ants, q, xi = 20, 4000, 0.2, 0.85
+    k, draws, q, xi = 20, 200, 0.2, 0.85
     points = np.random.default_rng(0).normal(size=(k, 1))
-    colony = jaxos4.AntColony(archive=k, ants=ants, q=q, xi=xi)
-    drawn = np.asarray(eqx.filter_jit(colony._sample)(jnp.asarray(points), jax.random.key(0)))[:, 0]
+    colony, one, yes = jaxos4.AntColony(archive=k, ants=k, q=q, xi=xi), np.ones(1), np.ones(1, dtype=bool)
+    unknowns = Unknowns(("x",), ("1",), 1, 1.0, 0 * one, one, yes, 0 * one, -9 * one, 9 * one, 9 * one)
+    flat = LocalModel(jnp.zeros(1), jnp.ones(1, dtype=bool), jnp.zeros((1, 1)), jnp.zeros((1, 1, 1)))
+    stage = Stage(unknowns, jnp.ones((1, 1)), lambda x: flat, jnp.asarray(yes), *map(jnp.asarray, (0.0, 0.0, True)))
 
+    @jax.jit
+    @jax.vmap
+    def drawn_in(sweep):  # all new points are better than the archive, and replace it
+        return colony.step(stage, Colony(jnp.asarray(points), jnp.ones(k), jnp.zeros((1, 1)), sweep)).points
+
+    drawn = np.asarray(drawn_in(np.arange(draws))).ravel()
     rank = np.arange(1, k + 1)
     weight = np.exp(-((rank - 1) ** 2) / (2 * q**2 * k**2)) / (q * k * np.sqrt(2 * np.pi))
     weight /= weight.sum()
@@ -181,5 +172,5 @@ def test_new_points_have_the_distribution_of_the_reference():
     mean = weight @ points[:, 0]
     variance = weight @ (kernel**2 + (points[:, 0] - mean) ** 2)
     squares = (drawn - mean) ** 2
-    assert abs(drawn.mean() - mean) < 4 * np.sqrt(variance / ants)
-    assert abs(squares.mean() - variance) < 4 * squares.std() / np.sqrt(ants)
+    assert abs(drawn.mean() - mean) < 4 * np.sqrt(variance / drawn.size)
+    assert abs(squares.mean() - variance) < 4 * squares.std() / np.sqrt(drawn.size)

@@ -57,16 +57,16 @@ def problem_of(flight, recordings, segments):
 
 
 @eqx.filter_jit
-def curvature_of(problem, values):
-    return problem.curvatures(values, jnp.zeros(0))
+def local_model_of(problem, values):
+    return problem.local_model(values[None])
 
 
 def likelihood(problem, values):
     """Cost, gradient and information without the prior."""
-    found, unknowns = curvature_of(problem, values), problem.unknowns.usable
+    found, unknowns = local_model_of(problem, values), problem.unknowns.usable
     prior = (unknowns.precision * jnp.square(values - unknowns.center)).sum() / 2
     parts = jax.tree.map(lambda leaf: np.asarray(leaf).sum(axis=0), found.parts)
-    return float(found.shot.cost[0] - prior), parts.gradient, parts.information
+    return float(found.cost[0] - prior), parts.gradient, parts.information
 
 
 def test_the_likelihood_is_the_sum_over_recordings():

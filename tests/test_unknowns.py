@@ -77,11 +77,11 @@ def test_information_about_held_unknowns_is_left_out(kind):
     held = free.hold(
         {name: float(value) for name, value in zip(HELD, free.unknowns.center[np.array(PLACES)], strict=True)}
     )
-    evaluate = eqx.filter_jit(lambda problem, at: problem.stages(cascade=False).evaluate(jnp.asarray(0), at))
-    at = eqx.filter_jit(lambda problem: problem.join(problem.starts[0], problem.first_state()[0]))(free)
-    whole, part = (jax.tree.map(np.asarray, evaluate(problem, at)) for problem in (free, held))
+    model_at = eqx.filter_jit(lambda problem, at: problem.stages().local_model(jnp.asarray(0), at, at))
+    at = eqx.filter_jit(lambda problem: problem.initial_guess.starts[0])(free)
+    whole, part = (jax.tree.map(np.asarray, model_at(problem, at)) for problem in (free, held))
     others = np.delete(np.arange(free.unknowns.count), PLACES)
-    np.testing.assert_allclose(part.shot.cost, whole.shot.cost, rtol=1e-12)
+    np.testing.assert_allclose(part.cost, whole.cost, rtol=1e-12)
     np.testing.assert_allclose(part.gradient[:, others], whole.gradient[:, others], rtol=1e-9)
     np.testing.assert_array_equal(part.gradient[:, PLACES], 0)
     cross = np.ix_([0], others, others)

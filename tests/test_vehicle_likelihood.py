@@ -223,7 +223,10 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share)
         dataclasses.replace(problem_of(dataclasses.replace(flight, specific_force=each)), segments=1)
         for each in (force, np.full_like(force, np.nan))
     )
-    values, noise = np.asarray(problem.starts[0]), np.log([[1.0, 1.0, 1.0]] * 3 + [[strength, tau, sensor]])
+    values, noise = (
+        np.asarray(problem.initial_guess.starts[0, 0]),
+        np.log([[1.0, 1.0, 1.0]] * 3 + [[strength, tau, sensor]]),
+    )
     parameters = values[: problem.problem.unknowns.count]
     noise = LogNoise(*map(jnp.asarray, noise.T))
     of_all, of_rates = (cost_of(each, jnp.asarray(parameters), noise) for each in (problem, silent))

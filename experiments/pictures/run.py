@@ -7,12 +7,14 @@ from typing import Annotated
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import typer
 from matplotlib.figure import Figure
 
 import jaxos4
+from jaxos4.estimators.solver import before_search
 
 BLUE, ORANGE, INK, GREY = "#0072b2", "#d55e00", "#1b1e23", "#b9bec6"
 PICTURES = ("estimate", "halving", "sweeps", "floors")
@@ -41,14 +43,14 @@ ROOMS = {
 
 
 def simulated() -> tuple[jaxos4.AbstractModel, jaxos4.ShootingProblem, jaxos4.Bracket, jaxos4.Estimate]:
-    """The flight of `jaxos4 simulate --noise 1 --seed 0`, identified by IBSS, which records its brackets."""
+    """The flight of `jaxos4 simulate --noise 1 --seed 0`, identified by IBSS."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     omega = jaxos4.multisine(model.airframe, duration=5.0, dt=0.01)
     flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
     problem = jaxos4.ShootingProblem(model, noisy, sigma=jaxos4.SENSOR_SIGMA)
     bracket = jaxos4.Bracket.default(model)
-    return model, problem, bracket, jaxos4.IBSS(record=60)(problem, bracket)
+    return model, problem, bracket, jaxos4.IBSS()(problem, bracket)
 
 
 def estimate_picture(model, problem, bracket, estimate) -> Figure:
@@ -111,10 +113,29 @@ def halving_picture(problem, estimate) -> Figure:
     return figure
 
 
-def sweeps_picture(model, bracket, estimate) -> Figure:
+def sweep_widths(problem: jaxos4.ShootingProblem) -> np.ndarray:
+    """Half-widths of the brackets as each sweep of IBSS opens them: of each parameter, sweep by sweep."""
+    solver, count, widths = jaxos4.IBSS(), problem.unknowns.count, []
+    stages = problem.stages(solver.shares)
+    stages = stages._replace(local_model=jax.jit(stages.local_model))
+    found = before_search(problem, stages)
+    for number in range(stages.number):
+        stage = stages.at(jnp.asarray(number), found.unknowns)
+        state = solver.init(stage, found)
+        while not solver.terminate(stage, state):
+            opened = (state.brackets.highest - state.brackets.lowest)[0] / 2
+            along = jnp.where(stage.searched[:count, None], state.directions.basis[0, :count], 0.0)
+            if opened.any():  # the first shot of a stage needs no bracket
+                widths.append(np.asarray(jnp.abs(along * opened).sum(axis=1)))
+            state = solver.step(stage, state)
+        found = solver.postprocess(stage, state, found)._replace(done=jnp.zeros((), dtype=bool))
+    return np.array(widths)
+
+
+def sweeps_picture(model, problem, bracket, estimate) -> Figure:
     """Half-widths of the brackets sweep by sweep, in standard deviations of the final estimate."""
-    std, brackets = np.asarray(estimate.std), np.asarray(estimate.brackets)[: int(estimate.sweeps)]
-    widths = np.concatenate([np.asarray(bracket.half_width)[None], (brackets[:, 1] - brackets[:, 0]) / 2]) / std
+    opened = sweep_widths(problem.within(bracket))
+    widths = np.concatenate([np.asarray(bracket.half_width)[None], opened]) / np.asarray(estimate.std)
     figure = Figure(figsize=(7.0, 3.8), layout="constrained")
     axes = figure.subplots()
     axes.axhline(1.0, color=INK, lw=0.9, ls="--")
@@ -178,7 +199,7 @@ def main(
     drawings = {
         "estimate": lambda: estimate_picture(model, problem, bracket, estimate),
         "halving": lambda: halving_picture(problem, estimate),
-        "sweeps": lambda: sweeps_picture(model, bracket, estimate),
+        "sweeps": lambda: sweeps_picture(model, problem, bracket, estimate),
     }
     look = {
         "axes.grid": True,

@@ -153,7 +153,7 @@ def cramer_rao_bound(
     infinite one.
     """
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
-    information = problem.curvatures(as_float(parameters), start).information
+    information = problem.local_model(problem.join(as_float(parameters), start)).information
     return covariance_of_shared(information, parameters.shape[0])
 
 

@@ -20,7 +20,6 @@ from ..models.state import Attitude, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
-from ..shooting.innovations import NOISE_PRECISION
 from ..shooting.sums import joined
 from .envelope import Envelope, hover_squares
 from .rotor_speeds import drawn
@@ -177,7 +176,7 @@ class Fleet(eqx.Module):
             found = innovations.innovations(self.parameters, noise)
             information = found.information.sum(axis=-1)
             whole = joined(found.gradient.sum(axis=-1), information, count)[1]
-            prior = NOISE_PRECISION * (np.arange(whole.shape[0]) >= count)
+            prior = innovations.noise_unknowns.precision * (np.arange(whole.shape[0]) >= count)
             return whole + jnp.diag(prior), information[:, :count, :count]
 
         return jax.vmap(one)(flights.omega, flights.states, flights.specific_force)

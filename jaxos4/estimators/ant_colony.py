@@ -18,23 +18,29 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Key, Scalar, integer, setting
-from ..bracket import Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at
-from ..shooting import ROUNDING, AbstractProblem
+from ..estimate import REACH
+from ..shooting import ROUNDING, Stage, WindowUnknowns
+from .solver import AbstractSolver, Found, cost_of
 
 Points = Float[Array, "archive unknowns"]
 Costs = Float[Array, " archive"]
 
 
-class _Colony(NamedTuple):
-    """The archive, best point first: its unknowns in half-widths, and their costs. `sweeps`: how many are done."""
+class Colony(NamedTuple):
+    """The archive, best point first.
+
+    - `points`, `costs`: their unknowns in half-widths from the start, and their costs.
+    - `start`: the unknowns where the search began.
+    - `sweeps`: how many are done.
+    """
 
     points: Points
     costs: Costs
+    start: WindowUnknowns
     sweeps: Int[Array, ""]
 
 
-class AntColony(AbstractEstimator):
+class AntColony(AbstractSolver[Colony]):
     """Ant colony optimisation (ACO_R) of the cost, without derivatives.
 
     It finds the optimum of the other methods that shoot, with many times their rollouts, and so shows what derivatives
@@ -52,6 +58,11 @@ class AntColony(AbstractEstimator):
     - `tolerance`: the search ends once the worst point of the archive costs at most this much more than the best one.
       The cost is the negative logarithm of a likelihood: an error of one standard deviation costs 0.5.
     - `max_sweeps`: the search ends after this many sweeps at the latest.
+    - `reach`: the search does not go further than this many half-widths from the bracket's center.
+    - `shares`: see `AbstractProblem.stages`; by default the likelihood is searched as a whole.
+
+    The estimate's `rollouts` count each point that was simulated, and the Fisher information at the answer. The
+    covariance is the inverse of this information, the only use of derivatives.
 
     All flights have the same random numbers.
     """
@@ -59,6 +70,7 @@ class AntColony(AbstractEstimator):
     shoots: ClassVar[bool] = True
     in_closed_loop: ClassVar[bool] = True
     in_comparison: ClassVar[bool] = False  # `experiments/comparison` has it
+    is_local: ClassVar[bool] = False
 
     archive: int = eqx.field(static=True, converter=integer("archive", 2, static=True), default=50)
     ants: int = eqx.field(static=True, converter=integer("ants", 1, static=True), default=10)
@@ -66,45 +78,51 @@ class AntColony(AbstractEstimator):
     xi: Scalar = eqx.field(converter=setting("xi", positive=True), default=0.85)
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-3)
     max_sweeps: Count = eqx.field(converter=integer("max_sweeps", 1), default=5000)
+    reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
+    shares: tuple[float, ...] = eqx.field(static=True, default=())
 
-    @eqx.filter_jit
-    def __call__(self, problem: AbstractProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
+    def init(self, stage: Stage, before: Found) -> Colony:
+        """The start, and points that are uniform around it."""
+        (windows, unknowns), count = stage.off.shape, stage.unknowns.count
+        shape = self.archive, count + windows * (unknowns - count)
+        points = jax.random.uniform(self._keys[1], shape, minval=-1, maxval=1, dtype=float).at[0].set(0.0)
+        costs = self._shoot(stage, before.unknowns, points)
+        return Colony(*self._best(points, costs), before.unknowns, jnp.zeros((), dtype=int))
 
-        The estimate's `rollouts` count each point that was simulated, and the Fisher information at the answer. The
-        covariance is the inverse of this information, the only use of derivatives.
+    def step(self, stage: Stage, state: Colony) -> Colony:
+        """One sweep: the ants' points replace the worst of the archive."""
+        new = self._sample(state.points, jax.random.fold_in(self._keys[0], state.sweeps))
+        points = jnp.concatenate([state.points, new])
+        costs = jnp.concatenate([state.costs, self._shoot(stage, state.start, new)])
+        return Colony(*self._best(points, costs), state.start, state.sweeps + 1)
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
-        """
-        problem = problem.within(bracket)
-        usable, count, (first, off) = problem.unknowns.usable, problem.unknowns.count, problem.first_state()
-        unknowns = count + problem.windows * problem.free_size
+    def terminate(self, stage: Stage, state: Colony) -> Bool[Array, ""]:
+        """Whether the archive has contracted."""
+        return self._settled(state.costs) | (state.sweeps >= self.max_sweeps)
 
-        def split(point: Float[Array, " unknowns"]) -> tuple[Array, Array]:
-            """The shared unknowns and the initial state of a point."""
-            start = first + off * point[count:] if problem.free_size else first
-            return jnp.clip(usable.center + usable.width * point[:count], *usable.limits(REACH)), start
+    def postprocess(self, stage: Stage, state: Colony, before: Found) -> Found:
+        """The best point."""
+        unknowns = self._unknowns(stage, state.start, state.points[0])
+        rollouts = self.archive + self.ants * state.sweeps + 1 + state.points.shape[1]
+        model, done = stage.local_model(unknowns), self._settled(state.costs)
+        return Found(unknowns, model, before.spread, state.sweeps, rollouts, done)
 
-        @jax.vmap
-        def shoot(point: Float[Array, " unknowns"]) -> Scalar:
-            """The cost of a point; infinite if its trajectory fails."""
-            cost, feasible = problem.shots(*split(point))
-            return jnp.where(feasible & jnp.isfinite(cost), cost, jnp.inf)
+    @property
+    def _keys(self) -> tuple[Key, Key]:
+        """Of the sweeps, and of the first archive."""
+        sweeps, first = jax.random.split(jax.random.key(0))
+        return sweeps, first
 
-        def sweep(colony: _Colony) -> _Colony:
-            new = self._sample(colony.points, jax.random.fold_in(key, colony.sweeps))
-            points, costs = jnp.concatenate([colony.points, new]), jnp.concatenate([colony.costs, shoot(new)])
-            return _Colony(*self._best(points, costs), colony.sweeps + 1)
+    def _unknowns(self, stage: Stage, start: WindowUnknowns, point: Float[Array, " unknowns"]) -> WindowUnknowns:
+        """The unknowns of a point: the shared ones, and those of each window."""
+        count, width = stage.unknowns.count, jnp.where(stage.searched, stage.off, 0.0)
+        own = point[count:].reshape(start.shape[0], -1)
+        steps = jnp.concatenate([jnp.broadcast_to(point[:count], (start.shape[0], count)), own], axis=1)
+        return jnp.clip(start + width * steps, *stage.limits(self.reach))
 
-        key, begin = jax.random.split(jax.random.key(0))
-        points = jax.random.uniform(begin, (self.archive, unknowns), minval=-1, maxval=1, dtype=float).at[0].set(0.0)
-        colony = _Colony(*self._best(points, shoot(points)), jnp.zeros((), dtype=int))
-        colony = jax.lax.while_loop(lambda c: ~self._settled(c.costs) & (c.sweeps < self.max_sweeps), sweep, colony)
-        parameters, initial_state = split(colony.points[0])
-        curvature = problem.curvatures(parameters, initial_state)
-        answer = problem.join(parameters, initial_state)
-        rollouts = self.archive + self.ants * colony.sweeps + 1 + unknowns
-        return estimate_at(problem, answer, curvature, rollouts, colony.sweeps, done=self._settled(colony.costs))
+    def _shoot(self, stage: Stage, start: WindowUnknowns, points: Float[Array, "some unknowns"]) -> Array:
+        """The cost of each point; infinite if its trajectory fails."""
+        return jax.vmap(lambda point: cost_of(stage.local_model(self._unknowns(stage, start, point))))(points)
 
     def _best(self, points: Float[Array, "tried unknowns"], costs: Float[Array, " tried"]) -> tuple[Points, Costs]:
         """The best points, as many as the archive holds, in order of their cost; equal ones by age."""

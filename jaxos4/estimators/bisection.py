@@ -1,70 +1,31 @@
-"""The parts of IBSS: a stage, the directions of a sweep, and the brackets along them.
+"""The parts of IBSS: the directions of a sweep, and the brackets along them.
 
 All steps are in standard deviations. The unknowns of a window are the shared ones, then its own initial state.
 The directions of its initial state come first. Along each shared direction, the initial states move too, to where they
 fit best.
 """
 
-import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Count, Scalar
-from ..shooting import AbstractProblem, Curvature, Stages
-from ..shooting.abstract import WindowUnknowns
+from .._custom_types import Scalar
+from ..linalg import joint_factor, movable, room_to_limits, slopes_along
+from ..shooting import LocalModel, WindowUnknowns
 
 Flag = Bool[Array, ""]
 PerDirection = Float[Array, "windows n"]
 
-# Added information, in units of 1/stride^2: that of unknowns with a stride misjudges the curvature.
-_STRIDE_INFORMATION = 0.1
-
-
-class Stage(NamedTuple):
-    """A stage of a problem, see `Stages`.
-
-    - `evaluate`, `misfit`, `searched`, `smallest_step`: those of `Stages` for this stage. `limits`: of all unknowns.
-    - `added_information`: added before directions are chosen; the cost does not contain it. For an unknown without a
-      prior it is that of the bracket; for any other it keeps steps within the stride.
-    """
-
-    problem: AbstractProblem
-    last: Flag
-    evaluate: Callable[[WindowUnknowns], Curvature]
-    misfit: Callable[[Scalar], Scalar]
-    searched: Bool[Array, " unknowns"]
-    smallest_step: Scalar
-    added_information: Float[Array, "windows unknowns unknowns"]
-    limits: tuple[WindowUnknowns, WindowUnknowns]
-
-    @classmethod
-    def of(cls, problem: AbstractProblem, stages: Stages, number: Count, reach: Scalar) -> "Stage":
-        """The stage of this number, whose search goes at most `reach` half-widths from the bracket's center."""
-        unknowns, prior = problem.unknowns, 1 / jnp.square(prior_std(problem))
-        of_stride = _STRIDE_INFORMATION / jnp.square(unknowns.stride)
-        shared = jnp.where(unknowns.precision > 0, of_stride, prior[:, : unknowns.count] / problem.windows)
-        return cls(
-            problem=problem,
-            last=number == stages.number - 1,
-            evaluate=functools.partial(stages.evaluate, number),
-            misfit=functools.partial(stages.misfit, number),
-            searched=stages.searched[number],
-            smallest_step=stages.smallest_step[number],
-            added_information=prior.at[:, : unknowns.count].set(shared)[:, :, None] * np.eye(prior.shape[1]),
-            limits=problem.limits(reach),
-        )
-
 
 class Directions(NamedTuple):
-    """The directions of a sweep, and the room along them from where it begins.
+    """The directions of a sweep, in which the cost is nearly separable, and the way along them.
 
     - `factor`, `basis`: see `JointFactor`. A direction is a column of `basis`.
     - `moves`: the unknowns that may move: all but those at a limit beyond which the cost falls.
     - `below`, `above`: the way to the limits, against and along each direction.
+    - `predicted`: the step to the minimum of the local model.
     """
 
     factor: Float[Array, "windows unknowns n"]
@@ -72,6 +33,48 @@ class Directions(NamedTuple):
     moves: Bool[Array, "windows unknowns"]
     below: PerDirection
     above: PerDirection
+    predicted: PerDirection
+
+    @classmethod
+    def none(cls, unknowns: WindowUnknowns) -> "Directions":
+        """Before anything is known of the cost: no unknown moves."""
+        matrix, zero = jnp.zeros((*unknowns.shape, unknowns.shape[1])), jnp.zeros_like(unknowns)
+        return cls(matrix, matrix, jnp.zeros(unknowns.shape, dtype=bool), zero, zero, zero)
+
+    @classmethod
+    def at(
+        cls,
+        unknowns: WindowUnknowns,
+        model: LocalModel,
+        limits: tuple[WindowUnknowns, WindowUnknowns],
+        added: WindowUnknowns,
+        count: int,
+    ) -> "Directions":
+        """The directions from some unknowns, of which the first `count` are shared, from the local model there.
+
+        `added`: information about each unknown that the cost does not contain.
+        """
+        moves = movable(unknowns, model.gradient, limits, count)
+        information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
+        factor, basis = joint_factor(information + jax.vmap(jnp.diag)(added), count)
+        lower, upper = (jnp.where(moves, limit, unknowns) for limit in limits)
+        below, above = room_to_limits(unknowns, basis, (lower, upper))
+        # Along a direction, the information is 1: the step is minus the slope.
+        slopes = slopes_along(basis, jnp.where(moves, model.gradient, 0.0), count)
+        return cls(factor, basis, moves, below, above, jnp.clip(-slopes, -below, above))
+
+    def slopes(self, gradient: WindowUnknowns, count: int) -> PerDirection:
+        """The slope of the cost along each direction, of the unknowns that move."""
+        return slopes_along(self.basis, jnp.where(self.moves, gradient, 0.0), count)
+
+    def sizes(self, spread: Float[Array, "windows unknowns unknowns"]) -> PerDirection:
+        """The standard deviation along each direction of unknowns with this covariance."""
+        return jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", self.factor, spread, self.factor))
+
+    @property
+    def longest(self) -> Scalar:
+        """The longest predicted step."""
+        return jnp.abs(self.predicted).max()
 
 
 class Brackets(NamedTuple):
@@ -117,8 +120,3 @@ class Brackets(NamedTuple):
         outside = ((zero <= lower) & (lower > self.lowest)) | ((zero >= upper) & (upper < self.highest))
         following = jnp.where(outside, (lower + upper) / 2, jnp.clip(zero, lower, upper))
         return self._replace(lower=lower, upper=upper, trial=following, last=self.trial, slope=slope, rate=rate)
-
-
-def prior_std(problem: AbstractProblem) -> WindowUnknowns:
-    """Standard deviation of each unknown before the flight is seen: half of how far off it may be."""
-    return problem.join(problem.unknowns.usable.half_width, problem.first_state()[1]) / 2

@@ -9,17 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Numeric
+from .._custom_types import Numeric, Scalar
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
 from ..results import RESULTS
 from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem, in_blocks
 from .ibss import IBSS
+from .solver import solve
 
 _LEVEL = 0.999  # the share of flights in which the seed's intervals hold all parameters at once
 # The seed was wrong if the answer is this many half-widths of these intervals away from the seed.
 _MISSED = 2.0
+# A cost this many standard deviations above that of pure noise is not explained.
+_UNEXPLAINED = 5.0
 
 
 class Hybrid(AbstractEstimator):
@@ -97,26 +100,27 @@ def search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
 
 
 def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
-    answered, unknowns, count = jnp.isfinite(seed.covariance).all(), problem.unknowns.usable, seed.parameters.shape[0]
+    answered, unknowns, count = jnp.isfinite(seed.covariance).all(), problem.unknowns, seed.parameters.shape[0]
+    guess = problem.initial_guess
     # The half-width is two standard deviations.
-    wide_spread = jnp.diag(jnp.square(unknowns.half_width[:count] / 2))
-    first = problem.split(problem.first_state()[0])
+    wide_spread = jnp.diag(jnp.square(guess.off[0, :count] / 2))
+    (windows, size), own = guess.off.shape, unknowns.count
     # The network's channels come first; a problem whose initial state is no unknown needs none of them.
-    estimated = seed.initial_state.reshape(problem.windows, -1)[:, : first.shape[1]]
-    seeded = first.at[:, : estimated.shape[1]].set(estimated)
-    seed_start = jnp.where(unknowns.free[:count], seed.parameters, unknowns.center[:count])
-    begin = jnp.full(unknowns.count, jnp.nan).at[:count].set(seed_start)
+    estimated = seed.initial_state.reshape(windows, -1)[:, : size - own]
+    begin = jnp.full((windows, size), jnp.nan).at[:, :count].set(seed.parameters)
+    begin = begin.at[:, own : own + estimated.shape[1]].set(estimated)
 
     def search(hit: Bool[Array, ""], near: Bool[Array, ""]) -> tuple[Bool[Array, ""], Estimate]:
-        found = ibss.search(
+        found = solve(
+            ibss,
             problem,
             start=jnp.where(near, begin, jnp.nan),
             spread=jnp.where(near, seed.covariance, wide_spread),
-            initial_state=jnp.where(near, seeded, first).ravel(),
-            cascade=~near,
+            is_close=near,
             skip=jnp.where(near, ~answered, hit),
         )
-        return hit | (near & answered & _confirms(found, seed, problem)), found
+        measurements = problem.stages(ibss.shares).measurements[-1]
+        return hit | (near & answered & _confirms(found, seed, measurements)), found
 
     # A loop over the two searches, so that the search is compiled once. A batch of hits skips the second.
     hit, both = jax.lax.scan(search, jnp.zeros((), dtype=bool), jnp.asarray([True, False]))
@@ -132,9 +136,11 @@ def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
     )
 
 
-def _confirms(near: Estimate, seed: Seed, problem: AbstractProblem) -> Bool[Array, ""]:
+def _confirms(near: Estimate, seed: Seed, measurements: Scalar) -> Bool[Array, ""]:
     """Whether the search near a seed ended well, close to the seed, and with residuals no larger than noise."""
     far = jnp.abs(near.parameters[: seed.parameters.shape[0]] - seed.parameters) > _MISSED * seed.half_width
     # A parameter that is not identifiable near the seed is not identifiable elsewhere either.
     ended = (near.result == RESULTS.successful) | (near.result == RESULTS.unidentifiable)
-    return ended & ~far.any() & problem.explains(near.cost)
+    # Without measurements, the noise is an unknown, and no cost is too large.
+    explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2 * measurements)
+    return ended & ~far.any() & explained

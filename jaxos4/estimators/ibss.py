@@ -1,10 +1,8 @@
 """Iterative Bi-Section Shooting (IBSS): narrow brackets by the sign of the slope of the cost.
 
-The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md). They are
-the five calls in `IBSS.sweep`.
+The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md).
 """
 
-import functools
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -12,61 +10,39 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Count, InitialStates, Parameters, Scalar, integer, setting
-from ..bracket import Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at, from_starts
-from ..linalg import gram, joint_factor, movable, room_to_limits, slopes_along
-from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
-from ..shooting.abstract import WindowUnknowns
-from .bisection import Brackets, Directions, Flag, PerDirection, Stage, prior_std
-
-_COARSE = 0.5  # every stage but the last ends when the minimum is at most this many standard deviations away
-# The first sweep of a stage: its longest step in standard deviations of the stage's start, and the half-width of its
-# brackets as a share of that.
-_OPENING, _FIRST = 4.0, 0.05
-# Later: half-width / longest step = _SAFETY times the relative error of the last predictions, from _NARROWEST to 1.
-_SAFETY, _NARROWEST = 2.0, 0.01
-# If the last shot was at an end of its bracket, its growth is multiplied by _GROWTH, up to _WIDEST.
-_GROWTH, _WIDEST = 4.0, 256.0
-_CHANCE = 1.0  # a sweep may raise the cost by this much and is still kept
-# A sweep has stalled if its predicted steps are at most _SHORT, and it lowers the cost by no more than _GAIN.
-_SHORT, _GAIN = 0.3, 1e-4
-# The trust is multiplied by _RETREAT after a rejected sweep, and by _ADVANCE after any other.
-_RETREAT, _ADVANCE = 0.25, 1.4
+from .._custom_types import Count, Scalar, integer, setting
+from ..estimate import REACH
+from ..linalg import gram
+from ..shooting import LocalModel, Stage, WindowUnknowns
+from .bisection import Brackets, Directions, Flag, PerDirection
+from .solver import AbstractSolver, Found, before_shots, chosen
 
 
 class State(NamedTuple):
-    """The search after a sweep.
+    """The search of a stage before a sweep.
 
-    - `unknowns`, `curvature`: where it is, and the curvature of the cost there.
-    - `spread`: the covariance of the unknowns, which sizes the first brackets of a stage.
-    - `relative_width`: the half-width of the next brackets, as a share of the longest step. `growth`: how many times as
-      wide each direction's bracket is.
+    - `unknowns`, `model`: where it is, and the local model of the cost there. See `before_shots`.
+    - `directions`, `brackets`: of the next sweep.
+    - `spread`: the covariance of the unknowns before the stage.
+    - `growth`: how many times as wide each direction's bracket is.
     - `trust`: the share of the longest predicted step that a sweep may go; 1: no limit.
-    - `number_in_stage`: the number of the next sweep in this stage; -1: only a shot at the start.
-    - `sweeps`: the number of sweeps with at least one shot. `rollouts`: see `Estimate.rollouts`. Both count all stages.
-    - `done`: whether the stage ended by itself. `record`: see `Estimate.brackets`.
+    - `sweeps`, `rollouts`: of this stage.
+    - `done`: whether the stage ended by itself.
     """
 
     unknowns: WindowUnknowns
-    curvature: Curvature
+    model: LocalModel
+    directions: Directions
+    brackets: Brackets
     spread: Float[Array, "windows unknowns unknowns"]
-    relative_width: Scalar
     growth: PerDirection
     trust: Scalar
-    number_in_stage: Count
     sweeps: Count
     rollouts: Count
     done: Flag
-    record: Float[Array, "record 2 parameters"]
 
 
-_KEPT = ("unknowns", "curvature", "spread", "sweeps", "rollouts", "record")  # from stage to stage
-# What a sweep found: the brackets after its shots, the last shot's unknowns and curvature, and how many shots it took.
-Bisected = tuple[Brackets, WindowUnknowns, Curvature, Count]
-
-
-class IBSS(AbstractEstimator):
+class IBSS(AbstractSolver[State]):
     """Iterative Bi-Section Shooting.
 
     A *shot* simulates the flight at trial unknowns, and gives the cost with its gradient and information. **The sign of
@@ -85,7 +61,24 @@ class IBSS(AbstractEstimator):
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
       direction. These are scaled by the `misfit` of the residuals, so noise-free data are fitted to rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
-    - `record`: how many sweeps' brackets the estimate keeps.
+    - `shares`: before all data, the body rates are fitted to these shares of the flight. Errors grow with time, so the
+      cost of a long flight has other minima.
+
+    How it searches; in standard deviations, which are scaled like those of `tolerance`:
+
+    - `coarse`: every stage but the last ends when the minimum is at most so far away.
+    - `opening`: the longest step of the first sweep of a stage, in standard deviations of the stage's start.
+    - `narrow`: half-width of the first brackets, as a share of that.
+    - `safety`: half-width of later brackets: so many times the relative error of the last predictions, as a share of
+      the longest step. It is at least `least` and at most 1.
+    - `widening`: if the last shot was at an end of its bracket, the next is wider by this factor, again and again, up
+      to `widest`.
+    - `chance`: a sweep may raise the cost by this much and is still kept.
+    - `retreat`, `advance`: after a sweep that is not kept, the next goes this share of the way; after any other, this
+      many times as far again.
+    - `short`, `gain`: if an unknown has a stride, its slopes are inexact. Then the search also ends after a sweep whose
+      predicted steps are at most `short`, if it lowers the cost by no more than `gain`.
+    - `damping`: added information, in units of 1/stride^2: that of unknowns with a stride misjudges the curvature.
     """
 
     shoots: ClassVar[bool] = True
@@ -95,227 +88,152 @@ class IBSS(AbstractEstimator):
     max_sweeps: Count = eqx.field(converter=integer("max_sweeps", 1), default=60)
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=0.005)
     reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
-    record: int = eqx.field(static=True, converter=integer("record", 0, static=True), default=0)
+    shares: tuple[float, ...] = eqx.field(static=True, default=(0.1, 0.3, 1.0))
+    coarse: float = eqx.field(static=True, default=0.5)
+    opening: float = eqx.field(static=True, default=4.0)
+    narrow: float = eqx.field(static=True, default=0.05)
+    safety: float = eqx.field(static=True, default=2.0)
+    least: float = eqx.field(static=True, default=0.01)
+    widening: float = eqx.field(static=True, default=4.0)
+    widest: float = eqx.field(static=True, default=256.0)
+    chance: float = eqx.field(static=True, default=1.0)
+    retreat: float = eqx.field(static=True, default=0.25)
+    advance: float = eqx.field(static=True, default=1.4)
+    short: float = eqx.field(static=True, default=0.3)
+    gain: float = eqx.field(static=True, default=1e-4)
+    damping: float = eqx.field(static=True, default=0.1)
 
-    @eqx.filter_jit
-    def __call__(
-        self,
-        problem: AbstractProblem,
-        bracket: Bracket | None = None,
-        *,
-        start: Float[Array, " unknowns"] | None = None,
-    ) -> Estimate:
-        """Identifies one flight.
+    def init(self, stage: Stage, before: Found) -> State:
+        """At the start, without directions, so that the first shot is there.
 
-        **Arguments:**
-
-        - `problem`, `bracket`: see `AbstractEstimator`. The parameters may turn out to lie outside of the bracket.
-        - `start`: where the search begins, unless it is NaN; by default the problem's `starts`.
-
-        **Raises:** `ValueError` for a bracket or a start of another length than the unknowns.
+        That shot is the first step of the loop: a second copy of the simulation would take as long to compile as all of
+        the search.
         """
-        return in_blocks(self.search, problem.within(bracket), start)
-
-    def search(
-        self,
-        problem: AbstractProblem,
-        start: Float[Array, " unknowns"] | None = None,
-        spread: Float[Array, "given given"] | None = None,
-        *,
-        initial_state: InitialStates | None = None,
-        cascade: Flag | bool = True,
-        skip: Flag | bool = False,
-    ) -> Estimate:
-        """Identifies one flight, inside the program of another estimator.
-
-        **Arguments:** as of a call, and
-
-        - `spread`: the covariance of the parameters of `start`, which sizes the first brackets; by default that of the
-          bracket, with its half-width as two standard deviations.
-        - `initial_state`: where the search for a free initial state begins; by default the first measurements.
-        - `cascade`: whether to go through all stages. A `start` that is close needs the last one only.
-        - `skip`: whether to return no answer, without a shot. Other lanes of the batch do not wait for this one.
-        """
-        initial = problem.first_state()[0] if initial_state is None else initial_state
-        stages = problem.stages(cascade=True)
-        stages = stages._replace(evaluate=jax.jit(stages.evaluate, inline=True))  # traced once, although called twice
-
-        def from_one(start: Parameters) -> Estimate:
-            first = self.init(problem, stages, problem.join(start, initial), spread, skip)
-
-            def fit(number: Count, state: State) -> State:
-                """One stage: sweeps from where the last stage ended."""
-                stage = Stage.of(problem, stages, number, self.reach)
-                sweep = functools.partial(self.sweep, stage)
-                begin = first._replace(**{name: getattr(state, name) for name in _KEPT})
-                return jax.lax.while_loop(lambda state: ~self.terminate(state), sweep, begin)
-
-            # One loop, so that the search is compiled once for all stages.
-            begin = jnp.where(cascade, 0, stages.number - 1).astype(int)
-            end = jax.lax.fori_loop(begin, stages.number, fit, first)
-            more = {"reach": self.reach, "brackets": end.record if self.record else None}
-            return estimate_at(problem, end.unknowns, end.curvature, end.rollouts, end.sweeps, done=end.done, **more)
-
-        return from_starts(problem, start, from_one)
-
-    def init(
-        self, problem: AbstractProblem, stages: Stages, start: WindowUnknowns, spread: Array | None, skip: Flag | bool
-    ) -> State:
-        """The search before its first shot."""
-        unknowns = jnp.clip(start, *problem.limits(self.reach))
-        covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem)))
-        if spread is not None:
-            size = spread.shape[0]
-            # A search that is skipped may have no finite spread.
-            covariance = covariance.at[:, :size, :size].set(jnp.where(skip, covariance[:, :size, :size], spread))
-        zero = jnp.zeros((), dtype=int)
-        shapes = jax.eval_shape(stages.evaluate, zero, unknowns)
+        unknowns = jnp.clip(before.unknowns, *stage.limits(self.reach))
+        directions = Directions.none(unknowns)
         return State(
             unknowns=unknowns,
-            curvature=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
-            spread=covariance,
-            relative_width=jnp.zeros((), dtype=float),
+            model=before_shots(before.model),
+            directions=directions,
+            brackets=_open(directions, directions.above, directions.above),
+            spread=before.spread,
             growth=jnp.ones_like(unknowns),
             trust=jnp.ones((), dtype=float),
-            number_in_stage=zero - 1,
-            sweeps=zero,
-            rollouts=zero,
-            done=jnp.asarray(skip),
-            record=jnp.full((self.record, 2, problem.unknowns.count), jnp.nan),
+            sweeps=jnp.zeros((), dtype=int),
+            rollouts=jnp.zeros((), dtype=int),
+            done=before.done,
         )
 
-    def sweep(self, stage: Stage, state: State) -> State:
-        """One iteration, in the five steps of docs/method/ibss.md."""
-        directions = self._look_around(stage, state)
-        predicted, near = self._predict(stage, state, directions)
-        brackets = self._open(stage, state, directions, predicted)
-        found = self._bisect(stage, state, directions, near, brackets)
-        return self._judge(stage, state, directions, predicted, near, found)
-
-    def terminate(self, state: State) -> Flag:
-        """Whether the stage has ended. One more call after the last sweep does not shoot: is the minimum near?"""
-        return state.done | (state.number_in_stage > self.max_sweeps)
-
-    def _look_around(self, stage: Stage, state: State) -> Directions:
-        """1. Choose directions in which the cost is nearly separable, from its curvature where the sweep begins."""
-        unknowns, curvature, count = state.unknowns, state.curvature, stage.problem.unknowns.count
-        moves = movable(unknowns, curvature.gradient, stage.limits, count)
-        information = jnp.where(moves[:, :, None] & moves[:, None, :], curvature.information, 0.0)
-        factor, basis = joint_factor(information + stage.added_information, count)
-        lower, upper = (jnp.where(moves, limit, unknowns) for limit in stage.limits)
-        return Directions(factor, basis, moves, *room_to_limits(unknowns, basis, (lower, upper)))
-
-    def _predict(self, stage: Stage, state: State, directions: Directions) -> tuple[PerDirection, Flag]:
-        """2. Predict the step to the quadratic model's minimum: minus the slope. If it is near, the stage ends."""
-        steps = jnp.clip(-self._slopes(stage, directions, state.curvature), -directions.below, directions.above)
-        return steps, (state.number_in_stage >= 0) & self._is_near(stage, state.curvature, steps)
-
-    def _open(self, stage: Stage, state: State, directions: Directions, predicted: PerDirection) -> Brackets:
-        """3. Open a bracket around the predicted step in each direction."""
-        longest = jnp.abs(predicted).max()
-        opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", directions.factor, state.spread, directions.factor))
-        later = jnp.maximum(state.relative_width * longest, stage.smallest_step) * state.growth
-        half_width = jnp.where(state.number_in_stage == 0, _FIRST * opening, later)
-        number, restricted = state.number_in_stage, jnp.where(state.trust < 1, state.trust * longest, jnp.inf)
-        # The first shot is at the start.
-        furthest = jnp.where(number < 0, 0.0, jnp.where(number == 0, opening, restricted))
-        below, above = jnp.minimum(directions.below, furthest), jnp.minimum(directions.above, furthest)
-        return Brackets.around(predicted, half_width, below, above)
-
-    def _bisect(self, stage: Stage, state: State, directions: Directions, near: Flag, brackets: Brackets) -> Bisected:
-        """4. Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
-
-        The last shot is at what the others found. There is none if the minimum is near, or after the last sweep.
-        """
-        over = near | (state.number_in_stage >= self.max_sweeps)
-        shots = jnp.where(state.number_in_stage < 0, 1, jnp.where(over, 0, self.halvings + 1))
-
-        def shoot(carry):
-            brackets, _, _, taken, _ = carry
-            step = jnp.einsum("wud,wd->wu", directions.basis, brackets.trial)
-            unknowns = jnp.clip(state.unknowns + step, *stage.limits)
-            curvature = stage.evaluate(unknowns)
-            slope = self._slopes(stage, directions, curvature)
-            close = curvature.shot.feasible.all() & self._is_near(stage, curvature, slope)
-            # A slope that is not finite becomes the trial: with unit information this puts the minimum at step 0.
-            brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
-            return brackets, unknowns, curvature, taken + 1, close
-
-        first = brackets, state.unknowns, state.curvature, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        return jax.lax.while_loop(lambda carry: (carry[3] < shots) & ~carry[4], shoot, first)[:4]
-
-    def _judge(
-        self,
-        stage: Stage,
-        state: State,
-        directions: Directions,
-        predicted: PerDirection,
-        near: Flag,
-        found: Bisected,
-    ) -> State:
-        """5. Keep the new point, or go back and stay closer if the sweep made things worse."""
-        brackets, unknowns, curvature, shots = found
-        shot, before = curvature.shot, state.curvature.shot
-        first = state.number_in_stage < 0
-        swept = ~first & (shots > 0)
-        gain = before.cost.sum() - shot.cost.sum()
-        stalled = swept & (gain <= _GAIN) & self._may_stall(stage, state, predicted, curvature)
-        numbers = (unknowns, shot.cost, curvature.gradient, curvature.information)
-        finite = jnp.stack([jnp.isfinite(each).all() for each in numbers]).all()
-        # The cost of a trajectory that is not feasible means nothing.
-        not_worse = shot.feasible.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
-        bad = ~finite | (before.feasible.all() & ~not_worse)
-        rejected = (~first & bad) | (stalled & (gain < 0))
-        new, old = (unknowns, curvature), (state.unknowns, state.curvature)
-        unknowns, curvature = jax.tree.map(lambda new, old: jnp.where(rejected, old, new), new, old)
-        covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(directions.basis)
-        relative_width, growth = _next_widths(stage, state, brackets)
+    def step(self, stage: Stage, state: State) -> State:
+        """One sweep: bisect, judge, look around, open. See docs/method/ibss.md."""
+        is_start = jnp.isnan(state.model.cost).any()
+        brackets, unknowns, model, shots = self._bisect(stage, state)
+        kept, stalled = self._judge(stage, state, unknowns, model)
+        unknowns, model = chosen(kept, (unknowns, model), (state.unknowns, state.model))
+        directions = self._look_around(stage, unknowns, model)
+        share, growth = self._next_widths(stage, state, brackets)
+        trust = jnp.where(kept, jnp.minimum(state.trust * self.advance, 1.0), state.trust * self.retreat)
+        later = jnp.maximum(share * directions.longest, stage.smallest_step) * growth
+        restricted = jnp.where(trust < 1, trust * directions.longest, jnp.inf)
+        opening = self.opening * directions.sizes(state.spread)
+        half_width = jnp.where(is_start, self.narrow * opening, later)
+        furthest = jnp.where(is_start, opening, restricted)
+        near = self._is_near(stage, model, directions.predicted)
         return State(
             unknowns=unknowns,
-            curvature=curvature,
-            spread=jnp.where(stage.searched & stage.searched[:, None] & ~first, covariance, state.spread),
-            relative_width=relative_width,
+            model=model,
+            directions=directions,
+            brackets=_open(directions, half_width, furthest),
+            spread=state.spread,
             growth=growth,
-            trust=jnp.where(rejected, state.trust * _RETREAT, jnp.minimum(state.trust * _ADVANCE, 1.0)),
-            number_in_stage=state.number_in_stage + 1,
-            sweeps=state.sweeps + swept,
+            trust=trust,
+            sweeps=state.sweeps + ~is_start,
             rollouts=state.rollouts + shots * stage.searched.sum(),
-            done=near | stalled | (first & ~finite),
-            record=_recorded(stage, state, directions, brackets, swept) if self.record else state.record,
+            done=near | stalled | (is_start & ~kept),
         )
 
-    def _slopes(self, stage: Stage, directions: Directions, curvature: Curvature) -> PerDirection:
-        """The slope of the cost along each direction, of the unknowns that move."""
-        gradient = jnp.where(directions.moves, curvature.gradient, 0.0)
-        return slopes_along(directions.basis, gradient, stage.problem.unknowns.count)
+    def terminate(self, stage: Stage, state: State) -> Flag:
+        """Whether the minimum is near, or the search cannot go on."""
+        return state.done | (state.sweeps >= self.max_sweeps)
 
-    def _is_near(self, stage: Stage, curvature: Curvature, steps: PerDirection) -> Flag:
+    def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
+        """The last point that was kept."""
+        misfit = jnp.maximum(stage.misfit(state.model.cost.sum()), 1.0)
+        covariance = jnp.square(misfit) * gram(state.directions.basis)
+        known = stage.searched & stage.searched[:, None] & _finite(state.unknowns, state.model)
+        spread = jnp.where(known, covariance, before.spread)
+        return Found(state.unknowns, state.model, spread, state.sweeps, state.rollouts, state.done)
+
+    def _look_around(self, stage: Stage, unknowns: WindowUnknowns, model: LocalModel) -> Directions:
+        """The directions in which the cost is nearly separable, and the steps that the local model predicts.
+
+        The information of the bracket is added for an unknown without a prior. The cost does not contain it.
+        """
+        of_bracket, (windows, _) = 1 / jnp.square(stage.off / 2), unknowns.shape
+        shared = of_bracket[:, : stage.unknowns.count] / windows
+        has_prior, of_stride = stage.unknowns.precision > 0, self.damping / jnp.square(stage.unknowns.stride)
+        added = of_bracket.at[:, : stage.unknowns.count].set(jnp.where(has_prior, of_stride, shared))
+        return Directions.at(unknowns, model, stage.limits(self.reach), added, stage.unknowns.count)
+
+    def _bisect(self, stage: Stage, state: State) -> tuple[Brackets, WindowUnknowns, LocalModel, Count]:
+        """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
+
+        The last shot is at what the others found, or where the minimum is near. A single one is enough if all brackets
+        are closed.
+
+        **Returns:** the brackets after the shots, the unknowns and the local model of the last, and how many they were.
+        """
+        limits, count = stage.limits(self.reach), stage.unknowns.count
+        most = jnp.where((state.brackets.highest > state.brackets.lowest).any(), self.halvings + 1, 1)
+
+        def shoot(carry):
+            brackets, _, _, shots, _ = carry
+            step = jnp.einsum("wud,wd->wu", state.directions.basis, brackets.trial)
+            unknowns = jnp.clip(state.unknowns + step, *limits)
+            model = stage.local_model(unknowns)
+            slope = state.directions.slopes(model.gradient, count)
+            near = model.feasible.all() & self._is_near(stage, model, slope)
+            # A slope that is not finite becomes the trial: with unit information this puts the minimum at step 0.
+            brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
+            return brackets, unknowns, model, shots + 1, near
+
+        first = state.brackets, state.unknowns, state.model, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
+        return jax.lax.while_loop(lambda carry: (carry[3] < most) & ~carry[4], shoot, first)[:4]
+
+    def _judge(self, stage: Stage, state: State, unknowns: WindowUnknowns, model: LocalModel) -> tuple[Flag, Flag]:
+        """Whether the new point is kept, and whether the search has stalled. It goes back if a sweep made it worse."""
+        before, gain = state.model, state.model.cost.sum() - model.cost.sum()
+        feasible, was_feasible = model.feasible.all(), before.feasible.all()
+        has_stride = jnp.isfinite(stage.unknowns.stride).any()
+        is_short = has_stride & (state.directions.longest <= self.short)
+        stalled = (gain <= self.gain) & feasible & was_feasible & is_short
+        # The cost of a trajectory that is not feasible means nothing.
+        not_worse = feasible & (model.cost.sum() <= before.cost.sum() + self.chance)
+        bad = ~_finite(unknowns, model) | (was_feasible & ~not_worse)
+        return ~(bad | (stalled & (gain < 0))), stalled
+
+    def _is_near(self, stage: Stage, model: LocalModel, steps: PerDirection) -> Flag:
         """Whether steps, or slopes, which are as long, are short enough to end the stage: the last one ends finely."""
-        misfit = stage.misfit(curvature.shot.cost.sum())
+        misfit = stage.misfit(model.cost.sum())
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
-        return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
+        return jnp.abs(steps).max() <= jnp.where(stage.last, fine, self.coarse * jnp.maximum(misfit, 1.0))
 
-    def _may_stall(self, stage: Stage, state: State, predicted: PerDirection, curvature: Curvature) -> Flag:
-        """Whether a short sweep may end the stage: only if an unknown has a stride, as its slopes are inexact."""
-        feasible = curvature.shot.feasible.all() & state.curvature.shot.feasible.all()
-        short = jnp.isfinite(stage.problem.unknowns.stride).any() & (jnp.abs(predicted).max() <= _SHORT)
-        return feasible & short
-
-
-def _next_widths(stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:
-    """`State.relative_width` and `State.growth` of the next sweep, from the errors of this sweep's predictions."""
-    steps = brackets.last
-    error = jnp.abs(steps - brackets.predicted).max()
-    longest = jnp.maximum(jnp.abs(steps).max(), stage.smallest_step)
-    at_end, was_open = (steps == brackets.lowest) | (steps == brackets.highest), brackets.highest > brackets.lowest
-    growth = jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0)
-    return jnp.clip(_SAFETY * error / longest, _NARROWEST, 1.0), jnp.where(was_open, growth, state.growth)
+    def _next_widths(self, stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:
+        """The half-width of the next brackets as a share of the longest step, and `State.growth`, from the errors."""
+        steps = brackets.last
+        error = jnp.abs(steps - brackets.predicted).max()
+        longest = jnp.maximum(jnp.abs(steps).max(), stage.smallest_step)
+        at_end, was_open = (steps == brackets.lowest) | (steps == brackets.highest), brackets.highest > brackets.lowest
+        growth = jnp.where(at_end, jnp.minimum(self.widening * state.growth, self.widest), 1.0)
+        return jnp.clip(self.safety * error / longest, self.least, 1.0), jnp.where(was_open, growth, state.growth)
 
 
-def _recorded(stage: Stage, state: State, directions: Directions, brackets: Brackets, swept: Flag) -> Array:
-    """The record with one more row: the lowest and the highest value of each parameter in the opened brackets."""
-    length, _, count = state.record.shape
-    basis = jnp.where(stage.searched[:count, None], directions.basis[0, :count], 0.0)
-    spans = basis * jnp.stack([brackets.lowest, brackets.highest])[:, 0, None]
-    bracket = state.unknowns[0, :count] + jnp.stack([spans.min(axis=0), spans.max(axis=0)]).sum(axis=-1)
-    return state.record.at[jnp.where(swept, state.sweeps, length)].set(bracket, mode="drop")
+def _open(directions: Directions, half_width: PerDirection, furthest: PerDirection | Scalar) -> Brackets:
+    """A bracket around the predicted step in each direction, which does not reach further than `furthest`."""
+    below, above = jnp.minimum(directions.below, furthest), jnp.minimum(directions.above, furthest)
+    return Brackets.around(directions.predicted, half_width, below, above)
+
+
+def _finite(unknowns: WindowUnknowns, model: LocalModel) -> Flag:
+    numbers = (unknowns, model.cost, model.gradient, model.information)
+    return jnp.stack([jnp.isfinite(each).all() for each in numbers]).all()

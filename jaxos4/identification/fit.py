@@ -221,6 +221,7 @@ def _searched(
     if first is None:
         progress("compiling, and fitting parameters and disturbances")
         first = search(problem)
+    problem = problem.passing(_parts(first).passed)
     found, fixed, negative = first, {}, {}
     freed = np.zeros(np.shape(first.covariance))
     if has_answer(found):

@@ -64,8 +64,9 @@ def with_profile(fit: Fit, case: Case, *, progress: Progress) -> Fit:
         if not left:
             break
         progress("fitting again where the cost is lower")
-        first = jax.block_until_ready(case.estimator(whole.starting_from(lower)))
-        other = fit_case(case, first=first, progress=progress)
+        same = whole.passing(problem.passed)  # costs compare in the same likelihood only
+        first = jax.block_until_ready(case.estimator(same.starting_from(lower)))
+        other = fit_case(case._replace(problem=same), first=first, progress=progress)
         is_lower = other.answered and _cost(other, whole) < _cost(fit, whole)
         fit = (other if is_lower else fit)._replace(rollouts=fit.rollouts + other.rollouts)
         if not is_lower:

@@ -41,14 +41,14 @@ def fit_at_sample_times(
 ) -> tuple[int, Case, Fit, tuple[SampleTime, ...]]:
     """The place of the case that the rule chooses, the case, its fit, and the answers of all.
 
-    If not `choose`: the first place. In the case, what the controller answers within a sample counts as noise.
+    If not `choose`: the first place.
 
     The search for all parameters starts at the answer of the sample time before, if that is a minimum. What the flights
     do not show is held beside it, in another thread.
 
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
-    found, fitted, fits, beside = None, [], [], ThreadPoolExecutor(1)
+    found, fits, beside = None, [], ThreadPoolExecutor(1)
     try:
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
@@ -59,15 +59,13 @@ def fit_at_sample_times(
             if begin is not case and not has_answer(found):  # the answer for longer samples was no start
                 other = jax.block_until_ready(case.estimator(case.problem))
                 found = eqx.tree_at(lambda e: e.rollouts, other, found.rollouts + other.rollouts)
-            case, found = _passing(case, found)
-            fitted.append(case)
             fits.append(beside.submit(for_threads(fit_case), case, first=found))
         fits = [fit.result() for fit in fits][::-1]
     finally:  # after an error, what has not begun is not computed
         beside.shutdown(cancel_futures=True)
     answers = tuple(map(answer_of, cases, fits))
     place = shortest(answers) if choose else 0
-    return place, fitted[::-1][place], fits[place], answers
+    return place, cases[place], fits[place], answers
 
 
 def _starting_from(case: Case, found: Estimate) -> Case:
@@ -79,15 +77,6 @@ def _starting_from(case: Case, found: Estimate) -> Case:
     if not (off < _NEAR * REACH).all():  # the answer may be another minimum
         return case
     return case._replace(problem=case.problem.starting_from(start))
-
-
-def _passing(case: Case, found: Estimate) -> tuple[Case, Estimate]:
-    """The case and its estimate with the noise that the controller answers within a sample, see `passing`."""
-    if not (isinstance(case.problem, InnovationsProblem) and has_answer(found)):
-        return case, found
-    problem = case.problem.passing(found.parameters)
-    other = jax.block_until_ready(case.estimator(problem.starting_from(found.parameters)))
-    return case._replace(problem=problem), eqx.tree_at(lambda e: e.rollouts, other, found.rollouts + other.rollouts)
 
 
 def shortest(answers: Sequence[SampleTime]) -> int:

@@ -1,9 +1,9 @@
-"""`AbstractProblem`: a likelihood of one flight, and its unknowns. Searches know nothing else of it."""
+"""`AbstractProblem`: a likelihood of one flight, and its unknowns. Solvers know nothing else of it."""
 
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,20 +12,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
+from .._custom_types import Count, Numeric, Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket, is_identifiable
-from ..flight import Flight
 from ..models.abstract import AbstractModel
-from .scans import Curvature, Shot
-
-if TYPE_CHECKING:
-    from typing import ClassVar as AbstractClassVar  # what type checkers understand
-else:
-    from equinox import AbstractClassVar
 
 # The unknowns of each window: those that all windows share, and then the window's own initial state if it is free.
 WindowUnknowns = Float[Array, "windows unknowns"]
 Values = Float[Array, " unknowns"]
+Problem = TypeVar("Problem", bound="AbstractProblem")
 
 
 def _as_mask(x: ArrayLike) -> Bool[Array, "..."]:
@@ -33,13 +27,15 @@ def _as_mask(x: ArrayLike) -> Bool[Array, "..."]:
 
 
 class Unknowns(eqx.Module):
-    """Everything that is fixed about the unknowns of a problem before the search.
+    """Everything that is known before the search about the unknowns that all windows of a flight share.
 
     The model's parameters come first. A likelihood may add unknowns of its own, such as the levels of the noise.
 
     - `names`, `units`: of each unknown.
+    - `parameters`: how many of them, the first, are the model's parameters.
+    - `prior`: how the cost uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
     - `center`, `half_width`: of the bracket in which each is looked for.
-    - `free`: whether it is searched. The others are held at `center`.
+    - `free`: whether it is searched. The others are fixed at `center`.
     - `precision`: of a Gaussian prior around `center`, as the reciprocal of a variance; 0: no prior.
     - `lowest`, `highest`: the values beyond which no search may go, however wide the bracket.
     - `stride`: the longest useful step of a search.
@@ -47,6 +43,8 @@ class Unknowns(eqx.Module):
 
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
+    parameters: int = eqx.field(static=True)
+    prior: float = eqx.field(static=True)
     center: Values = eqx.field(converter=as_float)
     half_width: Values = eqx.field(converter=as_float)
     free: Bool[Array, " unknowns"] = eqx.field(converter=_as_mask)
@@ -63,6 +61,8 @@ class Unknowns(eqx.Module):
         unknowns = cls(
             names=model.parameter_names,
             units=model.parameter_units,
+            parameters=count,
+            prior=NO_PRIOR,
             center=nothing,
             half_width=infinite,
             free=np.ones(count, dtype=bool),
@@ -79,7 +79,7 @@ class Unknowns(eqx.Module):
         return len(self.names)
 
     def within(self, bracket: Bracket) -> "Unknowns":
-        """The same unknowns, looked for in another bracket. A held unknown keeps its value.
+        """The same unknowns, looked for in another bracket. A fixed unknown keeps its value.
 
         **Raises:** `ValueError` for a bracket of another length.
         """
@@ -88,24 +88,24 @@ class Unknowns(eqx.Module):
         center = bracket.center if _all(self.free) else jnp.where(self.free, bracket.center, self.center)
         return dataclasses.replace(self, center=center, half_width=bracket.half_width)
 
-    def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
-        """The same unknowns, some of them held at known values.
+    def fix(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
+        """The same unknowns, some of them fixed at known values.
 
         **Raises:** `ValueError` for a name that is no unknown, or if no unknown remains free.
         """
         strangers = [name for name in values if name not in self.names]
         if strangers:
             raise ValueError(f"`values`: {strangers[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
-        held = np.isin(self.names, list(values))
-        if held.all() or not (isinstance(self.free, Tracer) or (np.asarray(self.free) & ~held).any()):
+        fixed = np.isin(self.names, list(values))
+        if fixed.all() or not (isinstance(self.free, Tracer) or (np.asarray(self.free) & ~fixed).any()):
             raise ValueError("`values` holds every unknown that is still free; leave at least one.")
         given = [as_float(values.get(name, 0.0)) for name in self.names]
-        center, free = _held(self.center, self.free, held, given)
+        center, free = _fixed(self.center, self.free, fixed, given)
         return dataclasses.replace(self, center=center, free=free)
 
     @property
     def valid(self) -> Bool[Array, ""]:
-        """Whether every bracket is finite, and its lower end is below its upper end, unless the unknown is held."""
+        """Whether every bracket is finite, and its lower end is below its upper end, unless the unknown is fixed."""
         wide = (self.half_width > 0) | ~self.free
         return (wide & jnp.isfinite(self.half_width) & jnp.isfinite(self.center)).all()
 
@@ -113,7 +113,7 @@ class Unknowns(eqx.Module):
     def usable(self) -> "Unknowns":
         """The unknowns themselves if they are valid; otherwise 0 +- 1, so that a batch stays finite.
 
-        The half-width of a held unknown is 1 if it was 0.
+        The half-width of a fixed unknown is 1 if it was 0.
         """
         center = jnp.where(self.valid, self.center, 0.0)
         half_width = jnp.where(self.valid & (self.half_width > 0), self.half_width, 1.0)
@@ -121,7 +121,7 @@ class Unknowns(eqx.Module):
 
     @property
     def width(self) -> Values:
-        """The half-width of each free unknown, and 0 for held ones."""
+        """The half-width of each free unknown, and 0 for fixed ones."""
         return jnp.where(self.free, self.half_width, 0.0)
 
     @property
@@ -134,9 +134,12 @@ class Unknowns(eqx.Module):
         lower, upper = self.center - reach * self.half_width, self.center + reach * self.half_width
         return jnp.maximum(lower, self.lowest), jnp.minimum(upper, self.highest)
 
-    def identifiable(self, std: Float[Array, " unknowns"], prior: float = NO_PRIOR) -> Bool[Array, " unknowns"]:
-        """Whether each unknown is identifiable, see `jaxos4.bracket.is_identifiable`; held ones count as known."""
-        return jnp.asarray(is_identifiable(std, self.half_width, prior)) | ~self.free
+    def identifiable(self, std: Float[Array, " unknowns"], prior: float | None = None) -> Bool[Array, " unknowns"]:
+        """Whether each unknown is identifiable, see `jaxos4.bracket.is_identifiable`; fixed ones count as known.
+
+        `prior`: how an estimator used the bracket; by default as the cost does.
+        """
+        return jnp.asarray(is_identifiable(std, self.half_width, self.prior if prior is None else prior)) | ~self.free
 
 
 def _all(mask: Bool[Array, "..."]) -> bool:
@@ -145,104 +148,192 @@ def _all(mask: Bool[Array, "..."]) -> bool:
 
 
 @eqx.filter_jit  # one compiled program instead of one for each operation
-def _held(
-    center: Values, free: Bool[Array, " unknowns"], held: Bool[Numeric, " unknowns"], given: list[Scalar]
+def _fixed(
+    center: Values, free: Bool[Array, " unknowns"], fixed: Bool[Numeric, " unknowns"], given: list[Scalar]
 ) -> tuple[Values, Bool[Array, " unknowns"]]:
-    return jnp.where(held, jnp.stack(given), center), free & ~held
+    return jnp.where(fixed, jnp.stack(given), center), free & ~fixed
 
 
-class Stages(NamedTuple):
-    """A problem in stages, from the one that is the easiest to search to the whole problem.
+class Shot(NamedTuple):
+    """One simulated window.
 
-    All stages have the same unknowns; an early stage may search only some of them, on a part of the data.
-
-    - `number`: how many stages there are.
-    - `evaluate`: from the number of a stage and the unknowns, the curvature of the stage's cost in all unknowns; 0 in
-      those that it does not search.
-    - `searched`: for each stage, the unknowns that it searches.
-    - `misfit`: from the number of a stage and its cost, the size of the residuals in standard deviations of the noise.
-    - `smallest_step`: for each stage, the step in standard deviations below which rounding decides the sign of a slope.
+    - `cost`: of the samples before the trajectory fails.
+    - `feasible`: whether no sample fails, by a pitch angle beyond +-90 degrees or a body rate above `FASTEST` in
+      `scans.py`. The cost of a failed shot means nothing, but its derivative still points back to feasible
+      trajectories.
     """
 
-    number: int
-    evaluate: Callable[[Int[Array, ""], WindowUnknowns], Curvature]
-    searched: Bool[Array, "stages unknowns"]
-    misfit: Callable[[Int[Array, ""], Scalar], Scalar]
-    smallest_step: Float[Array, " stages"]
+    cost: Scalar
+    feasible: Bool[Array, ""]
 
 
-class AbstractProblem(eqx.Module):
-    """The negative log-likelihood of a flight, with its derivatives, window by window.
+class Parts(NamedTuple):
+    """The likelihood of each part of a flight, without the prior.
 
-    A flight may be cut into windows. All windows share the unknowns in `unknowns`, which come first; in addition, each
-    window may have an initial state of its own.
-
-    - `prior`: how the cost uses the bracket: `NO_PRIOR` or `GAUSSIAN_PRIOR` of `jaxos4.bracket`.
+    - `gradient`, `information`: about all unknowns.
+    - `products`: for each channel, sums of the products of standardised innovations 0, 1, 2, ... samples apart.
+    - `passed`: the feedthroughs of the whole flight, whose share of the innovations counts as noise.
     """
 
-    model: eqx.AbstractVar[AbstractModel]
-    flight: eqx.AbstractVar[Flight]
-    unknowns: eqx.AbstractVar[Unknowns]
-    windows: eqx.AbstractVar[int]
-    prior: AbstractClassVar[float]
+    gradient: Float[Array, "parts unknowns"]
+    information: Float[Array, "parts unknowns unknowns"]
+    products: Float[Array, "parts channels lags"]
+    passed: Float[Array, "channels feedthroughs"]
 
-    @property
-    @abc.abstractmethod
-    def free_size(self) -> int:
-        """The number of unknowns in the initial state of one window; 0 if it is known."""
 
-    @property
-    @abc.abstractmethod
-    def starts(self) -> Float[Array, "starts unknowns"]:
-        """Where searches for the shared unknowns start: several rows if the likelihood has several maxima."""
+class LocalModel(NamedTuple):
+    """The quadratic model of a cost around some unknowns, of one window or with the windows as first axis.
 
-    @abc.abstractmethod
-    def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "AbstractProblem":
-        """The same problem with some unknowns held at known values, see `Unknowns.hold`."""
+    - `cost`, `feasible`: as of a `Shot`.
+    - `gradient`, `information`: in the parameters, and then in a free initial state. The information is that of
+      Fisher, J^T W^2 J for a shot.
+    - `parts`: from a likelihood whose parts are compared.
+    """
 
-    @abc.abstractmethod
-    def within(self, bracket: Bracket | None) -> "AbstractProblem":
-        """The same problem, with another bracket for the parameters; unchanged for `None`."""
+    cost: Float[Array, "*windows"]
+    feasible: Bool[Array, "*windows"]
+    gradient: Float[Array, "*windows unknowns"]
+    information: Float[Array, "*windows unknowns unknowns"]
+    parts: Parts | None = None
 
-    @abc.abstractmethod
-    def first_state(self) -> tuple[InitialStates, InitialStates]:
-        """The initial state of all windows at which a search starts, and how far off it may be."""
+    def restricted(self, searched: Bool[Array, " unknowns"]) -> "LocalModel":
+        """The model of these unknowns; 0 in all others."""
+        gradient = jnp.where(searched, self.gradient, 0.0)
+        information = jnp.where(searched & searched[:, None], self.information, 0.0)
+        return self._replace(gradient=gradient, information=information)
 
-    @abc.abstractmethod
-    def split(self, initial_state: InitialStates) -> Float[Array, "windows size"]:
-        """The initial state of each window."""
 
-    @abc.abstractmethod
-    def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
-        """The cost of all windows together. `parameters`: all shared unknowns."""
+class InitialGuess(NamedTuple):
+    """Where a search starts.
 
-    @abc.abstractmethod
-    def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
-        """`curvatures` for a loop: everything that does not depend on the unknowns is computed once."""
+    - `starts`: the unknowns of each window, the shared ones first; several starts if the likelihood has several maxima.
+    - `off`: how far off each may be: two standard deviations of what is known before the flight.
+    - `known`: the initial state of each window, as far as it is known and so no unknown.
+    """
 
-    @abc.abstractmethod
-    def stages(self, *, cascade: bool) -> Stages:
-        """The problem in stages; without `cascade` as a whole."""
+    starts: Float[Array, "starts windows unknowns"]
+    off: WindowUnknowns
+    known: Float[Array, "windows known"]
 
-    @abc.abstractmethod
-    def explains(self, cost: Scalar) -> Bool[Array, ""]:
-        """Whether a cost is no larger than noise makes it; false if the noise is an unknown."""
+    @classmethod
+    def of_shared(cls, starts: Float[Array, "starts unknowns"], off: Values) -> "InitialGuess":
+        """The guess of a flight in one window, with nothing but shared unknowns."""
+        return cls(starts[:, None], off[None], jnp.zeros((1, 0), dtype=float))
 
-    def curvatures(self, parameters: Parameters, initial_state: InitialStates) -> Curvature:
-        """The curvature of each window, in the shared unknowns and the window's own initial state."""
-        return self.evaluator()(parameters, initial_state)
 
-    def join(self, parameters: Parameters, initial_state: InitialStates) -> WindowUnknowns:
-        """The unknowns of each window: the shared ones, and its initial state if that is free."""
-        repeated = jnp.broadcast_to(parameters, (self.windows, parameters.shape[0]))
-        return jnp.concatenate([repeated, self.split(initial_state)[:, : self.free_size]], axis=1)
+class Stage(NamedTuple):
+    """One stage of a likelihood, see `Stages`."""
+
+    unknowns: Unknowns
+    off: WindowUnknowns
+    local_model: Callable[[WindowUnknowns], LocalModel]
+    searched: Bool[Array, " unknowns"]
+    measurements: Scalar
+    smallest_step: Scalar
+    last: Bool[Array, ""]
+
+    def misfit(self, cost: Scalar) -> Scalar:
+        """The size of the residuals in standard deviations of the noise; 1 if the noise is an unknown."""
+        return jnp.where(self.measurements > 0, jnp.sqrt(2 * cost / jnp.maximum(self.measurements, 1)), 1.0)
+
+    def of_windows(self, shared: Float[Array, " shared"], own: float) -> WindowUnknowns:
+        """A value for each shared unknown, and one value for all unknowns of the initial states."""
+        return jnp.full(self.off.shape, own, dtype=float).at[:, : self.unknowns.count].set(shared)
 
     def limits(self, reach: Scalar | float) -> tuple[WindowUnknowns, WindowUnknowns]:
         """The least and the greatest value of each unknown, see `Unknowns.limits`; a free initial state has none."""
         lower, upper = self.unknowns.usable.limits(reach)
-        return self.each_window(lower, -jnp.inf), self.each_window(upper, jnp.inf)
+        return self.of_windows(lower, -jnp.inf), self.of_windows(upper, jnp.inf)
 
-    def each_window(self, shared: Parameters, own: float) -> WindowUnknowns:
-        """A value for each shared unknown, and one value for all unknowns of the initial states."""
-        repeated = jnp.broadcast_to(shared, (self.windows, shared.shape[0]))
-        return jnp.concatenate([repeated, jnp.full((self.windows, self.free_size), own)], axis=1)
+    @property
+    def stride(self) -> WindowUnknowns:
+        """The longest useful step of each unknown."""
+        return self.of_windows(self.unknowns.stride, jnp.inf)
+
+
+class Stages(NamedTuple):
+    """A likelihood in stages, each of which is searched from the answer of the one before; the last is the whole.
+
+    All stages have the same unknowns; an early stage may search only some of them, on a part of the data.
+
+    - `unknowns`, `off`: those of the likelihood, and of its `InitialGuess`.
+    - `number`: how many stages there are. `first`: the stage with which a search begins. `whole`: the first that fits
+      all data.
+    - `local_model`: from the number of a stage, the unknowns that were found before it, and some unknowns: the model of
+      the stage's cost around the last. It is 0 in what the stage does not search.
+    - `searched`: for each stage, the unknowns that it searches.
+    - `measurements`: for each stage, how many measurements its cost compares; 0 if the noise is an unknown.
+    - `smallest_step`: for each stage, the step in standard deviations below which rounding decides the sign of a slope.
+    """
+
+    unknowns: Unknowns
+    off: WindowUnknowns
+    number: int
+    first: Count | int
+    whole: Count | int
+    local_model: Callable[[Int[Array, ""], WindowUnknowns, WindowUnknowns], LocalModel]
+    searched: Bool[Array, "stages unknowns"]
+    measurements: Float[Array, " stages"]
+    smallest_step: Float[Array, " stages"]
+
+    def at(self, number: Count, before: WindowUnknowns) -> Stage:
+        """The stage of this number, after a stage that found `before`."""
+        return Stage(
+            unknowns=self.unknowns,
+            off=self.off,
+            local_model=lambda unknowns: self.local_model(number, before, unknowns),
+            searched=self.searched[number],
+            measurements=self.measurements[number],
+            smallest_step=self.smallest_step[number],
+            last=number == self.number - 1,
+        )
+
+
+class AbstractProblem(eqx.Module):
+    """The negative log-likelihood of a flight.
+
+    A flight may be cut into windows. All windows share the unknowns in `unknowns`; in addition, each window may have a
+    free initial state of its own. The unknowns of all windows are one array: a row for each window, which holds the
+    shared unknowns and then the window's own. The number of rows and columns is that of the `initial_guess`.
+    """
+
+    unknowns: eqx.AbstractVar[Unknowns]
+
+    @property
+    @abc.abstractmethod
+    def initial_guess(self) -> InitialGuess:
+        """Where a search starts."""
+
+    @property
+    @abc.abstractmethod
+    def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
+        """The function from the unknowns to the cost of each window, with gradient, information and parts.
+
+        What does not depend on the unknowns is computed when the function is taken: take it before a loop.
+        """
+
+    @abc.abstractmethod
+    def fix(self: Problem, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> Problem:
+        """The same likelihood, with some unknowns fixed at known values: `problem.fix({"rotor_lag": 0.06})`.
+
+        `bracket`: where the parameters are looked for instead.
+
+        **Raises:** `ValueError` for a name that is no unknown, if no unknown remains free, or for a bracket of another
+        length.
+        """
+
+    @abc.abstractmethod
+    def stages(self, shares: tuple[float, ...] = ()) -> Stages:
+        """The likelihood in stages.
+
+        `shares`: before the whole, a likelihood that simulates fits the body rates to these shares of the flight, one
+        after the other. By default it is fitted as a whole.
+        """
+
+    def hold(self: Problem, values: Mapping[str, Float[ArrayLike, ""]]) -> Problem:
+        """`fix` under the name that users know: `problem.hold({"rotor_lag": 0.06})`."""
+        return self.fix(values)
+
+    def within(self: Problem, bracket: Bracket | None) -> Problem:
+        """The same likelihood, with another bracket for the parameters; unchanged for `None`."""
+        return self if bracket is None else self.fix({}, bracket)

@@ -10,38 +10,30 @@ References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, Sys
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
-from ..bracket import PROPER_PRIOR, Bracket
+from .._custom_types import Numeric, Parameters, as_float
+from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing
-from .abstract import AbstractProblem, Stages, Unknowns, Values, WindowUnknowns
+from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
 from .filters import innovate
-from .gains import INSTANT, LogNoise, Observed, Window, first_noise, is_rate
+from .gains import INSTANT, LogNoise, Observed, Window
+from .noise_unknowns import NoiseUnknowns, own_names
 from .problem import ShootingProblem
-from .scans import Curvature, Parts, Shot
+from .scans import with_tangents
 from .segments import Segments, observe_in_segments
 from .sums import Innovations, joined, placed
 
-# About how many samples a segment has by default, and how many settle its filter.
-_SEGMENT, SETTLING = 384, 128
-# Time constants of the disturbance at which searches start [s]: the likelihood has several maxima.
-_TIMES = np.array([0.2, 0.03])
-_SHORTEST, _LONGEST = 0.25, 3.0  # time constants: in samples, in seconds
-# Time constant of a disturbance of specific force at least [s]: what is faster is vibration, a noise of the sensor.
-_FORCE_SHORTEST = 0.25
-_NOISE_REACH = 1e8  # factor to either side of the first noise levels: simulated flights have no disturbance
-NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
-_STRIDE = 1.0  # the cost is roughly quadratic in a logarithm over such a step
+SETTLING = 128
+"""After so many samples a filter has settled, by default."""
 
 
 class InnovationsProblem(AbstractProblem):
@@ -65,14 +57,13 @@ class InnovationsProblem(AbstractProblem):
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
     - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample; by default
       nothing: the controller answers no measurement within its sample.
-    - `passed`: feedthroughs that were found before, see `passing`; by default 0.
+    - `passed`: feedthroughs that were found before: what they explain counts as noise, which made it. NaN, or by
+      default: not known, so that a search has two stages. The first finds them, the second counts them.
+    - `noise_unknowns`: how the noise is looked for.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
     """
 
-    prior: ClassVar[float] = PROPER_PRIOR
-    windows: ClassVar[int] = 1  # pyright: ignore[reportIncompatibleVariableOverride]  # segments share all unknowns
-    free_size: ClassVar[int] = 0  # pyright: ignore[reportIncompatibleMethodOverride]  # a filter finds its own state
     problem: ShootingProblem
     start: Values = eqx.field(converter=as_float)
     least_noise: Float[Array, " channels"] = eqx.field(converter=as_float)
@@ -80,6 +71,7 @@ class InnovationsProblem(AbstractProblem):
     passed: Float[Array, "channels feedthroughs"] = eqx.field(converter=as_float)
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
+    noise_unknowns: NoiseUnknowns = eqx.field(static=True, default=NoiseUnknowns())
 
     def __init__(
         self,
@@ -91,9 +83,10 @@ class InnovationsProblem(AbstractProblem):
         least_noise: Float[ArrayLike, " channels"] | None = None,
         input_innovations: Float[ArrayLike, "samples feedthroughs 3"] | None = None,
         passed: Float[ArrayLike, "channels feedthroughs"] | None = None,
+        noise_unknowns: NoiseUnknowns | None = None,
     ):
         if segments is None:
-            segments = max(round((problem.flight.time.shape[-1] - settling) / _SEGMENT), 1)
+            segments = max(round((problem.flight.time.shape[-1] - settling) / (3 * SETTLING)), 1)
         for name, value, least in (("segments", segments, 1), ("settling", settling, 0)):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
@@ -108,8 +101,9 @@ class InnovationsProblem(AbstractProblem):
             raise ValueError(
                 f"`input_innovations` must have shape ({samples}, feedthroughs, 3), got {self.input_innovations.shape}."
             )
-        nothing = np.zeros((channels, self.input_innovations.shape[1]))
-        self.passed = as_float(nothing if passed is None else passed)
+        unknown = np.full((channels, self.input_innovations.shape[1]), np.nan)
+        self.passed = as_float(unknown if passed is None else passed)
+        self.noise_unknowns = NoiseUnknowns() if noise_unknowns is None else noise_unknowns
         unknowns = problem.unknowns.count + len(self._own) * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
         self.least_noise = as_float(np.zeros(channels) if least_noise is None else least_noise)
@@ -119,12 +113,12 @@ class InnovationsProblem(AbstractProblem):
             raise ValueError(f"`start` must hold {unknowns} unknowns, got shape {self.start.shape}.")
 
     @property
-    def model(self) -> AbstractModel:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def model(self) -> AbstractModel:
         """The model of the shooting problem."""
         return self.problem.model
 
     @property
-    def flight(self) -> Flight:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def flight(self) -> Flight:
         """The flight of the shooting problem."""
         return self.problem.flight
 
@@ -163,58 +157,33 @@ class InnovationsProblem(AbstractProblem):
 
     @property
     @eqx.filter_jit  # one compiled program instead of one for each operation, and traced once
-    def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
-        own, dt = self.problem.unknowns, self.flight.dt
-        first = jnp.stack(first_noise(self.problem.measured(), dt, _TIMES[0]), axis=1)
-        lowest, highest = first - np.log(_NOISE_REACH), first + np.log(_NOISE_REACH)
-        shortest = jnp.where(is_rate(first.shape[0]), jnp.log(_SHORTEST * dt), np.log(_FORCE_SHORTEST))
-        lowest, highest = lowest.at[:, 1].set(shortest), highest.at[:, 1].set(np.log(_LONGEST))
-        lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(self.least_noise, jnp.finfo(float).tiny)))
-        first, lowest, highest = (
-            jnp.pad(x, ((0, 0), (0, len(self._own) - 3)), constant_values=value)
-            for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf))
-        )
-        names = tuple(each.format(name) for name in self.channels for each in self._own)
-        precision = jnp.full(first.size, NOISE_PRECISION)
-        return Unknowns(
-            names=own.names + names,
-            units=own.units + tuple("1" if name.startswith("log") else "rad/s" for name in names),
-            center=jnp.concatenate([own.center, first.ravel()]),
-            half_width=jnp.concatenate([own.half_width, 1 / jnp.sqrt(precision)]),
-            free=jnp.concatenate([own.free, jnp.ones(first.size, dtype=bool)]),
-            precision=jnp.concatenate([1 / jnp.square(own.usable.half_width), precision]),
-            lowest=jnp.concatenate([own.lowest, lowest.ravel()]),
-            highest=jnp.concatenate([own.highest, highest.ravel()]),
-            stride=jnp.concatenate([own.stride, jnp.full(first.size, _STRIDE)]),
-        )
+        feedthroughs, data = self.input_innovations.shape[-2], (self.problem.measured(), self.flight.dt)
+        return self.noise_unknowns.after(self.problem.unknowns, self.channels, feedthroughs, *data, self.least_noise)
 
     @property
-    def starts(self) -> Float[Array, "starts unknowns"]:
-        """`start` where it is not NaN; all rows are equal if it is a whole start."""
+    def initial_guess(self) -> InitialGuess:
+        """`start` where it is not NaN; all starts are equal if it is a whole start. A filter finds its own state."""
         unknowns, count = self.unknowns.usable, self.problem.unknowns.count
-        place = np.arange(unknowns.count) - count
-        times = jnp.where(
-            (place >= 0) & (place % len(self._own) == 1), jnp.log(jnp.asarray(_TIMES))[:, None], unknowns.center
-        )
-        times = jnp.clip(times, unknowns.lowest, unknowns.highest)
-        return jnp.where(jnp.isnan(self.start) | ~unknowns.free, times, self.start)
+        place, times = np.arange(unknowns.count) - count, jnp.log(jnp.asarray(self.noise_unknowns.times))
+        is_time = (place >= 0) & (place % len(self._own) == 1)
+        starts = jnp.where(is_time, times[:, None], unknowns.center)
+        starts = jnp.clip(starts, unknowns.lowest, unknowns.highest)
+        starts = jnp.where(jnp.isnan(self.start) | ~unknowns.free, starts, self.start)
+        return InitialGuess.of_shared(starts, unknowns.half_width)
 
     def starting_from(self, start: Float[ArrayLike, " unknowns"]) -> "InnovationsProblem":
         """The same problem, with another start."""
         return dataclasses.replace(self, start=start)
 
-    def passing(self, unknowns: Float[ArrayLike, " unknowns"]) -> "InnovationsProblem":
-        """The same problem, with what these feedthroughs explain counted as noise, which made it."""
-        return dataclasses.replace(self, passed=self._of_channels(jnp.asarray(unknowns))[:, 3:])
+    def passing(self, passed: Float[ArrayLike, "channels feedthroughs"]) -> "InnovationsProblem":
+        """The same problem, with what these feedthroughs explain counted as noise."""
+        return dataclasses.replace(self, passed=passed)
 
-    def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "InnovationsProblem":
-        """The same problem with some parameters held, see `ShootingProblem.hold`."""
-        return dataclasses.replace(self, problem=self.problem.hold(values))
-
-    def within(self, bracket: Bracket | None) -> "InnovationsProblem":
-        """The same problem, with another bracket for the parameters; unchanged for `None`."""
-        return self if bracket is None else dataclasses.replace(self, problem=self.problem.within(bracket))
+    def fix(self, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> "InnovationsProblem":
+        """See `AbstractProblem`. Only parameters can be fixed."""
+        return dataclasses.replace(self, problem=self.problem.fix(values, bracket))
 
     def noise(self, unknowns: Float[Numeric, " unknowns"]) -> LogNoise:
         """The noise levels among the unknowns."""
@@ -223,26 +192,46 @@ class InnovationsProblem(AbstractProblem):
     @property
     def _own(self) -> tuple[str, ...]:
         """The names of the unknowns of a channel."""
-        feedthroughs = tuple(f"{{}}_feedthrough_{i + 1}" for i in range(self.input_innovations.shape[-2]))
-        return ("log_{}_strength", "log_{}_time", "log_{}_sensor", *feedthroughs)
+        return own_names(self.input_innovations.shape[-2])
 
     def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "channels own"]:
         return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
 
-    def first_state(self) -> tuple[InitialStates, InitialStates]:
-        """Nothing: the initial state is no unknown."""
-        return jnp.zeros(0, dtype=float), jnp.zeros(0, dtype=float)
-
-    def split(self, initial_state: InitialStates) -> Float[Array, "1 0"]:
-        """See `AbstractProblem`."""
-        return initial_state[None]
-
-    def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
-        """See `AbstractProblem`."""
-        return jax.tree.map(lambda leaf: leaf[0], self.curvatures(parameters, initial_state).shot)
-
-    def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
+    @property
+    def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """See `AbstractProblem`. `parts` are the segments."""
+        at, passed = self._local_model(), jnp.nan_to_num(self.passed)
+        return lambda unknowns: at(unknowns, passed)
+
+    def stages(self, shares: tuple[float, ...] = ()) -> Stages:
+        """The whole problem: filters follow the measurements, so that errors do not grow with time.
+
+        What feedthroughs explain is counted as noise in a second stage, by the feedthroughs that were found before.
+        """
+        del shares
+        number, at = 2 if self.passed.size else 1, self._local_model()
+        is_known = ~jnp.isnan(self.passed).any()
+
+        def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
+            found = jnp.where(is_known, self.passed, self._of_channels(before[0])[:, 3:])
+            return at(unknowns, jnp.where(is_known | (stage > 0), found, 0.0))
+
+        unknowns, none = self.unknowns, jnp.zeros(number, dtype=float)
+        first = is_known.astype(int) if number == 2 else 0
+        return Stages(
+            unknowns=unknowns,
+            off=unknowns.usable.half_width[None],
+            number=number,
+            first=first,
+            whole=first,
+            local_model=local_model,
+            searched=jnp.broadcast_to(unknowns.free, (number, unknowns.count)),
+            measurements=none,
+            smallest_step=none + jnp.sqrt(jnp.finfo(float).eps),
+        )
+
+    def _local_model(self) -> Callable[[WindowUnknowns, Float[Array, "channels feedthroughs"]], LocalModel]:
+        """`local_model` as a function of the unknowns and of `passed`."""
         unknowns, innovations = self.unknowns.usable, self._innovations()
         count, free = self.problem.unknowns.count, unknowns.free
         both, places = free & free[:, None], None
@@ -250,9 +239,9 @@ class InnovationsProblem(AbstractProblem):
             others = np.broadcast_to(np.arange(count, free.size), (self.segments, free.size - count))
             places = jnp.concatenate([jnp.asarray(each.places)[self.cut.recording], others], axis=1)
 
-        def evaluate(values: Values, initial_state: InitialStates) -> Curvature:
-            del initial_state
-            found = innovations(values[:count], self.noise(values), self._of_channels(values)[:, 3:])
+        def at(row: WindowUnknowns, passed: Float[Array, "channels feedthroughs"]) -> LocalModel:
+            values = row[0]
+            found = innovations(values[:count], self.noise(values), self._of_channels(values)[:, 3:], passed)
             own = found.gradient.shape[1] - len(self._own)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, own)
             if places is not None:
@@ -260,32 +249,11 @@ class InnovationsProblem(AbstractProblem):
             off = values - unknowns.center
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
             slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
-            curvature = jnp.where(both, information.sum(axis=0), 0.0) + jnp.diag(unknowns.precision)
-            parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0))
-            return Curvature(Shot(cost[None], found.feasible.all()[None]), slope[None], curvature[None], parts)
+            whole = jnp.where(both, information.sum(axis=0), 0.0) + jnp.diag(unknowns.precision)
+            parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0), passed)
+            return LocalModel(cost[None], found.feasible.all()[None], slope[None], whole[None], parts)
 
-        return evaluate
-
-    def stages(self, *, cascade: bool) -> Stages:
-        """The whole problem: filters follow the measurements, so that errors do not grow with time."""
-        del cascade
-        at, nothing = self.evaluator(), jnp.zeros(0, dtype=float)
-
-        def evaluate(stage: Int[Array, ""], unknowns: WindowUnknowns) -> Curvature:
-            del stage
-            return at(unknowns[0], nothing)
-
-        def misfit(stage: Int[Array, ""], cost: Scalar) -> Scalar:
-            """The residuals are as large as the noise, which is found with the parameters."""
-            del stage
-            return jnp.ones_like(cost)
-
-        smallest_step = jnp.sqrt(jnp.finfo(float).eps) * jnp.ones(1)
-        return Stages(1, evaluate, self.unknowns.free[None], misfit, smallest_step)
-
-    def explains(self, cost: Scalar) -> Bool[Array, ""]:
-        """False: the noise is found with the parameters, so that no cost is too large."""
-        return jnp.zeros_like(cost, dtype=bool)
+        return at
 
     @property
     def _place(self) -> Int[Array, "segments time"]:
@@ -301,9 +269,10 @@ class InnovationsProblem(AbstractProblem):
     ) -> Innovations:
         """The innovations of all segments, with derivatives in the parameters of its recording. `feedthrough`: or 0."""
         nothing = jnp.zeros((self.problem.columns.size, self.input_innovations.shape[-2]))
-        return self._innovations()(parameters, noise, nothing if feedthrough is None else feedthrough)
+        feedthrough, passed = nothing if feedthrough is None else feedthrough, jnp.nan_to_num(self.passed)
+        return self._innovations()(parameters, noise, feedthrough, passed)
 
-    def _innovations(self) -> Callable[[Parameters, LogNoise, Array], Innovations]:
+    def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
         """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
         problem, observed, forced, each = self.problem, self.observed(), self._forced(), self._by_recording
         places = None
@@ -316,10 +285,10 @@ class InnovationsProblem(AbstractProblem):
         settings = {"dt": self.flight.dt, "window": self.window, "rows": self.cut.rows}
         settings |= {"forcing_parameters": model.forcing_parameters}
 
-        def at(parameters: Parameters, noise: LogNoise, feedthrough: Array) -> Innovations:
+        def at(parameters: Parameters, noise: LogNoise, feedthrough: Array, passed: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
-            data = observed, inputs, forcing, own, noise, tuple(feedthrough.T), tuple(self.passed.T)
+            data = observed, inputs, forcing, own, noise, tuple(feedthrough.T), tuple(passed.T)
             functions = problem.advance, problem.average, model.observe
             return innovate(functions, *data, forcing_tangents=tangents, **settings)
 
@@ -327,8 +296,7 @@ class InnovationsProblem(AbstractProblem):
 
     def _forced(self) -> Callable[[Parameters], tuple[Forcing, Forcing | None]]:
         """The forcing of all segments and its tangents, as functions of the parameters; segments are the last axis."""
-        problem, inputs = self.problem, self.flight.inputs._replace(length=self.problem.length)
-        samples = self._place
+        inputs, samples = self.flight.inputs._replace(length=self.problem.length), self._place
 
         def segments_last(forcing: Forcing) -> Forcing:
             forcing = forcing._replace(recording=())  # each segment belongs to one
@@ -342,7 +310,7 @@ class InnovationsProblem(AbstractProblem):
             return lambda parameters: (known, None)
 
         def forced(parameters: Parameters) -> tuple[Forcing, Forcing | None]:
-            forcing, tangents = problem.forcing_and_tangents(of, parameters)
+            forcing, tangents = with_tangents(of, parameters, self.model.forcing_parameters)
             return segments_last(forcing), segments_last(tangents)
 
         return forced

@@ -1,8 +1,8 @@
 """A shooting problem: how badly parameters of a model explain a flight."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -12,18 +12,27 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
-from ..bracket import NO_PRIOR, Bracket
+from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS, midpoint_step
-from .abstract import AbstractProblem, Stages, Unknowns
-from .scans import Curvature, Length, Rows, Shot, each_window, predict_window, shoot, shoot_with_derivatives, windowed
-from .stages import ROUNDING, shooting_stages
+from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stages, Unknowns, WindowUnknowns
+from .scans import (
+    Length,
+    Rows,
+    cut,
+    each_window,
+    first_measured,
+    predict_window,
+    shoot,
+    shoot_with_derivatives,
+    windowed,
+    with_tangents,
+)
+from .stages import ROUNDING, Plan
 
-# A cost this many standard deviations above that of pure noise is not explained.
-_UNEXPLAINED = 5.0
 # How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
 _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
 
@@ -53,8 +62,6 @@ class ShootingProblem(AbstractProblem):
 
     **Raises:** `ValueError` that names the argument.
     """
-
-    prior: ClassVar[float] = NO_PRIOR
 
     model: AbstractModel
     flight: Flight
@@ -124,20 +131,27 @@ class ShootingProblem(AbstractProblem):
         return np.concatenate([CASCADE_ORDER[: self.size], len(STATE_NAMES) + forces])
 
     @property
-    def starts(self) -> Float[Array, "1 unknowns"]:
-        """The center of the bracket: a search in stages needs no other start."""
-        return self.unknowns.usable.center[None]
+    def initial_guess(self) -> InitialGuess:
+        """The center of the bracket, and `first_state`: a search in stages needs no other start."""
+        usable, (first, off) = self.unknowns.usable, self.first_state()
+        known = self.split(first)[:, self.free_size :]
+        return InitialGuess(self.join(usable.center, first)[None], self.join(usable.half_width, off), known)
 
-    def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "ShootingProblem":
-        """The same problem with some parameters held at known values: `problem.hold({"rotor_lag": 0.06})`.
+    @property
+    def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
+        """See `AbstractProblem`."""
+        forced, known, count = self.forced_rows(), self.first_state()[0], self.unknowns.count
 
-        **Raises:** `ValueError` for a name that the model does not have, or if no parameter remains free.
-        """
-        return dataclasses.replace(self, unknowns=self.unknowns.hold(values))
+        def at(unknowns: WindowUnknowns) -> LocalModel:
+            own = unknowns[:, count:] if self.free_size else self.split(known)
+            return each_window(self.model_of_window, forced(unknowns[0, :count]), unknowns[:, :count], own)
 
-    def within(self, bracket: Bracket | None) -> "ShootingProblem":
-        """The same problem, with another bracket for its unknowns; unchanged for `None`."""
-        return self if bracket is None else dataclasses.replace(self, unknowns=self.unknowns.within(bracket))
+        return at
+
+    def fix(self, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> "ShootingProblem":
+        """See `AbstractProblem`."""
+        unknowns = self.unknowns if bracket is None else self.unknowns.within(bracket)
+        return dataclasses.replace(self, unknowns=unknowns.fix(values) if values else unknowns)
 
     def restrict(self, channels: str) -> "ShootingProblem":
         """The same problem on fewer channels."""
@@ -171,32 +185,23 @@ class ShootingProblem(AbstractProblem):
     def forced_rows(self) -> Callable[[Parameters], Rows]:
         """`rows` with the derivatives of the forcing, for a loop: what depends on no parameter is made once."""
         rows, inputs, index = self.rows(), self.flight.inputs, self.cut()[0]
+        places = self.model.forcing_parameters
 
         def forced(parameters: Parameters) -> Rows:
-            forcing, tangents = self.forcing_and_tangents(
-                lambda values: windowed(self.model.forcing(inputs, values), index), parameters
-            )
+            of = functools.partial(self.model.forcing, inputs)
+            forcing, tangents = with_tangents(lambda x: windowed(of(x), index), parameters, places)
             return rows._replace(forcing=forcing, forcing_tangents=tangents)
 
-        return forced if self.model.forcing_parameters else lambda parameters: rows
-
-    def forcing_and_tangents(
-        self, of: Callable[[Parameters], Forcing], parameters: Parameters
-    ) -> tuple[Forcing, Forcing]:
-        """The forcing that is a function `of` the parameters, and its derivatives in `Model.forcing_parameters`."""
-        positions = np.asarray(self.model.forcing_parameters, dtype=int)
-
-        def forcing(values: Float[Array, " positions"]) -> tuple[Forcing, Forcing]:
-            new = of(parameters.at[positions].set(values))
-            return new._replace(recording=(), velocity=None), new  # no parameter changes these fields
-
-        slopes, new = jax.jacfwd(forcing, has_aux=True)(parameters[positions])
-        zeros: Forcing = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), new)
-        return new, slopes._replace(recording=zeros.recording, velocity=zeros.velocity)
+        return forced if places else lambda parameters: rows
 
     def split(self, initial_state: InitialStates) -> Float[Array, "windows size"]:
         """The initial state of each window."""
         return initial_state.reshape(self.windows, self.size)
+
+    def join(self, parameters: Parameters, initial_state: InitialStates) -> WindowUnknowns:
+        """The unknowns of each window: the parameters, and its initial state if that is free."""
+        repeated = jnp.broadcast_to(parameters, (self.windows, parameters.shape[0]))
+        return jnp.concatenate([repeated, self.split(initial_state)[:, : self.free_size]], axis=1)
 
     def first_state(self) -> tuple[InitialStates, InitialStates]:
         """The initial state at which a search starts, and how far off it may be.
@@ -208,10 +213,8 @@ class ShootingProblem(AbstractProblem):
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
         (index, within), sigma = self.cut(), self.sigma[order]
         states = jnp.where(within[:, :, None], self.measured()[index, : self.size], jnp.nan)
-        first = jnp.argmin(jnp.isnan(states), axis=1)
-        value = jnp.take_along_axis(states, first[:, None], axis=1)[:, 0]
-        off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
-        return jnp.where(jnp.isnan(value), 0.0, value).ravel(), off.ravel()
+        value, is_first = first_measured(states)
+        return value.ravel(), (3 * sigma + jnp.where(is_first, 0.0, _UNMEASURED[: self.size])).ravel()
 
     @eqx.filter_jit
     def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
@@ -249,35 +252,45 @@ class ShootingProblem(AbstractProblem):
         each = each_window(lambda rows, start: self.shot(rows, parameters, start), rows, starts)
         return Shot(each.cost.sum(), each.feasible.all())
 
-    def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
-        """`curvatures` for a loop: what does not depend on the unknowns is made once."""
-        forced = self.forced_rows()
+    def stages(self, shares: tuple[float, ...] = ()) -> Stages:
+        """See `AbstractProblem`."""
+        count, measured, known = self.unknowns.count, self.measured(), self.split(self.first_state()[0])
+        length = measured.shape[0] if self.length is None else self.length
+        plan = Plan.of(self.channels, shares, measured, self.sigma[self.columns], length, self.windows)
+        number, place, forced = len(plan.place), jnp.asarray(plan.place), self.forced_rows()
+        free, own = jnp.broadcast_to(self.unknowns.free, (number, count)), np.arange(self.free_size)
+        searched = jnp.concatenate([free, own < plan.sizes[:, None]], axis=1)
+        parts = [functools.partial(self._model_of_part, self.restrict(channels)) for channels in plan.channels]
 
-        def evaluate(parameters: Parameters, initial_state: InitialStates) -> Curvature:
-            rows, starts = forced(parameters), self.split(initial_state)
-            return each_window(lambda rows, start: self.curvature(rows, parameters, start), rows, starts)
+        def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
+            del before
+            length = self.length if plan.lengths is None else plan.lengths[stage]
+            own = unknowns[:, count:] if self.free_size else known
+            data = forced(unknowns[0, :count]), unknowns[:, :count], own, length
+            # The stage is the same in all lanes of a batch.
+            model = parts[0](*data) if len(parts) == 1 else jax.lax.switch(place[stage], parts, *data)
+            return model.restricted(searched[stage])
 
-        return evaluate
+        off, last, counts = self.initial_guess.off, number - 1, plan.measurements
+        return Stages(self.unknowns, off, number, 0, last, local_model, searched, counts, plan.smallest_step)
 
-    def stages(self, *, cascade: bool) -> Stages:
-        """See `shooting_stages`."""
-        return shooting_stages(self, cascade=cascade)
-
-    def cascade(self) -> "tuple[ShootingProblem, ...]":
-        """The problems to solve one after the other: the rates, which depend on nothing else, and then all channels."""
-        return (self,) if self.channels == "rates" else (self.restrict("rates"), self)
-
-    def explains(self, cost: Scalar) -> Bool[Array, ""]:
-        """Whether a cost is at most `_UNEXPLAINED` standard deviations above that of pure noise."""
-        measurements = jnp.sum(~jnp.isnan(self.measured()))
-        return 2 * cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
+    def _model_of_part(
+        self, part: "ShootingProblem", rows: Rows, parameters: Array, own: Array, length: Length
+    ) -> LocalModel:
+        """The local model of the whole problem's `rows` on the channels of `part`, in all unknowns."""
+        part = eqx.tree_at(lambda p: p.length, part, length, is_leaf=lambda leaf: leaf is None)
+        compared = rows._replace(measured=rows.measured[: part.size] + rows.measured[self.size :])
+        model = each_window(part.model_of_window, compared, parameters, own[:, : part.size])
+        none, more = (0, 0), (0, self.free_size - part.free_size)
+        gradient, information = jnp.pad(model.gradient, (none, more)), jnp.pad(model.information, (none, more, more))
+        return model._replace(gradient=gradient, information=information)
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""
         return shoot(self._advance, rows, self._weights(), parameters, initial_state, self.length)
 
-    def curvature(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Curvature:
-        """Cost, gradient and Fisher information of one window, in the parameters and a free initial state."""
+    def model_of_window(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> LocalModel:
+        """The local model of one window, in the parameters and a free initial state."""
         return shoot_with_derivatives(
             self._advance,
             rows,
@@ -327,11 +340,8 @@ class ShootingProblem(AbstractProblem):
         return midpoint_step(self.model, state, forcing, parameters, self.flight.dt)
 
     def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-        """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
-        ends = np.arange(self.windows + 1) * self.flight.states.shape[-2] // self.windows
-        index = ends[:-1, None] + np.arange(np.diff(ends).max())
-        within = index < ends[1:, None]
-        return np.where(within, index, ends[1:, None] - 1), within
+        """The samples of each window, and which of them belong to it."""
+        return cut(self.flight.states.shape[-2], self.windows)
 
     def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
         return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import InitialState, Numeric, Parameters, Scalar
 from ..models.state import Forcing, State, Translation, unstack
+from .abstract import LocalModel, Shot
 from .batching import computed_once, with_batch
 from .sparsity import Panel, panels_of, symmetric
 
@@ -46,42 +47,6 @@ class Rows(NamedTuple):
     forcing_tangents: Forcing | None = None
 
 
-class Shot(NamedTuple):
-    """One simulated window.
-
-    - `cost`: of the samples before the trajectory fails.
-    - `feasible`: whether no sample fails, by a pitch angle beyond +-90 degrees or a body rate above `FASTEST`. The cost
-      of a failed shot means nothing, but its derivative still points back to feasible trajectories.
-    """
-
-    cost: Scalar
-    feasible: Bool[Array, ""]
-
-
-class Parts(NamedTuple):
-    """The likelihood of each part of a flight, without the prior.
-
-    - `gradient`, `information`: about all unknowns.
-    - `products`: for each channel, sums of the products of standardised innovations 0, 1, 2, ... samples apart.
-    """
-
-    gradient: Float[Array, "parts unknowns"]
-    information: Float[Array, "parts unknowns unknowns"]
-    products: Float[Array, "parts channels lags"]
-
-
-class Curvature(NamedTuple):
-    """A shot with its gradient and its Fisher information J^T W^2 J in (parameters, initial state).
-
-    `parts`: from a likelihood whose parts are compared.
-    """
-
-    shot: Shot
-    gradient: Float[Array, " unknowns"]
-    information: Float[Array, "unknowns unknowns"]
-    parts: Parts | None = None
-
-
 def predict_window(
     advance: Advance, forcing: Forcing, parameters: Parameters, initial_state: InitialState, length: Length = None
 ) -> Float[Array, "length columns"]:
@@ -102,6 +67,21 @@ def predict_window(
         return state, outputs.at[i].set(jnp.stack(predicted))
 
     return jax.lax.fori_loop(0, length, fill, (first, jnp.zeros((samples, columns), dtype=float)))[1]
+
+
+def with_tangents(
+    of: Callable[[Parameters], Forcing], parameters: Parameters, places: tuple[int, ...]
+) -> tuple[Forcing, Forcing]:
+    """The forcing that is a function `of` the parameters, and its derivatives in those in these places."""
+    positions = np.asarray(places, dtype=int)
+
+    def forcing(values: Float[Array, " positions"]) -> tuple[Forcing, Forcing]:
+        new = of(parameters.at[positions].set(values))
+        return new._replace(recording=(), velocity=None), new  # no parameter changes these fields
+
+    slopes, new = jax.jacfwd(forcing, has_aux=True)(parameters[positions])
+    zeros: Forcing = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), new)
+    return new, slopes._replace(recording=zeros.recording, velocity=zeros.velocity)
 
 
 def _fold(step: Callable, first: Carry, rows: Rows, length: Length) -> Carry:
@@ -142,18 +122,18 @@ def shoot_with_derivatives(
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
     length: Length = None,
-) -> Curvature:
+) -> LocalModel:
     """`shoot` with the gradient and the information in the parameters and, if it is free, the initial state.
 
     One tangent for each unknown travels with the state. A batch is computed in lanes.
     """
 
-    def alone(*data: Any) -> Curvature:
+    def alone(*data: Any) -> LocalModel:
         return _linearised_shot(
             *data, forcing_parameters=forcing_parameters, initial_state_is_free=initial_state_is_free
         )
 
-    def together(lanes: int, many: Any, shared: Any) -> Curvature:
+    def together(lanes: int, many: Any, shared: Any) -> LocalModel:
         if many[-1] is not None:  # lanes of different lengths
             return jax.vmap(lambda one: alone(*eqx.combine(one, shared)))(many)
         last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), many[1:-1])
@@ -197,7 +177,7 @@ def _linearised_shot(
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
-) -> Curvature:
+) -> LocalModel:
     """`shoot_with_derivatives` of one flight, or of flights in lanes, which are then the last axis of all arrays.
 
     Rows and weights that all lanes share have a last axis of 1.
@@ -246,7 +226,7 @@ def _linearised_shot(
 
     last = _fold(step, _before(initial_state, count, cut, panels), rows, length)
     information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)
-    return Curvature(last.shot, jnp.concatenate(last.gradient), symmetric(information))
+    return LocalModel(*last.shot, jnp.concatenate(last.gradient), symmetric(information))
 
 
 def _before(initial_state: Float[Array, "size *lanes"], count: int, cut: int, panels: list[Panel]) -> _Carried:
@@ -329,12 +309,12 @@ def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
 
 
-def each_window(function: Callable, *arguments: Any) -> Any:
-    """`function` of each window. The only window of a flight needs no `vmap`, which takes long to trace."""
-    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
-        return jax.vmap(function)(*arguments)
-    only = jax.tree.map(lambda leaf: leaf[0], arguments)
-    return jax.tree.map(lambda leaf: leaf[None], function(*only))
+def cut(samples: int, windows: int) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+    """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
+    ends = np.arange(windows + 1) * samples // windows
+    index = ends[:-1, None] + np.arange(np.diff(ends).max())
+    within = index < ends[1:, None]
+    return np.where(within, index, ends[1:, None] - 1), within
 
 
 def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
@@ -344,3 +324,20 @@ def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
         return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
 
     return jax.tree.map(rows, series)
+
+
+def each_window(function: Callable, *arguments: Any) -> Any:
+    """`function` of each window. The only window of a flight needs no `vmap`, which takes long to trace."""
+    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
+        return jax.vmap(function)(*arguments)
+    only = jax.tree.map(lambda leaf: leaf[0], arguments)
+    return jax.tree.map(lambda leaf: leaf[None], function(*only))
+
+
+def first_measured(
+    measured: Float[Array, "windows length columns"],
+) -> tuple[Float[Array, "windows columns"], Bool[Array, "windows columns"]]:
+    """The first measurement of each window, or 0 if there is none; and whether it is that of the first sample."""
+    first = jnp.argmin(jnp.isnan(measured), axis=1)
+    value = jnp.take_along_axis(measured, first[:, None], axis=1)[:, 0]
+    return jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)

@@ -121,8 +121,8 @@ def first_state(problem):
 
 
 @eqx.filter_jit
-def curvatures(problem, parameters, starts):
-    return problem.curvatures(parameters, starts)
+def local_model(problem, parameters, starts):
+    return problem.local_model(problem.join(parameters, starts))
 
 
 BLOCK = 64  # draws of one call, whatever the number wanted: one program

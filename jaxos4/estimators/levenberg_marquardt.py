@@ -1,0 +1,246 @@
+"""Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood; and output error and filter error, which use it.
+
+Output error is the prediction-error method for a model without process noise: nonlinear least squares of the simulated
+against the measured trajectory. Filter error allows for disturbances that the model does not contain: its likelihood is
+that of `InnovationsProblem`.
+
+References: Marquardt 1963, SIAM J. Appl. Math. 11(2), on the damping; Ljung, System Identification, ch. 7 and 13;
+Jategaonkar, Flight Vehicle System Identification, ch. 4 and 5.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._custom_types import Count, Scalar, integer, setting
+from ..bracket import GAUSSIAN_PRIOR, Bracket
+from ..estimate import REACH, AbstractEstimator, Estimate, as_estimate, fit_start
+from ..linalg import joint_factor, movable, slopes_along
+from ..results import RESULTS
+from ..shooting import (
+    AbstractProblem,
+    InnovationsProblem,
+    LocalModel,
+    ShootingProblem,
+    Stage,
+    WindowUnknowns,
+    in_blocks,
+)
+from .solver import AbstractSolver, Found, before_shots, chosen, cost_of, solve
+
+
+class State(NamedTuple):
+    """The search of a stage before a shot.
+
+    - `best`, `model`: the best unknowns so far, and the local model there, see `before_shots`.
+    - `trial`: where the shot will be.
+    - `damping`: of the last step, or of the first one.
+    - `shots`: how many there were.
+    - `done`: whether the stage ended by itself.
+    """
+
+    best: WindowUnknowns
+    model: LocalModel
+    trial: WindowUnknowns
+    damping: Scalar
+    shots: Count
+    done: Bool[Array, ""]
+
+
+class LevenbergMarquardt(AbstractSolver[State]):
+    """Gauss-Newton steps, which are damped more after a step that failed, and less after one that succeeded.
+
+    **Arguments:**
+
+    - `step_tolerance`: a stage ends with a step that changes no unknown by more, in the unit of how far off its initial
+      guess may be. Cost and covariance are those before this step. 0: no step is short enough.
+    - `coarse`: `step_tolerance` of all stages but the last, at least.
+    - `gain_tolerance`: a stage ends if hardly damped steps promise to lower the cost by less. An error of one standard
+      deviation costs 0.5.
+    - `flat`: it ends too if a step failed whose damping is more than 1, and which promised to lower the cost by less.
+    - `max_steps`: the most steps of a stage.
+    - `is_relative`: whether damping is relative to the information about each unknown (Marquardt). Otherwise it is
+      relative to what is known before the flight (Levenberg): such a damping hardly changes the steps of a flight with
+      much information.
+    - `damping`: of the first step. `least_damping`: of any other. `factor`: how much more, or less, is damped after a
+      step.
+    - `stride_information`: information that is always added about an unknown with a stride, in units of 1/stride^2: its
+      own information misjudges the curvature.
+    - `shares`: see `AbstractProblem.stages`. The rates are fitted first, and then all channels with them: from a wide
+      bracket, a direct fit of all channels can end in another minimum.
+    - `reach`: the search does not go further than this many half-widths from the bracket's center.
+    """
+
+    shoots: ClassVar[bool] = True
+    in_closed_loop: ClassVar[bool] = True
+
+    step_tolerance: Scalar = eqx.field(converter=setting("step_tolerance"), default=1e-5)
+    coarse: float = eqx.field(static=True, default=1e-3)
+    gain_tolerance: Scalar = eqx.field(converter=setting("gain_tolerance"), default=0.0)
+    flat: float = eqx.field(static=True, default=0.0)
+    max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
+    is_relative: bool = eqx.field(static=True, default=False)
+    damping: float = eqx.field(static=True, default=1.0)
+    least_damping: float = eqx.field(static=True, default=0.0)
+    factor: float = eqx.field(static=True, default=10.0)
+    stride_information: float = eqx.field(static=True, default=0.3)
+    shares: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
+    reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
+
+    def init(self, stage: Stage, before: Found) -> State:
+        """The first trial is the start. Any cost is better than none."""
+        model = before_shots(before.model)
+        damping = jnp.full((), self.factor * self.damping, dtype=float)
+        return State(before.unknowns, model, before.unknowns, damping, jnp.zeros((), dtype=int), before.done)
+
+    def step(self, stage: Stage, state: State) -> State:
+        """Shoot at the trial, keep the better, and propose the next trial."""
+        model, before = stage.local_model(state.trial), state.model
+        known = ~jnp.isnan(before.cost).any()
+        better = ~(known & (cost_of(model) >= cost_of(before)))
+        best, model = chosen(better, (state.trial, model), (state.best, before))
+        damping = state.damping * jnp.where(better, 1 / self.factor, self.factor)
+        damping = jnp.maximum(damping, self.least_damping)
+        step = jnp.clip(self._step(stage, best, model, damping), -stage.stride, stage.stride)
+        trial = jnp.clip(best + step, *stage.limits(self.reach))
+        step = trial - best
+        small = self._is_small(stage, step, model, damping)
+        done = small | ~jnp.isfinite(step).all()
+        return State(jnp.where(small, trial, best), model, trial, damping, state.shots + 1, done)
+
+    def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
+        """Whether a step was small, or there were too many."""
+        return state.done | (state.shots > self.max_steps)
+
+    def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
+        """The best unknowns. A shot counts as one rollout for itself, and one for each of its tangents."""
+        (windows, _), count = state.best.shape, stage.unknowns.count
+        tangents = count + windows * stage.searched[count:].sum()
+        return Found(state.best, state.model, before.spread, state.shots - 1, state.shots * (1 + tangents), state.done)
+
+    def _is_small(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Bool[Array, ""]:
+        """Whether a step ends the stage."""
+        tolerance = jnp.where(stage.last, self.step_tolerance, jnp.maximum(self.step_tolerance, self.coarse))
+        unit, least = self._unit(stage, model.information), self._least(stage)
+        # By how much the step should lower the cost, as if it were hardly damped.
+        eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
+        left = -(eased * model.gradient * step).sum()
+        stalled = (left < self.gain_tolerance) | ((damping > 1) & (left < self.flat))
+        return (jnp.abs(step) <= tolerance * stage.off).all() | stalled
+
+    def _step(self, stage: Stage, best: WindowUnknowns, model: LocalModel, damping: Scalar) -> WindowUnknowns:
+        """The damped Gauss-Newton step of each window's unknowns; 0 for those that are fixed or at their limit."""
+        count = stage.unknowns.count
+        moves = movable(best, model.gradient, stage.limits(self.reach), count) & stage.searched
+        information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
+        added = damping * self._unit(stage, information) + self._least(stage)
+        basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
+        slopes = slopes_along(basis, jnp.where(moves, model.gradient, 0.0), count)
+        return -(basis * slopes[:, None, :]).sum(axis=-1)
+
+    def _least(self, stage: Stage) -> WindowUnknowns:
+        """The information that damps each unknown in any case."""
+        return self.stride_information / jnp.square(stage.stride)
+
+    def _unit(self, stage: Stage, information: Float[Array, "windows n n"]) -> WindowUnknowns:
+        """The information that a damping of 1 adds; about a parameter once, as all windows share it."""
+        if self.is_relative:
+            diagonal = jnp.diagonal(information, axis1=1, axis2=2)
+            return jnp.where(diagonal > 0, diagonal, 1.0)
+        return 1 / jnp.square(stage.off).at[:, : stage.unknowns.count].multiply(stage.off.shape[0])
+
+
+class OutputError(AbstractEstimator):
+    """Levenberg-Marquardt on the weighted residuals, from the bracket's center: first the rates, then all channels.
+
+    **Arguments:**
+
+    - `tolerance`: the search ends with a step that changes no unknown by more, in half-widths of the bracket. Cost and
+      covariance are those before this step.
+    - `max_steps`: for each stage.
+    """
+
+    looks_at: ClassVar[str] = "all"
+    shoots: ClassVar[bool] = True
+
+    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-5)
+    max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
+
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight.
+
+        The estimate's `rollouts` count each trial and each of its tangents; `sweeps` are the steps of all stages.
+
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        """
+        return LevenbergMarquardt(step_tolerance=self.tolerance, max_steps=self.max_steps)(problem, bracket)
+
+
+class FilterError(AbstractEstimator):
+    """Maximum likelihood of the innovations of Kalman filters, by Gauss-Newton steps from the bracket's center.
+
+    It compares the body rates, and specific force if the model predicts it. The disturbance and the sensor's noise of
+    each channel are estimated too, see `InnovationsProblem`. The bracket is a Gaussian prior, whose standard deviation
+    is the bracket's half-width.
+
+    **Arguments:**
+
+    - `tolerance`: the search ends with a step that promises to lower the cost by less. An error of one standard
+      deviation costs 0.5.
+    - `max_steps`: of the search from one time constant of the disturbance.
+    """
+
+    looks_at: ClassVar[str] = "rates"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = GAUSSIAN_PRIOR
+    in_closed_loop: ClassVar[bool] = True
+
+    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=3e-3)
+    max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=200)
+
+    @property
+    def solver(self) -> LevenbergMarquardt:
+        """Its damping is relative, because the noise levels have no bracket."""
+        return LevenbergMarquardt(
+            step_tolerance=0.0,
+            gain_tolerance=self.tolerance,
+            flat=0.05,
+            max_steps=self.max_steps,
+            is_relative=True,
+            damping=1e-2,
+            least_damping=1e-4,
+        )
+
+    @eqx.filter_jit
+    def __call__(self, problem: ShootingProblem | InnovationsProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight.
+
+        The estimate of a shooting problem has the model's parameters alone, and the cost of a simulation, as that of
+        any other estimator. The estimate of a problem of innovations has all its unknowns and the cost of these.
+
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        """
+        return in_blocks(self._identify, problem.within(bracket))
+
+    def _identify(self, problem: AbstractProblem) -> Estimate:
+        """One flight, or a block of flights."""
+        if not isinstance(problem, ShootingProblem):
+            return solve(self.solver, problem)
+        found, count = solve(self.solver, InnovationsProblem(problem)), problem.unknowns.count
+        parameters = found.parameters[:count]
+        first, cost, feasible, rollouts = fit_start(problem, parameters)
+        return as_estimate(
+            problem,
+            parameters=parameters,
+            covariance=found.covariance[:count, :count],
+            initial_state=first,
+            cost=cost,
+            rollouts=rollouts + found.rollouts,
+            sweeps=found.sweeps,
+            feasible=feasible & jnp.isfinite(found.cost),
+            done=found.result != RESULTS.max_sweeps,
+            prior=self.prior,
+        )

@@ -1,0 +1,184 @@
+"""`AbstractSolver`: an estimator that minimises any likelihood, step by step. `solve` is the loop of all of them."""
+
+import abc
+import functools
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._custom_types import Count, Scalar
+from ..bracket import Bracket
+from ..estimate import AbstractEstimator, Estimate, estimate_at
+from ..shooting import AbstractProblem, LocalModel, Stage, Stages, WindowUnknowns, in_blocks
+
+State = TypeVar("State")
+
+
+class Found(NamedTuple):
+    """What a search has found in a stage, or knows before the first.
+
+    - `unknowns`: the best of each window, and `model`, the local model of the cost there.
+    - `spread`: the covariance of the unknowns of each window.
+    - `steps`, `rollouts`: of this stage alone, see `Estimate`; in `solve`, the sums over all stages.
+    - `done`: whether the stage ended by itself.
+    """
+
+    unknowns: WindowUnknowns
+    model: LocalModel
+    spread: Float[Array, "windows unknowns unknowns"]
+    steps: Count
+    rollouts: Count
+    done: Bool[Array, ""]
+
+    @property
+    def cost(self) -> Scalar:
+        """The cost of all windows; infinite for a trajectory that fails."""
+        return cost_of(self.model)
+
+
+class AbstractSolver(AbstractEstimator, Generic[State]):
+    """An algorithm that minimises a likelihood. It knows nothing of the likelihood but what `AbstractProblem` says.
+
+    - `is_local`: whether the answer depends on the start, so that the search is repeated from all starts of a problem.
+    - `shares`: the stages that it wants, see `AbstractProblem.stages`.
+    - `reach`: it does not go further than this many half-widths from the bracket's center.
+    """
+
+    is_local: ClassVar[bool] = True
+    shares: eqx.AbstractVar[tuple[float, ...]]
+    reach: eqx.AbstractVar[Scalar]
+
+    @abc.abstractmethod
+    def init(self, stage: Stage, before: Found) -> State:
+        """The state with which the search of a stage begins: at `before.unknowns`, of the covariance `before.spread`.
+
+        `before.done`: the search of this lane is skipped.
+        """
+
+    @abc.abstractmethod
+    def step(self, stage: Stage, state: State) -> State:
+        """One iteration."""
+
+    @abc.abstractmethod
+    def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
+        """Whether the stage has ended."""
+
+    @abc.abstractmethod
+    def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
+        """What the stage found, from its last state."""
+
+    @eqx.filter_jit
+    def __call__(
+        self,
+        problem: AbstractProblem,
+        bracket: Bracket | None = None,
+        *,
+        start: Float[Array, " unknowns"] | None = None,
+    ) -> Estimate:
+        """Identifies one flight.
+
+        **Arguments:**
+
+        - `problem`, `bracket`: see `AbstractEstimator`. The parameters may turn out to lie outside of the bracket.
+        - `start`: where the search begins, unless it is NaN; by default the problem's `initial_guess`.
+
+        **Raises:** `ValueError` for a bracket or a start of another length than the unknowns.
+        """
+        return in_blocks(solve, self, problem.within(bracket), start)
+
+
+def solve(
+    solver: AbstractSolver,
+    problem: AbstractProblem,
+    start: Float[Array, " unknowns"] | WindowUnknowns | None = None,
+    spread: Float[Array, "given given"] | None = None,
+    *,
+    is_close: Bool[Array, ""] | bool = False,
+    skip: Bool[Array, ""] | bool = False,
+) -> Estimate:
+    """The estimate that a solver finds, stage by stage.
+
+    The first stage is searched from each start of the problem. Equal starts count once. A later start begins with the
+    parameters that are the best so far. The other stages are searched from the best answer of all starts.
+
+    **Arguments:**
+
+    - `start`: where to start instead, unless it is NaN or the unknown is fixed. Shared unknowns, or those of each
+      window.
+    - `spread`: the covariance of the first unknowns of each window at the start; by default that of the initial guess.
+    - `is_close`: whether the start is so close that no stage is needed that fits a part of the data.
+    - `skip`: whether to return no answer, without a step. Other lanes of the batch do not wait for this one.
+    """
+    stages = problem.stages(solver.shares)
+    # Traced once, although a solver may call it twice.
+    stages = stages._replace(local_model=jax.jit(stages.local_model, inline=True))
+    starts, begin = _starts(problem, start), before_search(problem, stages)._replace(done=jnp.asarray(skip))
+    if spread is not None:
+        given, wide = spread.shape[0], begin.spread
+        # A search that is skipped may have no finite spread.
+        begin = begin._replace(spread=wide.at[:, :given, :given].set(jnp.where(skip, wide[:, :given, :given], spread)))
+    number = stages.first if is_close is False else jnp.where(is_close, stages.whole, stages.first)
+    count = 1
+    if starts.shape[0] > 1 and solver.is_local:
+        count = jnp.where((starts == starts[0]).all(), 1, starts.shape[0])
+
+    def search(place: Count, best: Found) -> Found:
+        """From a start in the first stage, or from the best answer in a later one."""
+        from_start = place < count
+        own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameters) & (place > 0) & jnp.isfinite(best.cost)
+        first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
+        before = chosen(from_start, first, best)._replace(done=begin.done)
+        stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
+        state = jax.lax.while_loop(
+            lambda state: ~solver.terminate(stage, state),
+            functools.partial(solver.step, stage),
+            solver.init(stage, before),
+        )
+        found = solver.postprocess(stage, state, before)
+        is_better = (place == 0) | ~from_start | (found.cost < best.cost)
+        total = {"steps": best.steps + found.steps, "rollouts": best.rollouts + found.rollouts}
+        return chosen(is_better, found, best)._replace(**total)
+
+    # One loop, so that the search is compiled once for all starts and stages.
+    end = jax.lax.fori_loop(0, count + stages.number - 1 - number, search, begin)
+    return estimate_at(problem, end.unknowns, end.model, end.rollouts, end.steps, done=end.done, reach=solver.reach)
+
+
+def before_search(problem: AbstractProblem, stages: Stages) -> Found:
+    """What is known before a search: the first start, how far off it may be, and nothing about the cost."""
+    guess, zero = problem.initial_guess, jnp.zeros((), dtype=int)
+    start, spread = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
+    shapes = jax.eval_shape(stages.local_model, zero, start, start)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return Found(start, nothing, spread, zero, zero, jnp.zeros((), dtype=bool))
+
+
+def _starts(problem: AbstractProblem, start: Array | None) -> Float[Array, "starts windows unknowns"]:
+    """The starts of the problem, with the `start` that is given."""
+    starts, unknowns = problem.initial_guess.starts, problem.unknowns
+    if start is None:
+        return starts
+    if start.ndim == 1:
+        if start.shape != (unknowns.count,):
+            raise ValueError(f"`start` must hold {unknowns.count} unknowns, got shape {start.shape}.")
+        start = jnp.full(starts.shape[1:], jnp.nan).at[:, : unknowns.count].set(start)
+    free = jnp.ones(starts.shape[2], dtype=bool).at[: unknowns.count].set(unknowns.free)
+    return jnp.where(jnp.isnan(start) | ~free, starts, start)
+
+
+def cost_of(model: LocalModel) -> Scalar:
+    """The cost of all windows; infinite for a trajectory that fails."""
+    return jnp.where(model.feasible.all() & jnp.isfinite(model.cost).all(), model.cost.sum(), jnp.inf)
+
+
+def before_shots(model: LocalModel) -> LocalModel:
+    """A local model before the first shot: its cost is NaN, and nothing is feasible. Any shot is better."""
+    return model._replace(cost=jnp.full_like(model.cost, jnp.nan), feasible=jnp.zeros_like(model.feasible))
+
+
+def chosen(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """The tree `new` if the condition holds, else `old`."""
+    return jax.tree.map(functools.partial(jnp.where, condition), new, old)
