@@ -1,7 +1,7 @@
 """Each experiment runs in a small configuration, writes its results, and draws them."""
 
 import functools
-import importlib.util
+import importlib
 import json
 import pathlib
 import subprocess
@@ -11,20 +11,15 @@ import numpy as np
 import pytest
 
 import jaxos4
+from experiments import shared
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
-sys.path.append(str(EXPERIMENTS))
-
-import shared  # noqa: E402
 
 
 def load(name, script="run"):
-    spec = importlib.util.spec_from_file_location(f"experiment_{name}_{script}", EXPERIMENTS / name / f"{script}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(f"experiments.{name}.{script}")
 
 
 @pytest.fixture
@@ -212,9 +207,9 @@ def test_networks(report_of):
 def test_precision(tmp_path):
     """In a process of its own: JAX keeps the constants of a program in the precision of their first use."""
     names, out = ["kalman", "equation-error"], tmp_path / "out.json"
-    command = [sys.executable, str(EXPERIMENTS / "precision/run.py"), "--flights", "64", "--out", str(out)]
+    command = [sys.executable, "-m", "experiments.precision.run", "--flights", "64", "--out", str(out)]
     options = [each for name in names for each in ("--estimators", name)]
-    subprocess.run([*command, *options], check=True, capture_output=True)
+    subprocess.run([*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent)
     report = json.loads(out.read_text())
     rows = {(row["estimator"], row["precision"]): row for row in report["rows"]}
     assert len(rows) == 4

@@ -1,17 +1,13 @@
 """How do the network and the hybrid depend on the width of the bracket and on the random seed of the training?"""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from msgspec.structs import replace
 
+from experiments.shared import run_studies
 from jaxos4.study import load_study
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import run_studies
 
 
 def main(

@@ -5,7 +5,6 @@ and a known initial state. It depends on the model, the input, the duration and 
 """
 
 import itertools
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -16,13 +15,10 @@ import typer
 import xarray as xr
 
 import jaxos4
+from experiments.shared import save_results
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import save_results
 
 jax.config.update("jax_enable_x64", True)
 

@@ -1,4 +1,4 @@
-"""The pictures of the documentation, drawn from real results: `python experiments/pictures/run.py docs/pictures`."""
+"""The pictures of the documentation, drawn from real results: `python -m experiments.pictures.run docs/pictures`."""
 
 import tomllib
 from html import escape
