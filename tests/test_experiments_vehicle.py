@@ -6,6 +6,7 @@ from helpers import how_we_compile
 from test_experiments import load, plot, report_of  # noqa: F401
 
 import jaxos4
+from experiments import monte_carlo
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
@@ -159,12 +160,12 @@ def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
 def test_an_interrupted_report_of_predictions_is_continued(tmp_path):
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     rotorpy, out, settings = load("rotorpy"), tmp_path / "out.json", {"flights": 1, "duration": 1.0, "seed": 2}
-    done = rotorpy.continued(None, settings, "predictions")
+    done = monte_carlo.continued(None, settings, "predictions")
     row = {name: {"error": 1.0, "true": 1.0, "held": 0.95} for name in rotorpy.QUANTITIES}
     done["predictions"].append({"flight": 0, "result": "successful", **row})
-    rotorpy.write_report(out, done)
+    monte_carlo.write_report(out, done)
     rotorpy.main(tmp_path, **settings, predict=True, out=out)
-    assert rotorpy.continued(out, settings, "predictions") == done
+    assert monte_carlo.continued(out, settings, "predictions") == done
     with pytest.raises(SystemExit, match="other settings"):
         rotorpy.main(tmp_path, **(settings | {"seed": 3}), predict=True, out=out)
 

@@ -25,8 +25,6 @@ _PHRASES = {
 }
 # The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
 _MARKS = ("", "†", "‡")
-# The table of coverage by parameter shows this level, or the nearest one in the study.
-_LEVEL = 0.95
 _MOST_LISTED = 20
 
 
@@ -124,8 +122,8 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
 
 
 def shown_level(data: xr.Dataset) -> float:
-    """The level of the intervals in the table of coverage."""
-    return min(data["level"].values.tolist(), key=lambda level: abs(level - _LEVEL))
+    """The level of the intervals in the table of coverage: the study's nearest to 95 %."""
+    return min(data["level"].values.tolist(), key=lambda level: abs(level - 0.95))
 
 
 def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:

@@ -31,8 +31,6 @@ Trained = bytes | str | None
 
 # Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
-# How often a task that raises an unexpected exception is repeated. The cluster itself counts lost workers.
-_RETRIES = 2
 
 
 def device_name() -> str:
@@ -69,11 +67,12 @@ def run_here(store: Store) -> Iterator[tuple[str, int]]:
     yield from _run(store, submit, results)
 
 
-def run_on_cluster(store: Store, client: "Client") -> Iterator[tuple[str, int]]:
+def run_on_cluster(store: Store, client: "Client", *, retries: int = 2) -> Iterator[tuple[str, int]]:
     """Computes the remaining cells on a cluster, in the order in which they finish. Yields as `run_here`.
 
     `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
-    lock of the cluster. Raises `InputError` if the cluster has no workers, or loses a task more often than it allows.
+    lock of the cluster. `retries`: how often a task that raises an unexpected exception is repeated; the cluster itself
+    counts lost workers. Raises `InputError` if the cluster has no workers, or loses a task more often than it allows.
     """
     from distributed import as_completed
 
@@ -91,7 +90,7 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[tuple[str, int]]:
                 raise InputError(f"lost by the cluster ({what}); run the study again to resume.") from None
             yield future, result
 
-    yield from _run(store, functools.partial(client.submit, retries=_RETRIES, pure=False), results)
+    yield from _run(store, functools.partial(client.submit, retries=retries, pure=False), results)
 
 
 def _run(
