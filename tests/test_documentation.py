@@ -22,7 +22,7 @@ import jaxos4
 from experiments.pictures.run import floors_picture
 from jaxos4._registry import Registry
 from jaxos4.airframe import airframe_table
-from jaxos4.cli._app import app
+from jaxos4.cli import app
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import results
 from jaxos4.noise import NOISES
@@ -202,7 +202,7 @@ import json, jax
 jax.config.update("jax_enable_x64", True)
 import jaxos4, lab
 from jaxos4.airframe import airframe_table
-from jaxos4.cli._app import app
+from jaxos4.cli import app
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.models import default_terms
 used = [name for name in ("gauss_newton", "friction", "mylog") if hasattr(lab, name)]

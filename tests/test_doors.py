@@ -16,11 +16,12 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 import small_study
-import test_logs_blackbox as blackbox
+import strange
 import xarray as xr
 from helpers import refused
 from hypothesis import given, settings, strategies as st
-from recorded_logs import ACCIDENTS, blackbox_csv, damaged, table_csv
+from recorded_logs import ACCIDENTS, damaged, table_csv
+from strange import in_one_line, nodes
 from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
 
@@ -47,18 +48,6 @@ PREDICTS["held"] = {f"alpha{i}": held(0.1) for i in (1, 2, 4, 5, 7)}
 OFFSETS = {f"{axis}_{kind}": 0.1 for kind in ("offset", "damping") for axis in ("roll", "pitch", "yaw")}
 RESULT = vehicle_result({f"alpha{i}": value for i, value in ((3, 6e4), (6, 5.9e4), (8, 3.5e4))} | OFFSETS, **PREDICTS)
 NESTED = 250_000 * "["
-
-
-def in_one_line(door, path):
-    """Whether the door took the file. Each error is an `InputError` of one line, which no terminal takes for more."""
-    message = ""
-    try:
-        door(path)
-    except InputError as error:
-        message = str(error)
-    assert message.isprintable()
-    assert len(message) <= 5000
-    return not message
 
 
 # Damage at every door
@@ -90,16 +79,7 @@ DOORS = {
     "study": (load_study, STUDY),
     "study.json": (store, json.dumps(HEADER)),
 }
-STRANGE = [1e308, -1e29, 1e20, -1.0, 0, 1e-300, None, True, "x", "", "a\x07", "\n", "x" * 20_000, "-->", "\u2028"]
-STRANGE += [[], {}, [[1, 2], [3]], {"a": {"b": [1]}}, 10**40, 1e4]
 LITERALS = ["1e308", "1e999", "nan", "inf", "-1", "0", "0x" + 5000 * "f", '"\\u0007"', "[]", "{}", NESTED, "1979-05-27"]
-
-
-def nodes(tree):
-    """Every container of a tree with each of its keys."""
-    for key, each in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():
-        yield tree, key
-        yield from nodes(each)
 
 
 @pytest.mark.parametrize("name", DOORS)
@@ -126,7 +106,7 @@ def test_a_damaged_file_ends_in_one_line(name, tmp_path):
             if places := list(nodes(tree)):
                 holder, key = places[data.draw(st.integers(0, len(places) - 1))]
                 if data.draw(st.booleans()) or isinstance(holder, list):
-                    holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(STRANGE))))
+                    holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(strange.VALUES))))
                 else:
                     del holder[key]
         path.write_text(json.dumps(tree), encoding="utf-8")
@@ -225,14 +205,6 @@ def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, ca
     with pytest.raises(InputError, match="no |more than it holds"):
         read_results(tmp_path)
     assert capfd.readouterr() == ("", "")
-
-
-def test_blank_lines_above_the_header_of_a_blackbox_csv_are_skipped(save):
-    text = blackbox_csv(blackbox.recorded(blackbox.T), settings={"acc_1G": "2048"})
-    plain, spaced = (read_recording(save(each), full_scale=1.0) for each in (text, f"\n\n{text}"))
-    np.testing.assert_array_equal(plain.states, spaced.states)
-    doubled = text.replace("\n", "\n\n")
-    assert not in_one_line(lambda path: read_recording(path, full_scale=1.0), save(doubled))
 
 
 # Texts in exported files and drafts

@@ -11,6 +11,7 @@ from helpers import CRAZYFLIE
 from hypothesis import given, strategies as st
 from jinja2 import UndefinedError
 from matplotlib.figure import Figure
+from pages import stands_alone, words
 from rich.console import Console
 from synthetic_identification import (
     COLOURED,
@@ -22,7 +23,6 @@ from synthetic_identification import (
     synthetic_predictions,
     synthetic_response,
 )
-from test_report import stands_alone, words
 
 from jaxos4.analysis.inertia import CenterOfMass
 from jaxos4.identification.results import Disturbance, HeldParameter, ParameterEstimate, RigidBody, Validation

@@ -312,3 +312,11 @@ BAD = {
 }
 SMALL = blackbox_csv(recorded(T[:30]), settings=SETTINGS).encode()
 SMALL_RAW = bbl(FEW) * 2
+
+
+def test_blank_lines_above_the_header_are_skipped_and_others_are_refused(save):
+    text = blackbox_csv(recorded(T), settings={"acc_1G": "2048"})
+    plain, spaced = (read_recording(save(each), full_scale=1.0) for each in (text, f"\n\n{text}"))
+    np.testing.assert_array_equal(plain.states, spaced.states)
+    with pytest.raises(jaxos4.InputError):
+        read_recording(save(text.replace("\n", "\n\n")), full_scale=1.0)

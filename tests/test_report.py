@@ -1,6 +1,5 @@
 """The report of a study: its files, every number in its tables, the trouble that it names, and what it refuses."""
 
-import html
 import io
 import json
 import math
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import refused
+from pages import stands_alone, words
 from rich.console import Console
 from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
@@ -48,20 +48,6 @@ def tables(text):
                     place = group.findtext("th/span"), "".join(label.itertext()).strip(), heading
                     cells[place] = cell.text.strip(), cell.findtext("small", ""), cell.findtext("span", "")
     return found
-
-
-def words(text):
-    """The words that a page shows."""
-    return " ".join(html.unescape(re.sub(r"<(script|style).*?</\1>|<[^>]+>", " ", text, flags=re.DOTALL)).split())
-
-
-def stands_alone(text):
-    """Asserts that a page fetches nothing, that no id occurs twice, and that no name opens a script of its own."""
-    outside = re.sub(r'<script>.*?</script>|xmlns(:\w+)?="[^"]*"', "", text, flags=re.DOTALL)
-    assert not re.search(r"(src|href|action)=(?!\"#)|https?:|url\((?!#)|<(link|iframe|img|object|embed)", outside)
-    ids = re.findall(r'\sid="([^"]*)"', outside)
-    assert len(ids) == len(set(ids)) > 4
-    assert text.count("<script") == text.count("</script") == 1
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,8 @@ from hypothesis import given, settings, strategies as st
 from matplotlib.figure import Figure
 from rich.console import Console
 from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
-from test_doors import STRANGE, in_one_line, nodes
-from test_report import stands_alone, words
 
 import jaxos4
-from jaxos4.cli._output import write_json
 from jaxos4.errors import InputError
 from jaxos4.identification.results import Constant, Disturbance, RigidBody
 from jaxos4.identification.verdict import Verdict
@@ -34,7 +31,7 @@ FULL = {
 
 
 def written(found, path):
-    write_json(found.to_dict(), path)
+    path.write_text(json.dumps(found.to_dict()))
     return jaxos4.read_result(path)
 
 
@@ -57,7 +54,7 @@ def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
 def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path):
     found = identified_vehicle(**FULL)
     write_flight_page(tmp_path / "fresh.html", found)
-    write_json(found.to_dict(), tmp_path / "found.json")
+    tmp_path / "found.json".write_text(json.dumps(found.to_dict()))
     code, out, err = run("report", "found.json")
     assert (code, err) == (0, "")
     assert out.startswith("found.html: ")
@@ -65,7 +62,7 @@ def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path)
     assert run("report", "found.json", "--out", "other.html")[0] == 0
     assert (tmp_path / "other.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
     refused(run("report", "found.json", "--out", "found.json"), "would overwrite an input")
-    write_json(identified_flight().to_dict(), tmp_path / "os4.json")
+    tmp_path / "os4.json".write_text(json.dumps(identified_flight().to_dict()))
     assert run("report", "os4.json")[0] == 0
     assert "<title>flight.csv</title>" in (tmp_path / "os4.html").read_text(encoding="utf-8")
     (tmp_path / "study").mkdir()
@@ -253,7 +250,7 @@ AGREE = (1.66e-5, 1.69e-5, 1.64e-5)
 @pytest.fixture
 def files(tmp_path):
     for i, ix in enumerate((*AGREE, 1.9e-5)):
-        write_json(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}).to_dict(), tmp_path / f"{i}.json")
+        tmp_path / f"{i}.json".write_text(json.dumps(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}).to_dict()))
     return [f"{i}.json" for i in range(4)]
 
 
@@ -300,7 +297,7 @@ def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):
     refused(run("compare", "0.json"), "two results or more")
     refused(run("compare", "--report", "page.html"), "--report: is for a comparison of results")
     refused(run("compare", *files, "--quick"), "--quick: is for a comparison of estimators")
-    write_json(identified_flight().to_dict(), tmp_path / "os4.json")
+    tmp_path / "os4.json".write_text(json.dumps(identified_flight().to_dict()))
     refused(run("compare", "0.json", "os4.json"), "os4.json: is of the published model")
     heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, jnp.asarray(0.03))
     other = of_inertias(1.66e-5, airframe=heavy)
@@ -321,7 +318,7 @@ def test_a_damaged_result_ends_in_one_line(tmp_path):
         for _ in range(data.draw(st.integers(1, 3))):
             places = list(nodes(tree))
             holder, key = places[data.draw(st.integers(0, len(places) - 1))]
-            holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(STRANGE))))
+            holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(strange.VALUES))))
         path.write_text(json.dumps(tree), encoding="utf-8")
         in_one_line(shown, path)
 
