@@ -54,7 +54,7 @@ def test_every_public_name_is_in_the_api_reference():
 
 def test_the_picture_of_the_floors_is_up_to_date():
     drawn = (ROOT / "docs" / "pictures" / "floors.svg").read_text(encoding="utf-8")
-    # If this fails: python -m experiments.pictures.run docs/pictures --only floors
+    # If this fails: python -m experiments pictures.run docs/pictures --only floors
     assert drawn == floors_picture(ROOT / "pyproject.toml")
 
 

@@ -170,7 +170,7 @@ def test_networks(tmp_path):
 def test_precision(tmp_path):
     """In a process of its own: JAX keeps the constants of a program in the precision of their first use."""
     names, out = ["kalman", "equation-error"], tmp_path / "out.json"
-    command = [sys.executable, "-m", "experiments.precision.run", "--flights", "64", "--out", str(out)]
+    command = [sys.executable, "-m", "experiments", "precision.run", "--flights", "64", "--out", str(out)]
     options = [each for name in names for each in ("--estimators", name)]
     subprocess.run([*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent)
     report = json.loads(out.read_text())

@@ -6,7 +6,6 @@ from helpers import how_we_compile
 from small_experiments import load, plot, result_of
 
 import jaxos4
-from experiments import monte_carlo
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
@@ -47,10 +46,6 @@ def test_closed_loop(monkeypatch, tmp_path):
     # A controller that answers gusts makes both biased by tens of percent, and their intervals do not know it.
     for row in (row for case in report["cases"] for row in case["summary"].values()):
         assert (row["bias"] > 0.2, row["covered"]) == (True, 0)
-    # An interrupted study is continued: the flights that are there are not identified again.
-    assert result_of(tmp_path, "closed_loop", **cases) == report
-    with pytest.raises(SystemExit, match="other settings"):
-        result_of(tmp_path, "closed_loop", **{**cases, "seed": 17})
 
 
 def test_effects(tmp_path):
@@ -74,7 +69,6 @@ def test_verdicts(capsys, tmp_path):
     assert clipped["error"] < -0.1
     assert clipped["status"] == "contradicted"
     assert "spoiled flights" in capsys.readouterr().out
-    assert result_of(tmp_path, "verdicts", flights=1, duration=16.0, cases=list(cases)) == report
 
 
 def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
@@ -150,19 +144,6 @@ def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
     moved = clocks.aligned(recording)
     assert np.median(np.abs(moved.states[:-5, 6] - angle(time[:-5]))) < 0.005
     np.testing.assert_array_equal(moved.states[:, 7], states[:, 7])
-
-
-def test_an_interrupted_report_of_predictions_is_continued(tmp_path):
-    pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
-    rotorpy, out, settings = load("rotorpy"), tmp_path / "out.json", {"flights": 1, "duration": 1.0, "seed": 2}
-    done = monte_carlo.continued(None, settings, "predictions")
-    row = {name: {"error": 1.0, "true": 1.0, "held": 0.95} for name in rotorpy.QUANTITIES}
-    done["predictions"].append({"flight": 0, "result": "successful", **row})
-    monte_carlo.write_report(out, done)
-    rotorpy.main(tmp_path, **settings, predict=True, out=out)
-    assert monte_carlo.continued(out, settings, "predictions") == done
-    with pytest.raises(SystemExit, match="other settings"):
-        rotorpy.main(tmp_path, **(settings | {"seed": 3}), predict=True, out=out)
 
 
 # Benchmarks.

@@ -21,8 +21,6 @@ from experiments.shared import PARAMETERS, brackets_around, identify, measure, n
 from jaxos4.estimators import ESTIMATORS as ALL
 from jaxos4.noise import NOISES
 
-jax.config.update("jax_enable_x64", True)
-
 ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {
     name: kind for name, kind in ALL.items() if not kind.needs_network
 }
@@ -101,7 +99,3 @@ def main(
     title = f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights"
     headings = "noise", "scale", "estimator", *PARAMETERS, "bias", "95 %", "rollouts", "ms", "results"
     print_table(title, headings, cells, width=170)
-
-
-if __name__ == "__main__":
-    typer.run(main)

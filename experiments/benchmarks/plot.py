@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -75,7 +74,3 @@ def draw(report: dict[str, Any]) -> Figure:
 
 
 main = plotter(read_json, {"benchmarks": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

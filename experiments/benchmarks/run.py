@@ -8,7 +8,6 @@ alternate, so that each ratio compares laps under the same load of the machine.
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import numpy as np
 import typer
 
@@ -19,8 +18,6 @@ from experiments.benchmarks.race import line_up, race, ratios
 from experiments.benchmarks.tables import print_report
 from experiments.monte_carlo import machine, write_report
 from jaxos4.flight import Inputs
-
-jax.config.update("jax_enable_x64", True)
 
 DT = 0.01
 SAME_COST = 0.01  # an error of a seventh of a standard deviation costs as much
@@ -191,7 +188,3 @@ def main(
     report["skipped"] = list(dict.fromkeys(skipped))
     print_report(report)
     write_report(out, report)
-
-
-if __name__ == "__main__":
-    typer.run(main)

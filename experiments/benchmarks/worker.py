@@ -28,7 +28,7 @@ def peak_mib() -> float:
     return int(line.split()[1]) / 1024
 
 
-def main(contender: str, path: str, flights: str, options: str = "{}") -> None:
+def serve(contender: str, path: str, flights: str, options: str = "{}") -> None:
     """Answer lines of standard input with the time of a run. The arguments are those of the command line."""
     # Libraries print: only our answers go to the real standard output.
     answers = os.fdopen(os.dup(1), "w")
@@ -54,4 +54,4 @@ def main(contender: str, path: str, flights: str, options: str = "{}") -> None:
 
 if __name__ == "__main__":
     with contextlib.suppress(BrokenPipeError):
-        main(*sys.argv[1:])
+        serve(*sys.argv[1:])

@@ -1,7 +1,6 @@
 """Plots RMSE / bound, hit rate and rollouts against the width of the bracket, with one line for each seed."""
 
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -48,7 +47,3 @@ def draw(studies: dict[str, xr.Dataset]) -> Figure:
 
 
 main = plotter(read_each, {"bracket_and_seeds": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -18,7 +18,3 @@ def main(
     """Run the study once for each training seed, on the same flights, in a folder for each seed."""
     study = load_study(specification)
     run_studies({f"seed {s}": replace(study, network=replace(study.network, seed=s)) for s in seeds}, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -23,8 +23,6 @@ from experiments.closed_loop.run import CHUNK, DELAY, DT, LAG, LARGEST, VEHICLE,
 from experiments.fits import fit, given_airframe, print_summaries, summary
 from experiments.monte_carlo import Row, monte_carlo
 
-jax.config.update("jax_enable_x64", True)
-
 GUST = 5.0  # [rad/s^2]
 
 
@@ -140,7 +138,3 @@ def main(
 
     report = monte_carlo(out, settings, cases, lambda kind, **_: flown(kind), row_of, summary)
     print_summaries(f"effects of real flights, {duration:g} s in closed loop", report)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,6 +1,5 @@
 """Bias and interval coverage of the moments of inertia against the strength of gusts, a line for each estimator."""
 
-import typer
 from matplotlib.figure import Figure
 
 from experiments.shared import plotter, read_json
@@ -37,7 +36,3 @@ def draw(report: dict) -> Figure:
 
 
 main = plotter(read_json, {"closed_loop": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,7 +1,6 @@
 """Errors and intervals of each quantity for each effect of real flights, an estimator each figure's colour."""
 
 import numpy as np
-import typer
 from matplotlib.figure import Figure
 
 from experiments.fits import INERTIAS, THRUST
@@ -39,7 +38,3 @@ def draw(report: dict) -> Figure:
 
 
 main = plotter(read_json, {"closed_loop_effects": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -32,8 +32,6 @@ from experiments.monte_carlo import Row, covered_error, monte_carlo, print_table
 from jaxos4.design import standard_references
 from jaxos4.results import NINETY_FIVE
 
-jax.config.update("jax_enable_x64", True)
-
 THRUST, FULL = 0.15, 2500.0  # of one rotor at full speed [N], and that speed [rad/s]
 VEHICLE = jaxos4.Airframe(
     mass=0.027,
@@ -240,7 +238,3 @@ def main(
     figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
     title = f"moments of inertia from flights of {duration:g} s in closed loop"
     print_table(title, ("gust", "references", "estimator", "", *figures), table_rows(report))
-
-
-if __name__ == "__main__":
-    typer.run(main)

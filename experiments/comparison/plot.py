@@ -1,7 +1,6 @@
 """The comparison as a coloured table: rows are estimators, columns are parameters, panels are noise scales."""
 
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm
@@ -46,7 +45,3 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 main = plotter(read_by_noise, {"comparison": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

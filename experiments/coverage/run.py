@@ -21,8 +21,6 @@ from experiments.shared import PARAMETERS, brackets_around, identify, measure, n
 from jaxos4.models import MODELS
 from jaxos4.results import NINETY_FIVE
 
-jax.config.update("jax_enable_x64", True)
-
 ESTIMATORS = {"ibss": jaxos4.IBSS, "hybrid": jaxos4.Hybrid, "output-error": jaxos4.OutputError}
 CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
 # Flights in one call, limited by the memory for the derivatives of the residuals.
@@ -106,7 +104,3 @@ def main(
     headings = "scale", "estimator", *PARAMETERS, *CONSTANTS, "p < 5 %", "s", "results"
     print_table(title, headings, cells, width=170)
     print(f"Monte-Carlo error of each number: {100 * error:.2f} %.")
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -21,8 +21,6 @@ from jaxos4.design import Design
 from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
 from jaxos4.models import MODELS
 
-jax.config.update("jax_enable_x64", True)
-
 DT = 0.01
 # Widths of the bracket, in multiples of the default: that of all vehicles, and almost none.
 WIDTHS = {"default": 1.0, "airframe": 1e-3}
@@ -108,7 +106,3 @@ def main(
     )
     headings = "model", "channels", "vehicles", "/ multisine", "/ doublet", "largest use", "RMSE / bound", "results"
     print_table(f"geometric mean of the bounds, of {duration:g} s", headings, cells, width=140)
-
-
-if __name__ == "__main__":
-    typer.run(main)

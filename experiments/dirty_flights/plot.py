@@ -1,7 +1,6 @@
 """A row a parameter: the share of 95 % intervals that hold the truth, with two Monte-Carlo errors, of each airframe."""
 
 import numpy as np
-import typer
 from matplotlib.figure import Figure
 
 from experiments.shared import plotter, read_json
@@ -33,7 +32,3 @@ def draw(report: dict) -> Figure:
 
 
 main = plotter(read_json, {"dirty_flights": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

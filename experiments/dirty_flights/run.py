@@ -27,8 +27,6 @@ from jaxos4.logs.sampling import averages
 from jaxos4.models.vehicle import DEFAULT_TERMS
 from jaxos4.results import NINETY_FIVE
 
-jax.config.update("jax_enable_x64", True)
-
 # As large as a Crazyflie 2.
 CRAZYFLIE = jaxos4.Airframe(
     mass=0.032,
@@ -220,7 +218,3 @@ def main(
         title = f"95 % intervals of {flights} flights of {duration:g} s, {name}, {seconds:.1f} s a fit"
         headings = "parameter", "identified", "covered [%]", "+-", "bias [std]", "spread [std]", "mean error", "/ CRB"
         print_table(title, headings, table_rows(case["summary"]), width=120)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -19,8 +19,6 @@ from experiments.monte_carlo import Row, continued, count_results, in_words, pri
 from experiments.shared import PARAMETERS
 from jaxos4.results import NINETY_FIVE
 
-jax.config.update("jax_enable_x64", True)
-
 
 class Case(NamedTuple):
     """The model and the data of a case. Several windows have free starts."""
@@ -112,7 +110,3 @@ def main(
     )
     title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
     print_table(title, ("case", *PARAMETERS, "covered", "results", "rollouts", "s"), cells)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -5,7 +5,6 @@ a parameter to its left cannot be distinguished from 0 with them.
 """
 
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -59,7 +58,3 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 main = plotter(load_results, {"frontier": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -4,7 +4,6 @@ One column for each method of the fit, one line for each method of the simulatio
 """
 
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -50,7 +49,3 @@ def draw(studies: dict[str, xr.Dataset]) -> Figure:
 
 
 main = plotter(read_each, {"inverse_crime": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

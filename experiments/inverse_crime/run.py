@@ -28,7 +28,3 @@ def main(
         for method in fit_methods
     }
     run_studies(variants, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

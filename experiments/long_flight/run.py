@@ -21,8 +21,6 @@ import jaxos4
 from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
 from experiments.shared import PARAMETERS
 
-jax.config.update("jax_enable_x64", True)
-
 SHOOTING = {"ibss": jaxos4.IBSS, "output-error": jaxos4.OutputError}
 # The parameters that are compared: those that are identifiable and not 0.
 COMPARED = (0, 2, 3, 5, 7)
@@ -114,7 +112,3 @@ def main(
     )
     headings = "drift", "windows", "estimator", *(PARAMETERS[i] for i in COMPARED), "rollouts", "s", "results"
     print_table(f"RMS error [%] on {flights} flights of {duration:g} s, rates", headings, cells)
-
-
-if __name__ == "__main__":
-    typer.run(main)

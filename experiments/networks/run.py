@@ -22,8 +22,6 @@ from experiments.monte_carlo import Row, count_results, in_words, print_table, w
 from experiments.shared import PARAMETERS, identify, measure
 from jaxos4.study import metrics
 
-jax.config.update("jax_enable_x64", True)
-
 CHUNK = 250
 LEVELS = (0.5, 0.9, 0.99)
 NOISES = (0.1, 1.0, 10.0)
@@ -206,10 +204,8 @@ def main(
 
     def fit(case: Case, settings: dict) -> tuple[jaxos4.TrainedNetwork, float]:
         begin = time.perf_counter()
-        settings = settings if steps is None else {**settings, "steps": steps}
-        trained = jaxos4.NetworkEstimator(**settings).fit(
-            case.problem(case.flight, 1.0), case.bracket, key=jax.random.key(0)
-        )
+        estimator = jaxos4.NetworkEstimator(**settings | ({} if steps is None else {"steps": steps}))
+        trained = estimator.fit(case.problem(case.flight, 1.0), case.bracket, key=jax.random.key(0))
         return trained, time.perf_counter() - begin
 
     for name in cases:
@@ -241,7 +237,3 @@ def main(
     headings = "case", "estimator", "noise", *PARAMETERS, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"
     title = f"RMSE / Cramer-Rao bound: of the rates for a network alone, of {channels} for the others"
     print_table(title, headings, map(cells, report["rows"]), width=170)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,7 +1,6 @@
 """RMSE / bound of white noise, and coverage of 95 % intervals, for each kind of noise."""
 
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -38,7 +37,3 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 main = plotter(read_results, {"noise_kinds": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,12 +1,6 @@
 """RMS error and bound of each parameter, and RMSE / bound, against the noise scale."""
 
-import typer
-
 from experiments.shared import plotter, read_by_noise
 from jaxos4.report.study_page import efficiency, errors
 
 main = plotter(read_by_noise, {"noise_study-error": errors, "noise_study-efficiency": efficiency})
-
-
-if __name__ == "__main__":
-    typer.run(main)

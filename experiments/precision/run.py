@@ -19,8 +19,6 @@ from jaxos4._custom_types import as_float
 from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.networks import encode_network
 
-jax.config.update("jax_enable_x64", True)
-
 MODEL, DT = jaxos4.PublishedOS4, 0.01
 
 
@@ -117,7 +115,3 @@ def main(
     headings = "estimator", "precision", *PARAMETERS, "covered", "largest difference", "results"
     print_table(title, headings, cells, width=170)
     write_report(out, report)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -7,7 +7,6 @@ is identified with all commands, and with one in 10, 20 and 40, each held until 
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import numpy as np
 import typer
 
@@ -15,8 +14,6 @@ import jaxos4
 from experiments.monte_carlo import interval, print_table, write_report
 from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
-
-jax.config.update("jax_enable_x64", True)
 
 AIRFRAME = jaxos4.load_airframe("crazyflie")
 FLIGHT, STEP = "arpl_crazyflie_rollpitch.csv", 0.01
@@ -47,7 +44,3 @@ def main(
         numbers = (interval(known.get(name), size) for name, size in SHOWN.items())
         rows.append((str(n), *numbers, found["result"], "; ".join(each["cause"] for each in found["doubts"])))
     print_table("95 % intervals", ("one command of", *SHOWN, "result", "doubts"), rows, width=180)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import numpy as np
 import typer
 
@@ -28,8 +27,6 @@ from experiments.public_flights.rate_network import errors_of, trained
 from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
 from jaxos4.results import NINETY_FIVE
-
-jax.config.update("jax_enable_x64", True)
 
 AIRFRAME = jaxos4.load_airframe("crazyflie")
 FITTED = ("B8_star_fast_rep1", "B5_helix_fast_mell_rep1", "B9_trefoil_fast_rep4")
@@ -137,7 +134,3 @@ def main(
         report["alone"]["all together"] = alone([recordings[name] for name in compared], end)
     write_report(out, report)
     print_flights(report)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,7 +1,6 @@
 """Plots what each model can identify, the errors of its fits, and the tests of their residuals."""
 
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -51,7 +50,3 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 main = plotter(load_results, {"published_corrected": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -22,8 +22,6 @@ from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
 
-jax.config.update("jax_enable_x64", True)
-
 
 class Fits(NamedTuple):
     """For each flight: the estimate, the half-width of its 95 % interval, the result, and the diagnostics.
@@ -105,7 +103,3 @@ def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for
         for case in itertools.product(*cases)
     ]
     save_results(xr.combine_by_coords(parts), study, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import typer
 from matplotlib.figure import Figure
 
 from experiments.shared import plotter, read_json
@@ -50,7 +49,3 @@ def draw(report: dict[str, Any]) -> Figure:
 
 
 main = plotter(read_json, {"real_flight": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

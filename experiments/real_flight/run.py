@@ -14,15 +14,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import typer
 
 import jaxos4
 from experiments.monte_carlo import Row, interval, print_table, write_report
 from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
-
-jax.config.update("jax_enable_x64", True)
 
 AIRFRAME = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
 AUTHORS = {"Ix": 1.03e-5, "Iy": 1.11e-5}
@@ -100,7 +97,3 @@ def main(
         report["estimators"][estimator] = {"flights": rows, "z": disagreements(rows)}
         write_report(out, report)
     print_report(report)
-
-
-if __name__ == "__main__":
-    typer.run(main)

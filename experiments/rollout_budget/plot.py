@@ -1,7 +1,6 @@
 """Plots RMSE / bound, averaged over the parameters, against rollouts. One line for each search."""
 
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -40,7 +39,3 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 main = plotter(load_results, {"rollout_budget": draw})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -22,9 +22,6 @@ from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
 
-jax.config.update("jax_enable_x64", True)
-
-
 SEARCHES: dict[str, Callable[[int], jaxos4.AbstractEstimator]] = {
     "IBSS": lambda most: jaxos4.IBSS(max_sweeps=most),
     "output error": lambda most: jaxos4.OutputError(max_steps=most),
@@ -99,7 +96,3 @@ def main(
         {"channels": list(study.channels), "search": list(names), "limit": list(limits)},
     )
     save_results(results, study, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

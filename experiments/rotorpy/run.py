@@ -11,7 +11,6 @@ import itertools
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import numpy as np
 import typer
 
@@ -20,8 +19,6 @@ from experiments.fits import fit, print_summaries, summary
 from experiments.monte_carlo import Row, continued, fill, monte_carlo, print_table
 from experiments.rotorpy.flights import VEHICLE, recorded
 from experiments.rotorpy.predictions import QUANTITIES, prediction
-
-jax.config.update("jax_enable_x64", True)
 
 GUSTS = {"calm": 0.0, "gusty": 1.5}  # [m/s]
 KINDS, ESTIMATORS = tuple(GUSTS), ("filter-error", "ibss", "hybrid")
@@ -74,7 +71,3 @@ def main(
     flown = functools.cache(lambda kind: read(recordings, settings, kind))
     report = monte_carlo(out, settings, cases, lambda kind, **_: flown(kind), row_of, summary)
     print_summaries(f"RotorPy's Hummingbird, flights of {duration:g} s", report)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -21,8 +21,6 @@ import jaxos4
 from experiments.monte_carlo import Row, covered_error, monte_carlo, print_table, results_of
 from jaxos4.results import NINETY_FIVE
 
-jax.config.update("jax_enable_x64", True)
-
 VEHICLE = jaxos4.Airframe(
     mass=0.428,
     inertia=(6.3e-4, 7.5e-4, 8.9e-4),
@@ -128,7 +126,3 @@ def main(
     report = monte_carlo(out, settings, cases, lambda **_: flown, row_of, summary)
     headings = "ms", "", "flights", "mean error", "covered [%]", "results"
     print_table("errors by sample time", headings, table_rows(report), width=120)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,12 +1,6 @@
 """RMSE / bound and coverage against the noise scale; with 10,000 flights their error is below 0.01."""
 
-import typer
-
 from experiments.shared import plotter, read_by_noise
 from jaxos4.report.study_page import coverage, efficiency
 
 main = plotter(read_by_noise, {"scale-efficiency": efficiency, "scale-coverage": coverage})
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -19,8 +19,6 @@ import jaxos4
 from experiments.monte_carlo import Row, machine, print_table, write_report
 from jaxos4.simulation import METHODS
 
-jax.config.update("jax_enable_x64", True)
-
 
 def timed(function: Callable, *arguments, repeats: int) -> tuple[float, float, float, float]:
     """Compile time, and the median, smallest and largest time of a run [s]."""
@@ -64,6 +62,15 @@ def identify(problem: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, keys) -> 
         return jaxos4.IBSS()(eqx.tree_at(lambda p: p.flight, problem, flight), bracket).parameters
 
     return jax.vmap(one)(keys)
+
+
+def in_chunks(problem: jaxos4.ShootingProblem, count: int, chunk: int) -> float:
+    """The time of identifying many flights in chunks [s]. The memory should not depend on their number."""
+    step, begin = eqx.filter_jit(identify), time.perf_counter()
+    for first in range(0, count, chunk):
+        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(2), i))(jnp.arange(first, first + chunk))
+        jax.block_until_ready(step(problem, jaxos4.Bracket.default(problem.model), keys))
+    return time.perf_counter() - begin
 
 
 def main(
@@ -110,15 +117,9 @@ def main(
             measured = timed(identify, problem, jaxos4.Bracket.default(problem.model), keys, repeats=1)
             add(f"IBSS, {looked_at}, {count} flights", measured, count, "flights/s")
 
-    # In chunks: the memory of a study should not depend on its number of flights.
     problem, chunk = standard_problem("rates", steps), min(256, flights[-1])
-    step = eqx.filter_jit(identify)
     for count in (4 * chunk, 16 * chunk):
-        begin = time.perf_counter()
-        for first in range(0, count, chunk):
-            keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(2), i))(jnp.arange(first, first + chunk))
-            jax.block_until_ready(step(problem, jaxos4.Bracket.default(problem.model), keys))
-        seconds = time.perf_counter() - begin
+        seconds = in_chunks(problem, count, chunk)
         add(f"IBSS, rates, {count} flights by {chunk}", (0.0, seconds, seconds, seconds), count, "flights/s")
     cells = []
     for row in rows:
@@ -132,7 +133,3 @@ def main(
     peaks = ", ".join(f"{row['what']}: {row['peak_memory_mib']:.0f} MiB" for row in rows[-2:])
     print(f"peak memory of the process after {peaks}")
     write_report(out, {"provenance": provenance, "rows": rows})
-
-
-if __name__ == "__main__":
-    typer.run(main)

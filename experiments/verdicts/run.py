@@ -240,7 +240,3 @@ def main(
 
     fill(out, report, report["rows"], trials, row_of)
     print_tables(report["rows"])
-
-
-if __name__ == "__main__":
-    typer.run(main)

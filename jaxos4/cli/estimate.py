@@ -79,8 +79,7 @@ def estimate(
             validate=None if validate is None else read_recording(validate, vehicle, columns=columns),
             progress=progress,
         )
-    notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
-    _publish(_with_command(found, airframe or _OS4, notes), out, report, verbose=verbose)
+    _publish(_with_command(found, airframe or _OS4, evidence), out, report, verbose=verbose)
 
 
 def _subject(
@@ -103,10 +102,11 @@ def _subject(
     return vehicle, evidence
 
 
-def _with_command(found: "jaxos4.Identification", airframe: str, notes: list[str]) -> "jaxos4.Identification":
+def _with_command(found: "jaxos4.Identification", airframe: str, evidence: str) -> "jaxos4.Identification":
     """The identification with its command; notes, doubts and verdicts in the words of the command line."""
     import msgspec
 
+    notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
     provenance = msgspec.structs.replace(
         found.provenance,
         airframe=printable(airframe),

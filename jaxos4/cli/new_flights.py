@@ -17,6 +17,10 @@ from ._output import check_outputs, end, option_names, stages
 OpenLoopModelOption = Annotated[options.Model | None, Option(help="Equations of motion. Default: published.")]
 DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
 SampleTimeOption = Annotated[float | None, Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.")]
+AccuracyOption = Annotated[
+    float | None,
+    Option(help="Wanted standard deviation [% of half a bracket]. Default: 1; with --closed-loop: 5 % of inertias."),
+]
 GustOption = Annotated[
     float | None, Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5.")
 ]
@@ -146,12 +150,7 @@ def design(
         options.Criterion,
         Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound."),
     ] = "D",
-    accuracy: Annotated[
-        float | None,
-        Option(
-            help="Wanted standard deviation [% of half a bracket]. Default: 1; with --closed-loop: 5 % of inertias."
-        ),
-    ] = None,
+    accuracy: AccuracyOption = None,
     gust: GustOption = None,
     lag: LagOption = None,
     delay: DelayOption = None,

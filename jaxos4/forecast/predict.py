@@ -66,26 +66,38 @@ def predict(
     arguments; `OSError` if `found` cannot be read.
     """
     _check_options(horizon, spacing, seed)
-    tuning = Tuning()
     vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
     recording = as_recording(flight, airframe=vehicle.model.airframe)
     prepared = _prepare(vehicle, recording, sample_time)
-    measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
+    fitted = found.problem if isinstance(found, Identification) else None
+    trained = None if fitted is None else Measured.of(fitted.flight)
+    return _predicted(vehicle, recording.name, prepared, trained, horizon, spacing, seed)
+
+
+def _predicted(
+    vehicle: Vehicle,
+    name: str,
+    prepared: Prepared,
+    trained: Measured | None,
+    horizon: float,
+    spacing: float,
+    seed: int,
+) -> FlightPrediction:
+    """The prediction of a flight of this name. The regression is fitted to `trained`, or to the flight's first half."""
+    tuning, measured, problem = Tuning(), Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     missing = tuple(part for part in ("position", "velocity") if not measured.has(part))
-    start = _starts(measured, recording.name, steps, max(round(spacing / dt), 1), missing)
+    start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
     begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed, tuning)
-    ahead = start[:, None] + np.arange(1, steps + 1)
+    ahead, trained = start[:, None] + np.arange(1, steps + 1), measured.first_half if trained is None else trained
     gravity = float(vehicle.model.airframe.gravity)
-    fitted = found.problem if isinstance(found, Identification) else None
-    trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
     sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(
         found=vehicle.name,
-        flight=recording.name,
+        flight=name,
         time=prepared.time[start],
         horizons=dt * np.arange(1, steps + 1),
         begin=begin,
