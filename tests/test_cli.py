@@ -53,6 +53,7 @@ def test_estimate_recovers_the_truth_within_its_intervals(run):
     code, out, err, report = estimate(run)
     assert code == 0, err
     assert {"estimator", "model", "result", "rollouts", "cost", "seconds", "parameters", "fit"} <= report.keys()
+    assert pathlib.Path("e.json").read_text().count('"ci95": [-') > 1  # a list of numbers is one line
     assert (report["estimator"], report["model"], report["result"]) == ("ibss", "published", "successful")
     assert list(report["parameters"]) == [f"alpha{i}" for i in range(1, 9)]
     for name, row in report["parameters"].items():
