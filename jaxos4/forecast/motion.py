@@ -59,7 +59,7 @@ class Known(NamedTuple):
 
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: of the filters [rad/s], [rad/s^2; m/s^2].
-    - `unsure`: the standard deviation of each offset, see `Lanes`.
+    - `unsure`: the standard deviation of each offset, see `Futures`.
     """
 
     state: Float[Numeric, "... 13"]
@@ -68,7 +68,7 @@ class Known(NamedTuple):
     unsure: Float[Numeric, "... 6"]
 
 
-class Lanes(NamedTuple):
+class Futures(NamedTuple):
     """Several futures of each start.
 
     - `parameters`: of the model. `forcing`: of these parameters, one row for each sample.
@@ -80,14 +80,14 @@ class Lanes(NamedTuple):
     - `gusts`: what rate and disturbance of each channel gain in each step besides the model.
     """
 
-    parameters: Float[Array, "lanes parameters"]
+    parameters: Float[Array, "futures parameters"]
     forcing: Forcing
-    offset: Float[Array, "lanes samples 6"]
-    filtered: Bool[Array, " lanes"]
-    begin: Float[Array, "lanes 3"]
-    pushed: Float[Array, "lanes channels"]
-    off: Float[Array, "lanes 2 6"]
-    gusts: Float[Array, "lanes steps channels 2"]
+    offset: Float[Array, "futures samples 6"]
+    filtered: Bool[Array, " futures"]
+    begin: Float[Array, "futures 3"]
+    pushed: Float[Array, "futures channels"]
+    off: Float[Array, "futures 2 6"]
+    gusts: Float[Array, "futures steps channels 2"]
 
 
 class _Free(NamedTuple):
@@ -154,17 +154,17 @@ def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _fly(
-    model: FlightModel, lane: Lanes, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
+    model: FlightModel, future: Futures, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
 ) -> Float[Array, "steps 13"]:
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
-    scalars, axes = tuple(lane.parameters), model.force_axes
+    scalars, axes = tuple(future.parameters), model.force_axes
     p, v, q, w = (start.state[places] for places in PARTS.values())
-    steps = lane.gusts.shape[0]
-    rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), lane.forcing)
+    steps = future.gusts.shape[0]
+    rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    w = jnp.where(lane.filtered, start.rates, w) - gyro_bias(model, w, still, scalars) + lane.begin
-    error, absorbed = start.unsure * lane.off
-    offset = lane.offset[first] + error
+    w = jnp.where(future.filtered, start.rates, w) - gyro_bias(model, w, still, scalars) + future.begin
+    error, absorbed = start.unsure * future.off
+    offset = future.offset[first] + error
     begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
 
     def advance(carry: tuple[Motion, Array], forcing: Forcing, added: Array) -> tuple[Motion, Array]:
@@ -177,10 +177,10 @@ def _fly(
         feasible = feasible & finite & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
         return jax.tree.map(lambda new, old: jnp.where(feasible, new, old), moved, motion), feasible
 
-    disturbance = jnp.where(lane.filtered, start.disturbance, 0.0) + lane.pushed
+    disturbance = jnp.where(future.filtered, start.disturbance, 0.0) + future.pushed
     disturbance = disturbance.at[:3].add(absorbed[:3])
     fading = transition(jnp.exp(noise.time_constant), dt)
-    motion, _ = open_loop(advance, (begin, jnp.array(True)), disturbance, rows, lane.gusts, fading)
+    motion, _ = open_loop(advance, (begin, jnp.array(True)), disturbance, rows, future.gusts, fading)
     return jnp.stack(jax.tree.leaves(motion), axis=1)
 
 
@@ -202,13 +202,13 @@ def departures(states: Any, others: Any) -> Any:
 
 @eqx.filter_jit
 def fly_chunk(
-    model: FlightModel, lanes: Lanes, known: Known, first: Int[Array, " starts"], noise: LogNoise, dt: Scalar
+    model: FlightModel, futures: Futures, known: Known, first: Int[Array, " starts"], noise: LogNoise, dt: Scalar
 ) -> tuple[Float[Array, "starts 2 steps 13"], Float[Array, "starts steps 12"]]:
-    """The first two lanes from each sample `first`, and the root mean square `departures` of the others from them."""
+    """The first two futures from each sample `first`, and the root mean square `departures` of the others from them."""
 
     def every(first: Int[Array, ""]) -> tuple[Array, Array]:
         start = jax.tree.map(lambda leaf: leaf[first], known)
-        states = jax.vmap(lambda lane: _fly(model, lane, first, start, noise, dt))(lanes)
+        states = jax.vmap(lambda future: _fly(model, future, first, start, noise, dt))(futures)
         off = departures(jnp.broadcast_to(states[0], states[2:].shape), states[2:])
         return states[:2], jnp.sqrt(jnp.square(off).mean(axis=0))
 
@@ -220,13 +220,13 @@ def known_at_samples(
     model: FlightModel,
     flight: Flight,
     length: Count,
-    parameters: Float[Array, "lanes parameters"],
+    parameters: Float[Array, "futures parameters"],
     measured: tuple[Float[Array, "samples 13"], Float[Array, "samples 6"], Float[Array, "3"]],
     noise: LogNoise,
     prior: Float[Array, "6"],
     tuning: Tuning,
-) -> tuple[Known, Forcing, Float[Array, "lanes samples 6"]]:
-    """The knowledge at each sample, by the first row of `parameters`; and forcing and offsets of each row: see `Lanes`.
+) -> tuple[Known, Forcing, Float[Array, "futures samples 6"]]:
+    """The knowledge at each sample, by the first row of `parameters`; forcing and offsets of each row: see `Futures`.
 
     The velocity is left out of the forcing: it will be that of the prediction.
 
@@ -243,7 +243,7 @@ def known_at_samples(
     sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), velocity_noise])
     weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt, tuning)
 
-    def of_lane(values: Array) -> tuple[Forcing, Array, Array, Array]:
+    def of_future(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
         turning = jnp.stack(model.angular_acceleration(Rates(*middle.T), forcing, scalars), axis=1)
         pushing = jnp.stack(model.specific_force(forcing.thrust, forcing, scalars), axis=1)
@@ -253,7 +253,7 @@ def known_at_samples(
         seen = observe(jnp.nan_to_num(rates), forcing)
         return forcing._replace(velocity=None, recording=()), offset, turning, jnp.stack(seen[3:], axis=1)
 
-    forcing, offset, turning, expected = jax.vmap(of_lane)(parameters)
+    forcing, offset, turning, expected = jax.vmap(of_future)(parameters)
     force = flight.channels[:, len(STATE_NAMES) + np.asarray(model.force_axes, dtype=int)] - expected[0]
     # The bias of an accelerometer is its mean over the memory.
     force = force - _past(jnp.nan_to_num(force), kept) / jnp.maximum(_past(~jnp.isnan(force), kept), 1.0)

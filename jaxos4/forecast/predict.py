@@ -20,7 +20,7 @@ from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .flight_prediction import FlightPrediction
 from .measured import Measured, constant_rates, regressed
-from .motion import PARTS, Lanes, Tuning, fly_chunk, known_at_samples, settled, turned
+from .motion import PARTS, Futures, Tuning, fly_chunk, known_at_samples, settled, turned
 from .vehicle import Vehicle, vehicle_of
 
 # Inputs that no prediction can replace.
@@ -202,10 +202,10 @@ def _fly(
     off = generator.standard_normal((draws, 6))
     drawn = first[:, :3, 0], first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
     surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
-    lanes = Lanes(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
+    futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
     chunks = (np.minimum(np.arange(i, i + chunk), start.size - 1) for i in range(0, start.size, chunk))
-    found = [fly_chunk(vehicle.model, lanes, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]
+    found = [fly_chunk(vehicle.model, futures, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]
     states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[: start.size] for i in range(2))
     return state[start], states, spread
 

@@ -19,7 +19,7 @@ from .._files import write_file, write_netcdf
 from ..errors import InputError, TrainingError
 from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_network
 from ..shooting import cores
-from .cell import blank_problem, fleet_of, key_of, run_cell
+from .cell import blank_problem, key_of, run_cell, setup_of
 from .dataset import RESULTS_FILE, Store, assemble, check_store, open_store
 from .specification import Cell, Scenario, Study
 
@@ -139,10 +139,10 @@ def train(study: Study, job: Scenario) -> bytes | str:
     scales = [scale or 1.0 for scale in study.scales]
     try:
         with jax.enable_x64(True):
-            fleet, key = fleet_of(study, job), key_of(study.network.seed, study.jobs()[job])
+            setup, key = setup_of(study, job), key_of(study.network.seed, study.jobs()[job])
             training: dict[str, Any] = {"steps": study.network.steps, "held_out": study.network.held_out}
             settings = NetworkEstimator(channels=job.channels, noise=(min(scales), max(scales)), **training)
-            return encode_network(settings.fit(blank_problem(study, fleet, 1.0, job.channels), fleet.bracket, key=key))
+            return encode_network(settings.fit(blank_problem(study, setup, 1.0, job.channels), setup.bracket, key=key))
     except FAILURES as error:
         return str(error)
 
