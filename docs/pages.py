@@ -7,7 +7,7 @@ import re
 
 from mkdocs.structure.files import File
 
-from jaxos4.cli._app import app
+from jaxos4.cli import app
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = {

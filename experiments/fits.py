@@ -1,16 +1,13 @@
 """Fits of simulated flights whose true vehicle is known: what a user would give, errors, and intervals."""
 
-import json
 import time
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 
 import equinox as eqx
 import numpy as np
-from rich.console import Console
-from shared import count_results, in_words, table_of
 
 import jaxos4
+from experiments.monte_carlo import Row, print_table, results_of
 from jaxos4.errors import InputError
 from jaxos4.results import NINETY_FIVE
 
@@ -34,16 +31,19 @@ def given_airframe(vehicle: jaxos4.Airframe, i: int) -> jaxos4.Airframe:
     )
 
 
-def fit(estimator: str, flight: jaxos4.Flight, vehicle: jaxos4.Airframe, i: int) -> dict:
+def whole(flight: jaxos4.Flight) -> jaxos4.VehicleSettings:
+    """The settings that fit all samples, so that flights of one length have one program."""
+    return jaxos4.VehicleSettings(begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0)
+
+
+def fit(estimator: str, flight: jaxos4.Flight, vehicle: jaxos4.Airframe, i: int) -> Row:
     """The row of one flight. Errors and standard deviations are shares of the truth."""
     begin, given = time.perf_counter(), given_airframe(vehicle, i)
-    # One length of all flights: one program.
-    whole = jaxos4.VehicleSettings(begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0)
     try:
-        found = jaxos4.identify(flight, given, settings=whole, estimator=estimator)
+        found = jaxos4.identify(flight, given, settings=whole(flight), estimator=estimator)
     except InputError as error:
-        return {"flight": i, "result": "refused", "why": str(error), "seconds": time.perf_counter() - begin}
-    row: dict = {"flight": i, "result": found.result, "seconds": time.perf_counter() - begin}
+        return {"result": "refused", "why": str(error), "seconds": time.perf_counter() - begin}
+    row: Row = {"result": found.result, "seconds": time.perf_counter() - begin}
     row["doubts"] = [str(doubt) for doubt in found.doubts]
     for name, truth in zip(INERTIAS, np.asarray(vehicle.inertia).tolist(), strict=True):
         if name in found.rigid_body.constants:
@@ -56,7 +56,7 @@ def fit(estimator: str, flight: jaxos4.Flight, vehicle: jaxos4.Airframe, i: int)
     return row
 
 
-def summary(rows: list[dict]) -> dict[str, dict]:
+def summary(rows: list[Row]) -> dict[str, Row]:
     """For each quantity, as shares: figures over the flights with an estimate, and over those that say successful.
 
     - `successful`: share of all flights. `covered`: of 95 % intervals that hold the truth. `covered_successful`: of
@@ -81,58 +81,21 @@ def summary(rows: list[dict]) -> dict[str, dict]:
     return found
 
 
-def run_cases(
-    out: Path | None,
-    settings: dict,
-    cases: Iterable[tuple[str, str]],
-    vehicle: jaxos4.Airframe,
-    flights_of: Callable[[str], Sequence[jaxos4.Flight | None]],
-) -> dict:
-    """The report of all cases, each a kind of flights and an estimator; continued if `out` exists.
-
-    `flights_of`: the flights of a kind; `None`: one that was lost.
-    """
-    report = continued(out, settings, "cases")
-    for kind, estimator in cases:
-        if any((case["kind"], case["estimator"]) == (kind, estimator) for case in report["cases"]):
-            continue
-        flown = [(i, flight) for i, flight in enumerate(flights_of(kind)) if flight is not None]
-        rows = [fit(estimator, flight, vehicle, i) for i, flight in flown]
-        report["cases"].append({"kind": kind, "estimator": estimator, "flights": rows, "summary": summary(rows)})
-        write_report(out, report)
-    return report
-
-
-def continued(out: Path | None, settings: dict, rows: str) -> dict:
-    """A report with these settings and a list of `rows`: that of the file `out` if it exists, or a new one."""
-    settings = settings | {"version": jaxos4.__version__, "precision": "float64"}
-    if out is None or not out.exists():
-        return {**settings, rows: []}
-    report = json.loads(out.read_text())
-    if rows not in report or {name: report.get(name) for name in settings} != settings:
-        raise SystemExit(f"{out}: has other settings; give --out another name.")
-    return report
-
-
-def write_report(out: Path | None, report: dict) -> None:
-    """Write what there is of a report, if it has a file."""
-    if out is not None:
-        out.write_text(json.dumps(report, indent=1) + "\n")
-
-
-def print_table(title: str, report: dict) -> None:
+def print_summaries(title: str, report: Row) -> None:
     """One line for each case and quantity."""
+
+    def rows() -> Iterator[tuple[str, ...]]:
+        for case in report["cases"]:
+            about, results = (case["kind"], case["estimator"]), results_of(case)
+            for name, row in case["summary"].items():
+                trusted = row["covered_successful"]
+                yield (
+                    *(*about, name, str(row["flights"]), f"{100 * row['covered']:.0f}"),
+                    "" if trusted is None else f"{100 * trusted:.0f}",
+                    *(f"{100 * row['mean']:.2g}", f"{100 * row['width']:.2g}", results),
+                )
+            if not case["summary"]:
+                yield *about, *[""] * 6, results
+
     figures = "flights", "covered [%]", "covered if successful [%]", "mean error [%]", "half-width [%]", "results"
-    table = table_of(title, ("flights are", "estimator", "", *figures))
-    for case in report["cases"]:
-        results = in_words(count_results(np.array([row["result"] for row in case["flights"]])))
-        for name, row in case["summary"].items():
-            trusted = row["covered_successful"]
-            table.add_row(
-                *(case["kind"], case["estimator"], name, str(row["flights"]), f"{100 * row['covered']:.0f}"),
-                "" if trusted is None else f"{100 * trusted:.0f}",
-                *(f"{100 * row['mean']:.2g}", f"{100 * row['width']:.2g}", results),
-            )
-        if not case["summary"]:
-            table.add_row(case["kind"], case["estimator"], *[""] * 6, results)
-    Console(width=150).print(table)
+    print_table(title, ("flights are", "estimator", "", *figures), rows())

@@ -1,9 +1,12 @@
 """Functions that the experiments share: batched identification, tables, Datasets and figure files."""
 
+import functools
 import io
+import json
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +16,6 @@ import xarray as xr
 from jaxtyping import Array, Float, Key as Keys
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from jaxos4._custom_types import Key, States
 from jaxos4._files import write_atomically, write_netcdf
@@ -25,7 +27,7 @@ from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import AbstractNoise
 from jaxos4.report.style import Style, drawing, svg
 from jaxos4.shooting import ShootingProblem
-from jaxos4.study import Study, device_name
+from jaxos4.study import Study, device_name, metrics, read_results
 from jaxos4.study.dataset import RESULTS_FILE, provenance
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
@@ -60,14 +62,6 @@ def load_results(directory: Path) -> xr.Dataset:
     return xr.load_dataset(directory / RESULTS_FILE, engine="h5netcdf")
 
 
-def table_of(title: str, headings: Iterable[str]) -> Table:
-    """An empty table for the terminal. Only the column `results` wraps its lines."""
-    table = Table(title=title)
-    for heading in headings:
-        table.add_column(heading, no_wrap=heading != "results")
-    return table
-
-
 @eqx.filter_jit
 def measure(noise: AbstractNoise, exact: Flight, keys: Keys[Array, " flights"]) -> Float[Array, "flights samples 12"]:
     """The states of a flight as noisy sensors measure them, once for each key."""
@@ -89,6 +83,11 @@ def identify(
     return jax.vmap(one)(brackets, states)
 
 
+def noise_and_bracket_keys(seed: int, flights: int) -> Keys[Array, "2 flights"]:
+    """For each flight a key of its noise and one of its bracket."""
+    return jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+
+
 def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: float = 0.8) -> Bracket:
     """For each key, a bracket of the default width. Its centre lies within `share` half-widths of the truth."""
 
@@ -97,17 +96,6 @@ def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: 
         return Bracket.around(model.alpha + offset * model.half_width, model.half_width)
 
     return jax.vmap(one)(keys)
-
-
-def count_results(names: np.ndarray) -> dict[str, int]:
-    """The number of estimates by result, from their `result_names`."""
-    found, counts = np.unique(names, return_counts=True)
-    return dict(zip(found.tolist(), counts.tolist(), strict=True))
-
-
-def in_words(counts: dict[str, int]) -> str:
-    """The counts of `count_results` as the text of a table cell."""
-    return ", ".join(f"{count} {what}" for what, count in counts.items())
 
 
 def pdf(figure: Figure) -> bytes:
@@ -128,6 +116,33 @@ def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) 
         for suffix, render in ((".svg", svg), (".pdf", pdf)):
             with write_atomically(directory / f"{name}{suffix}") as beside:
                 beside.write_bytes(render(figure))
+
+
+def plotter(read: Callable[[Path], Any], drawn: dict[str, Callable[[Any], Figure | None]]) -> Callable[..., None]:
+    """The command that reads the results of an experiment and draws figures, by the names of their files."""
+
+    def main(results: Path, figures: Path) -> None:
+        """Draws the results of the experiment."""
+        found = read(results)
+        for name, draw in drawn.items():
+            write_figure(functools.partial(draw, found), figures, name)
+
+    return main
+
+
+def read_by_noise(directory: Path) -> xr.Dataset:
+    """The Dataset of a study, by noise scale and estimator alone."""
+    return read_results(directory).squeeze([d for d in metrics.SCENARIO if d not in ("scale", "estimator")])
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads what an experiment wrote as JSON."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def read_each(directory: Path) -> dict[str, xr.Dataset]:
+    """The Datasets of the studies in a folder, by the names of their folders."""
+    return {path.parent.name: read_results(path.parent) for path in sorted(directory.glob("*/results.nc"))}
 
 
 def draw_spread(panel: Axes, x: np.ndarray, values: xr.DataArray, look: Style, label: str) -> None:

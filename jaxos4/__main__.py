@@ -1,5 +1,5 @@
 """`python -m jaxos4`: the command line."""
 
-from .cli import console
+from .cli import main
 
-console()
+main()

@@ -13,9 +13,6 @@ from .identification.results import Identification
 from .result_file import read_result
 from .results import NINETY_FIVE
 
-_SAME = 1e-3  # constants of airframes that differ by less are equal
-
-
 Source = Identification | str | os.PathLike[str]
 
 
@@ -128,11 +125,12 @@ def _names(results: Sequence[Source], every: Sequence[Identification]) -> tuple[
     return tuple(printable(name) or ", ".join(each.logs) for name, each in zip(chosen, every, strict=True))
 
 
-def _notes(names: Sequence[str], every: Sequence[Identification]) -> list[str]:
+def _notes(names: Sequence[str], every: Sequence[Identification], *, same: float = 1e-3) -> list[str]:
+    """What makes the results hard to compare. `same`: constants of airframes that differ by less are equal."""
     notes, first = [], every[0].airframe
     for constant, why in (("mass", "are proportional to it"), ("rotor_positions", "depend on them")):
         values = [np.asarray(getattr(each.airframe, constant), dtype=float) for each in every]
-        far = [x for x in values if not np.allclose(x, np.asarray(getattr(first, constant)), rtol=_SAME, atol=0)]
+        far = [x for x in values if not np.allclose(x, np.asarray(getattr(first, constant)), rtol=same, atol=0)]
         if far:
             notes.append(
                 f"the airframes differ in `{constant}`: moments of inertia {why}; estimate again with one airframe"

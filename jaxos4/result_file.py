@@ -20,8 +20,6 @@ _NAME = re.compile(r"[\w.() -]{1,80}")
 _REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
 _EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
-_ROUNDING = 1e-6  # of a correlation
-_MOST_SAMPLES = 1 << 40  # of a flight
 
 _FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
 # The fields of a file: those of an `Identification`, with what has another form there.
@@ -107,7 +105,7 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
         if (np.diag(covariance) < 0).any():
             yield "`covariance`: a variance is negative"
         std = np.sqrt(np.diag(covariance))
-        if (np.abs(covariance) > (1 + _ROUNDING) * np.outer(std, std)).any():
+        if (np.abs(covariance) > (1 + 1e-6) * np.outer(std, std)).any():  # beyond rounding
             yield "`covariance`: a correlation exceeds 1"
     if not all(each > 0 for each in (found.provenance.sample_time, *(x.sample_time for x in found.sample_times))):
         yield "`sample_time`: is not positive"
@@ -146,7 +144,7 @@ def _predictions(table: dict[str, Any] | None) -> Predictions | None:
         return None
     arrays = _arrays(Predictions, table, "predictions")
     start, horizons = arrays["start"], arrays["horizons"]
-    usable = start.size and (start >= 0).all() and (start < _MOST_SAMPLES).all() and (np.diff(start) >= 1).all()
+    usable = start.size and (start >= 0).all() and (start < 1 << 40).all() and (np.diff(start) >= 1).all()
     if not (usable and horizons.size and (horizons > 0).all() and (start % 1 == 0).all()):
         raise InputError(f"`predictions`: starts must increase, and horizons be positive; {_AGAIN}")
     return Predictions(**arrays | {"start": start.astype(int)})

@@ -112,12 +112,12 @@ def test_the_cells_of_a_study(foreign, tmp_path):
     (tmp_path / "study.toml").write_text(SPECIFICATION)
     study = load_study(tmp_path / "study.toml")
     each = [study.cell(i) for i in range(study.count)]
-    fleet = cells.fleet_of(study, each[0].scenario)
-    blank = cells.blank_problem(study, fleet, 1.0, "rates")
+    setup = cells.setup_of(study, each[0].scenario)
+    blank = cells.blank_problem(study, setup, 1.0, "rates")
     for cell in each:
         if cell.scenario.estimator == "network":
-            assert not foreign(lambda fleet, cell=cell: cells.fly(study, fleet, cell), fleet), cell
+            assert not foreign(lambda setup, cell=cell: cells.fly(study, setup, cell), setup), cell
         if cell.scenario.noise == "white":
             identify = lambda *args, cell=cell: cells._answers(study, cell, *args)  # noqa: E731
-            assert not foreign(identify, fleet, blank, STATES, trained()), cell
+            assert not foreign(identify, setup, blank, STATES, trained()), cell
     assert not foreign(cells.cramer_rao_std, (np.ones((LANES, 8)), STATES), blank)

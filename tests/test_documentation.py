@@ -1,6 +1,5 @@
 """The documentation agrees with the code, and the type checker of the tests sees every call."""
 
-import importlib.util
 import json
 import pathlib
 import re
@@ -19,9 +18,10 @@ from typechecker import check
 from typer.main import get_command
 
 import jaxos4
+from experiments.pictures.run import floors_picture
 from jaxos4._registry import Registry
 from jaxos4.airframe import airframe_table
-from jaxos4.cli._app import app
+from jaxos4.cli import app
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import results
 from jaxos4.noise import NOISES
@@ -52,13 +52,9 @@ def test_every_public_name_is_in_the_api_reference():
 
 
 def test_the_picture_of_the_floors_is_up_to_date():
-    script = ROOT / "experiments" / "pictures" / "run.py"
-    spec = importlib.util.spec_from_file_location("experiment_pictures_run", script)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     drawn = (ROOT / "docs" / "pictures" / "floors.svg").read_text(encoding="utf-8")
-    # If this fails: python experiments/pictures/run.py docs/pictures --only floors
-    assert drawn == module.floors_picture(ROOT / "pyproject.toml")
+    # If this fails: python -m experiments pictures.run docs/pictures --only floors
+    assert drawn == floors_picture(ROOT / "pyproject.toml")
 
 
 def test_the_links_of_the_readme_lead_somewhere_and_are_absolute_in_a_release(tmp_path):
@@ -205,7 +201,7 @@ import json, jax
 jax.config.update("jax_enable_x64", True)
 import jaxos4, lab
 from jaxos4.airframe import airframe_table
-from jaxos4.cli._app import app
+from jaxos4.cli import app
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.models import default_terms
 used = [name for name in ("gauss_newton", "friction", "mylog") if hasattr(lab, name)]

@@ -285,13 +285,6 @@ def test_a_name_that_is_not_utf8_is_estimated_and_shown(run, tmp_path):
     assert (code, "l\\udcffg.csv: flight CSV" in out) == (0, True)
 
 
-def test_python_runs_the_package():
-    line = [sys.executable, "-m", "jaxos4", "--version"]
-    done = subprocess.run(line, env=small_study.environment(), capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("jaxos4 ")
-
-
 # Logs
 
 

@@ -1,7 +1,5 @@
 """Each experiment runs in a small configuration, writes its results, and draws them."""
 
-import functools
-import importlib.util
 import json
 import pathlib
 import subprocess
@@ -9,53 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+from small_experiments import load, plot, result_of
 
-import jaxos4
+from experiments import shared
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
-sys.path.append(str(EXPERIMENTS))
-
-import shared  # noqa: E402
-
-
-def load(name, script="run"):
-    spec = importlib.util.spec_from_file_location(f"experiment_{name}_{script}", EXPERIMENTS / name / f"{script}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def report_of(tmp_path, monkeypatch):
-    """Runs an experiment with these options and small networks, and returns the JSON that it writes."""
-    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, tilings=4, cells=8, batch=64, held_out=4000)
-    small.steps = jaxos4.NetworkEstimator.steps
-    monkeypatch.setattr(jaxos4, "NetworkEstimator", small)
-
-    def report(name, script="run", **options):
-        load(name, script).main(**options, out=tmp_path / "out.json")
-        return json.loads((tmp_path / "out.json").read_text())
-
-    return report
-
-
-@pytest.fixture
-def plot(tmp_path, monkeypatch):
-    """Draws the results in `tmp_path / "out"`, or in its JSON. Only the comparison is drawn as PDF too."""
-
-    def drawn(name, script="plot", results="out.json", *, suffixes=(".svg",)):
-        with monkeypatch.context() as patch:
-            if ".pdf" not in suffixes:
-                patch.setattr(shared, "pdf", lambda figure: b"")
-            load(name, script).main(tmp_path / results, tmp_path / f"{name} {script}")
-        for suffix in suffixes:
-            figures = list((tmp_path / f"{name} {script}").glob(f"*{suffix}"))
-            assert figures
-            assert all(path.name.startswith(name) and path.stat().st_size > 5000 for path in figures)
-
-    return drawn
 
 
 # Studies: experiments with a specification.
@@ -75,12 +33,12 @@ def near(found, expected, errors):
 
 
 @pytest.fixture
-def run(tmp_path, plot):
+def run(tmp_path):
     """Runs and plots the small configuration of an experiment with a script."""
 
     def results(name, **options):
         load(name).main(small(name), tmp_path / "out", **options)
-        plot(name, results="out")
+        plot(tmp_path, name, results="out")
         return tmp_path / "out"
 
     return results
@@ -94,11 +52,11 @@ def test_configurations(name):
     assert (EXPERIMENTS / name / "run.py").exists() == (name not in STUDIES)
 
 
-def test_comparison_noise_study_and_scale(tmp_path, plot):
+def test_comparison_noise_study_and_scale(tmp_path):
     """One study of IBSS and equation error against the noise, and the figures of three experiments."""
     shared.run_studies({"out": load_study(small("comparison"))}, tmp_path)
     for name in ("noise_study", "scale", "comparison"):
-        plot(name, results="out", suffixes=(".svg", ".pdf") if name == "comparison" else (".svg",))
+        plot(tmp_path, name, results="out", suffixes=(".svg", ".pdf") if name == "comparison" else (".svg",))
     data = read_results(tmp_path / "out").squeeze()
     accuracy, error = metrics.accuracy(data), metrics.estimator_error(data)["absolute"].sel(estimator="ibss")
     # On the rates of one second both are at the bound, within chance: 8 parameters of 32 flights.
@@ -109,9 +67,9 @@ def test_comparison_noise_study_and_scale(tmp_path, plot):
     assert (accuracy.sel(scale=10.0, estimator="ibss") < accuracy.sel(scale=10.0, estimator="equation-error")).all()
 
 
-def test_noise_kinds(tmp_path, plot):
+def test_noise_kinds(tmp_path):
     shared.run_studies({"out": load_study(small("noise_kinds"))}, tmp_path)
-    plot("noise_kinds", results="out")
+    plot(tmp_path, "noise_kinds", results="out")
     covered = metrics.mean_coverage(read_results(tmp_path / "out").squeeze()).sel(level=0.95)
     low, high = covered["low"].sel(noise="white"), covered["high"]
     # Without 10 % of the samples the errors are about 5 % larger, and the intervals too.
@@ -179,9 +137,9 @@ def test_bracket_and_seeds(run):
 # Experiments that are scripts.
 
 
-def test_efficiency(report_of):
+def test_efficiency(tmp_path):
     case = "published, rates"
-    row = report_of("efficiency", flights=48, seed=0, scale=1.0, cases=[case])["cases"][case]
+    row = result_of(tmp_path, "efficiency", flights=48, seed=0, scale=1.0, cases=[case])["cases"][case]
     assert row["results"] == {"successful": 48}
     # Within four Monte-Carlo standard errors of the bound, on each of the eight parameters.
     assert near(row["efficiency"], 1, 4 * row["monte_carlo_error"])
@@ -189,17 +147,17 @@ def test_efficiency(report_of):
     assert near(row["covered"], 0.95, 4 * np.sqrt(0.95 * 0.05 / 48))
 
 
-def test_speed(report_of):
+def test_speed(tmp_path):
     sizes = {"batch": 64, "steps": 40, "flights": [2], "repeats": 2}
-    report = report_of("speed", **sizes, channels=["rates"], methods=["euler"])
+    report = result_of(tmp_path, "speed", **sizes, channels=["rates"], methods=["euler"])
     assert report["provenance"]["precision"] == "float64"
     assert all(row["rate"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
 
 
-def test_networks(report_of):
+def test_networks(tmp_path):
     trained = {"networks": ["score, mlp", "score, cmac"], "channels": "rates", "separate": False}
     cases = {"cases": ["standard"], "noises": [1.0], **trained}
-    report = report_of("networks", flights=128, seed=7, steps=100, many=128, **cases)
+    report = result_of(tmp_path, "networks", flights=128, seed=7, steps=100, many=128, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
     assert report["one_call"]["flights"] == 128
     hybrids = [f"hybrid from {label}" for label in trained["networks"]]
@@ -212,9 +170,9 @@ def test_networks(report_of):
 def test_precision(tmp_path):
     """In a process of its own: JAX keeps the constants of a program in the precision of their first use."""
     names, out = ["kalman", "equation-error"], tmp_path / "out.json"
-    command = [sys.executable, str(EXPERIMENTS / "precision/run.py"), "--flights", "64", "--out", str(out)]
+    command = [sys.executable, "-m", "experiments", "precision.run", "--flights", "64", "--out", str(out)]
     options = [each for name in names for each in ("--estimators", name)]
-    subprocess.run([*command, *options], check=True, capture_output=True)
+    subprocess.run([*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent)
     report = json.loads(out.read_text())
     rows = {(row["estimator"], row["precision"]): row for row in report["rows"]}
     assert len(rows) == 4
@@ -226,9 +184,9 @@ def test_precision(tmp_path):
     assert near(rows["kalman", "float32"]["efficiency"], 1, 5 * np.sqrt(1 / 128))
 
 
-def test_baselines(report_of):
+def test_baselines(tmp_path):
     cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
-    rows = report_of("baselines", flights=48, seed=5, channels="rates", **cases)["rows"]
+    rows = result_of(tmp_path, "baselines", flights=48, seed=5, channels="rates", **cases)["rows"]
     exact, noisy = rows[:2], rows[2:]
     assert all(row["answers"] == 48 for row in rows)
     assert all(max(row["efficiency"]) < 1e-6 for row in exact)
@@ -237,9 +195,9 @@ def test_baselines(report_of):
     assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]
 
 
-def test_coverage(report_of):
+def test_coverage(tmp_path):
     cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
-    rows = report_of("coverage", flights=128, seed=11, scales=[1.0], steps=100, **cases)["rows"]
+    rows = result_of(tmp_path, "coverage", flights=128, seed=11, scales=[1.0], steps=100, **cases)["rows"]
     assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
         assert row["results"] == {"successful": 128}
@@ -247,9 +205,9 @@ def test_coverage(report_of):
         assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
 
 
-def test_dirty_flights(report_of, plot):
-    report = report_of("dirty_flights", flights=2, duration=6.0, seed=17, airframes=["os4"])
-    plot("dirty_flights")
+def test_dirty_flights(tmp_path):
+    report = result_of(tmp_path, "dirty_flights", flights=2, duration=6.0, seed=17, airframes=["os4"])
+    plot(tmp_path, "dirty_flights")
     found, summary = (report["airframes"]["os4"][name] for name in ("flights", "summary"))
     assert {flight["result"] for flight in found} == {"successful"}
     assert max(flight["fastest"] for flight in found) < 5
@@ -261,10 +219,10 @@ def test_dirty_flights(report_of, plot):
     assert abs(summary["rotor_delay"]["mean_error"]) < 2e-3
 
 
-def test_long_flight(report_of):
+def test_long_flight(tmp_path):
     """Windows follow a drift that one shot cannot. One shot ends at the bounds, and its result says so."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
-    one, many = report_of("long_flight", flights=2, seed=3, steps=100, **cases)["rows"]
+    one, many = result_of(tmp_path, "long_flight", flights=2, seed=3, steps=100, **cases)["rows"]
     assert (one["results"], many["results"]) == ({"at_bound": 2}, {"successful": 2})
     assert max(many["percent"]) < 5
     assert max(many["percent"][place] for place in (1, 3, 4)) < 2  # the gains of the torques
@@ -281,10 +239,10 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
     assert agreement({})["share"] is None
 
 
-def test_public_flights(report_of, shared_flights):
+def test_public_flights(shared_flights, tmp_path):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    report = report_of("public_flights", flights=shared_flights, end=15.0, batches=20, compared=[], **names)
+    report = result_of(tmp_path, "public_flights", flights=shared_flights, end=15.0, batches=20, compared=[], **names)
     assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 from helpers import how_we_compile
-from test_experiments import load, plot, report_of  # noqa: F401
+from small_experiments import load, plot, result_of
 
 import jaxos4
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
 
-def test_real_flight(shared_flights, report_of, plot):  # noqa: F811
-    report = report_of(
-        "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
+def test_real_flight(shared_flights, tmp_path):
+    report = result_of(
+        tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
     )
-    plot("real_flight")
+    plot(tmp_path, "real_flight")
     (row,) = report["estimators"]["filter-error"]["flights"].values()
     assert all(0.8e-5 < row["constants"][name]["estimate"] < 2.2e-5 for name in ("Ix", "Iy"))
     assert all(value > 0 for value, _ in row["ahead"].values())
@@ -36,40 +36,31 @@ def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-def test_closed_loop(report_of, plot, monkeypatch):  # noqa: F811
-    def load_with_small_chunks(name, script="run"):
-        module = load(name, script)
-        module.CHUNK = 2  # two calls of each estimator, the second of them padded
-        return module
-
-    monkeypatch.setattr("test_experiments.load", load_with_small_chunks)
+def test_closed_loop(monkeypatch, tmp_path):
+    monkeypatch.setattr("experiments.closed_loop.run.CHUNK", 2)  # two calls of each estimator; the second is padded
     cases = {"flights": 3, "gusts": [10.0], "duration": 6.0, "seed": 16}
     cases |= {"estimators": ["equation-error", "output-error"]}
-    report = report_of("closed_loop", **cases)
-    plot("closed_loop")
+    report = result_of(tmp_path, "closed_loop", **cases)
+    plot(tmp_path, "closed_loop")
     assert [len(case["flights"]) for case in report["cases"]] == [3, 3]
     # A controller that answers gusts makes both biased by tens of percent, and their intervals do not know it.
     for row in (row for case in report["cases"] for row in case["summary"].values()):
         assert (row["bias"] > 0.2, row["covered"]) == (True, 0)
-    # An interrupted study is continued: the flights that are there are not identified again.
-    assert report_of("closed_loop", **cases) == report
-    with pytest.raises(SystemExit, match="other settings"):
-        report_of("closed_loop", **{**cases, "seed": 17})
 
 
-def test_effects(report_of, plot):  # noqa: F811
+def test_effects(tmp_path):
     """The effects of real flights are flown, identified and drawn."""
-    report = report_of("closed_loop", "effects", flights=1, duration=10.0, effects=["clock"])
-    plot("closed_loop", "plot_effects")
+    report = result_of(tmp_path, "closed_loop", "effects", flights=1, duration=10.0, effects=["clock"])
+    plot(tmp_path, "closed_loop", "plot_effects")
     for case in report["cases"]:
         assert [row["result"] for row in case["flights"]] == ["successful"]
         assert abs(case["summary"]["thrust"]["mean"]) < 0.05
 
 
-def test_verdicts(report_of, capsys):  # noqa: F811
+def test_verdicts(capsys, tmp_path):
     """Good and spoiled flights are judged, and counted."""
     cases = {"gusts": None, "force clipped 0.8": True}
-    report = report_of("verdicts", flights=1, duration=16.0, cases=list(cases))
+    report = result_of(tmp_path, "verdicts", flights=1, duration=16.0, cases=list(cases))
     rows = {row["case"]: row for row in report["rows"]}
     assert {name: row["named"] for name, row in rows.items()} == cases
     good, clipped = (rows[name]["Ix"] for name in cases)
@@ -78,7 +69,6 @@ def test_verdicts(report_of, capsys):  # noqa: F811
     assert clipped["error"] < -0.1
     assert clipped["status"] == "contradicted"
     assert "spoiled flights" in capsys.readouterr().out
-    assert report_of("verdicts", flights=1, duration=16.0, cases=list(cases)) == report
 
 
 def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
@@ -99,19 +89,19 @@ def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
     assert len(np.unique(spoiled["rare motors"].omega[:, 0])) == 100
 
 
-def test_sample_times(report_of):  # noqa: F811
+def test_sample_times(tmp_path):
     """Every sample time has the same answer, within its interval."""
-    report = report_of("sample_times", flights=2, sample_times=[0.004, 0.016], duration=16.0)
+    report = result_of(tmp_path, "sample_times", flights=2, sample_times=[0.004, 0.016], duration=16.0)
     for case in report["cases"]:
         assert {row["result"] for row in case["flights"]} == {"successful"}
         assert all(abs(case["summary"][name]["mean"]) < 0.08 for name in ("Ix", "Iy"))
         assert case["summary"]["Ix"]["covered"] == 1
 
 
-def test_rotorpy(report_of, tmp_path):  # noqa: F811
+def test_rotorpy(tmp_path):
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     cases = {"flights": 1, "kinds": ["calm"], "duration": 8.0, "estimators": ["filter-error"]}
-    report = report_of("rotorpy", recordings=tmp_path / "flights", **cases)
+    report = result_of(tmp_path, "rotorpy", recordings=tmp_path / "flights", **cases)
     (path,) = (tmp_path / "flights").iterdir()
     flight = jaxos4.read_flight(path)
     assert np.isfinite(flight.omega).all()
@@ -126,14 +116,10 @@ def test_rotorpy(report_of, tmp_path):  # noqa: F811
     (case,) = report["cases"]
     assert [row["result"] for row in case["flights"]] == ["successful"]
     assert all(abs(case["summary"][name]["mean"]) < 0.05 for name in ("Ix", "Iy", "Iz", "thrust"))
-    # The flights that are there are not flown again, and those that were identified are not identified again.
-    recorded = path.stat().st_mtime_ns
-    assert report_of("rotorpy", recordings=tmp_path / "flights", **cases) == report
-    assert path.stat().st_mtime_ns == recorded
 
 
-def test_commands_that_are_too_rare_are_named(shared_flights, report_of):  # noqa: F811
-    (row,) = report_of("public_flights", "radio", flights=shared_flights, every=[40]).values()
+def test_commands_that_are_too_rare_are_named(shared_flights, tmp_path):
+    (row,) = result_of(tmp_path, "public_flights", "radio", flights=shared_flights, every=[40]).values()
     assert row["result"] != "successful"
     assert any("damping" in doubt["cause"] and "too rarely" in doubt["cause"] for doubt in row["doubts"])
 
@@ -156,30 +142,17 @@ def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
     np.testing.assert_array_equal(moved.states[:, 7], states[:, 7])
 
 
-def test_an_interrupted_report_of_predictions_is_continued(tmp_path):
-    pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
-    rotorpy, out, settings = load("rotorpy"), tmp_path / "out.json", {"flights": 1, "duration": 1.0, "seed": 2}
-    done = rotorpy.continued(None, settings, "predictions")
-    row = {name: {"error": 1.0, "true": 1.0, "held": 0.95} for name in rotorpy.QUANTITIES}
-    done["predictions"].append({"flight": 0, "result": "successful", **row})
-    rotorpy.write_report(out, done)
-    rotorpy.main(tmp_path, **settings, predict=True, out=out)
-    assert rotorpy.continued(out, settings, "predictions") == done
-    with pytest.raises(SystemExit, match="other settings"):
-        rotorpy.main(tmp_path, **(settings | {"seed": 3}), predict=True, out=out)
-
-
 # Benchmarks.
 
 
-def test_benchmarks(report_of, plot, monkeypatch):  # noqa: F811
+def test_benchmarks(monkeypatch, tmp_path):
     for name, value in how_we_compile().items():
         monkeypatch.setenv(name, value)
     fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
     sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
     growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}
     others = {"contenders": fits, "shooters": shots, "network_steps": 0, "simulations": 0}
-    report = report_of("benchmarks", **sizes, **growth, **others)
+    report = result_of(tmp_path, "benchmarks", **sizes, **growth, **others)
     rows = report["fits"]["known"]
     # Both reach the same optimum, and are timed in turns.
     assert {name: row["reached"] for name, row in rows.items()} == dict.fromkeys(fits, 1.0)
@@ -187,7 +160,7 @@ def test_benchmarks(report_of, plot, monkeypatch):  # noqa: F811
     assert all(row["peak_mib"] > 10 for row in rows.values())
     assert report["shots"]["jaxos4"]["steps_per_second"] > 0
     assert 0 < report["roofline"]["share"] < 1
-    plot("benchmarks")
+    plot(tmp_path, "benchmarks")
 
 
 def test_a_benchmark_skips_who_is_missing_or_fails_and_times_only_who_reaches_the_least_cost():

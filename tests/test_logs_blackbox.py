@@ -6,6 +6,7 @@ from blackbox_logs import RATES, SETTINGS, T, bbl, recorded, without
 from helpers import CRAZYFLIE, usable_stretches
 from recorded_logs import FRD, GRAVITY, RPM, attitude, blackbox_csv, check, force, quaternions, rates, speeds
 
+from jaxos4.errors import InputError
 from jaxos4.logs import read_log, read_recording
 from jaxos4.logs.blackbox_frames import Numbers
 from jaxos4.recording import cut
@@ -213,3 +214,11 @@ def test_a_real_log_is_what_another_decoder_makes_of_it(name, rows, sessions, us
 
 
 # Bad logs, for the laws of all readers.
+
+
+def test_blank_lines_above_the_header_are_skipped_and_others_are_refused(save):
+    text = blackbox_csv(recorded(T), settings={"acc_1G": "2048"})
+    plain, spaced = (read_recording(save(each), full_scale=1.0) for each in (text, f"\n\n{text}"))
+    np.testing.assert_array_equal(plain.states, spaced.states)
+    with pytest.raises(InputError):
+        read_recording(save(text.replace("\n", "\n\n")), full_scale=1.0)

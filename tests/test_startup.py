@@ -180,13 +180,12 @@ def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwis
     assert ended(*SIMULATE, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "flight.csv"))[0] == 0
 
 
-def test_the_console_command_ends_at_once_with_the_code_of_main_and_all_output(tmp_path):
-    console = COMMAND.replace("main", "console")
-    refused = start("estimate", "nowhere.csv", code=f"import atexit; atexit.register(print, 'late'); {console}")
-    assert (refused.returncode, refused.stdout) == (2, "")
-    assert "nowhere.csv: there is no such file" in refused.stderr
-    version = start("--version", code=console)
-    assert (version.returncode, version.stdout) == (0, f"jaxos4 {jaxos4.__version__}\n")
+def test_a_reader_that_has_gone_is_no_error_of_the_program():
+    command = COMMAND.replace(
+        "main()", "import os; reader, writer = os.pipe(); os.close(reader); os.dup2(writer, 1); main()"
+    )
+    process = start("--help", code=command)
+    assert (process.returncode, process.stderr) == (1, "")
 
 
 def test_a_study_of_many_flights_is_fully_optimised(tmp_path):

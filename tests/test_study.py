@@ -96,13 +96,13 @@ def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
     study = Study(scales=(0.0, 1.0, 10.0), channels=("rates", "all"), estimators=("ibss", "kalman"), **sizes)
     truths, noises, draws = {}, {}, {}
     for cell in map(study.cell, range(study.count)):
-        fleet = cell_module.fleet_of(study, cell.scenario)
-        truth, true, measured = (np.asarray(x) for x in cell_module.fly(study, fleet, cell))
+        setup = cell_module.setup_of(study, cell.scenario)
+        truth, true, measured = (np.asarray(x) for x in cell_module.fly(study, setup, cell))
         width, scale, first = cell.scenario.width, cell.scenario.scale, cell.first
         np.testing.assert_array_equal(truths.setdefault((width, first), truth), truth)
         np.testing.assert_array_equal(noises.setdefault((width, scale, first), measured), measured)
         # The same uniform numbers for every width, and the same normal ones for every scale.
-        u = (truth - fleet.bracket.center) / fleet.bracket.half_width
+        u = (truth - setup.bracket.center) / setup.bracket.half_width
         np.testing.assert_allclose(draws.setdefault(first, u), u, rtol=1e-9, atol=1e-9)
         if scale:
             normal = (measured - true) / (scale * jaxos4.SENSOR_SIGMA)
@@ -116,7 +116,7 @@ def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
     study, model = Study(widths=(1.0, 3.0), seed=7), jaxos4.PublishedOS4()
     off = jax.random.uniform(jax.random.fold_in(jax.random.key(7), 0), (8,), minval=-0.8, maxval=0.8)
     for width in study.widths:
-        bracket = cell_module.fleet_of(study, study.cell(0).scenario._replace(width=width)).bracket
+        bracket = cell_module.setup_of(study, study.cell(0).scenario._replace(width=width)).bracket
         same(bracket.center, model.alpha + off * width * model.half_width, model.half_width)
         same(bracket.half_width, width * model.half_width)
 

@@ -5,8 +5,7 @@ default half-widths around the truth. The bound is always the one for white nois
 that the cost of coloured and biased noise is visible. Without noise, errors are in units of the bound at scale 1.
 """
 
-import json
-import sys
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,17 +14,12 @@ from typing import Annotated
 import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
+from experiments.shared import PARAMETERS, brackets_around, identify, measure, noise_and_bracket_keys
 from jaxos4.estimators import ESTIMATORS as ALL
 from jaxos4.noise import NOISES
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {
     name: kind for name, kind in ALL.items() if not kind.needs_network
@@ -39,14 +33,14 @@ def row_of(
     channels: str,
     flights: int,
     seed: int,
-) -> dict:
+) -> Row:
     """The results of one estimator with one noise: a row of the table."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     exact = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
     problem = jaxos4.ShootingProblem(
         model, exact, sigma=(scale or 1.0) * jaxos4.SENSOR_SIGMA, initial_state=exact.states[0], channels=channels
     )
-    noise_keys, start_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+    noise_keys, start_keys = noise_and_bracket_keys(seed, flights)
     states, brackets = measure(noise, exact, noise_keys), brackets_around(model, start_keys)
     jax.block_until_ready(identify(estimator, problem, brackets, states))
     begin = time.perf_counter()
@@ -77,36 +71,31 @@ def main(
     estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = tuple(ESTIMATORS),
     noises: Annotated[list[str], typer.Option(help="Kinds of noise.")] = tuple(NOISES),
     scales: Annotated[list[float], typer.Option(help="Noise / standard noise; 0: no noise.")] = (0.0, 0.1, 1.0, 10.0),
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Compare all estimators, with their default settings, on the standard flight."""
+
+    def row(noise: str, scale: float, estimator: str) -> Row:
+        kind = NOISES[noise if scale else "white"](scale * jaxos4.SENSOR_SIGMA)
+        return row_of(ESTIMATORS[estimator](), kind, scale, channels, flights, seed)
+
+    report = continued(out, {"seed": seed, "channels": channels, "flights": flights}, "rows")
+    trials = (
+        {"noise": kind, "scale": scale, "estimator": name}
+        for kind, scale, name in itertools.product(noises, scales, estimators)
+        if scale or kind == noises[0]
+    )
+    fill(out, report, report["rows"], trials, row)
+    cells = (
+        (
+            *(row["noise"] if row["scale"] else "none", f"{row['scale']:g}", row["estimator"]),
+            *((f"{x:.2g}" for x in row["efficiency"]) if row["efficiency"] else [""] * len(PARAMETERS)),
+            f"{np.abs(row['bias']).max():.2g}" if row["bias"] else "",
+            f"{100 * np.mean(row['covered']):.0f}" if row["covered"] else "",
+            *(f"{row['rollouts']:.0f}", f"{1000 * row['seconds']:.3g}", in_words(row["results"])),
+        )
+        for row in report["rows"]
+    )
+    title = f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights"
     headings = "noise", "scale", "estimator", *PARAMETERS, "bias", "95 %", "rollouts", "ms", "results"
-    table = table_of(f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights", headings)
-    rows = []
-    for kind in noises:
-        for scale in scales:
-            if scale == 0 and kind != noises[0]:
-                continue
-            for name in estimators:
-                noise = NOISES[kind if scale else "white"](scale * jaxos4.SENSOR_SIGMA)
-                row = row_of(ESTIMATORS[name](), noise, scale, channels, flights, seed)
-                rows.append({"noise": kind, "scale": scale, "estimator": name, **row})
-                table.add_row(
-                    kind if scale else "none",
-                    f"{scale:g}",
-                    name,
-                    *(f"{x:.2g}" for x in row["efficiency"] or ()),
-                    f"{np.abs(row['bias']).max():.2g}" if row["bias"] else "",
-                    f"{100 * np.mean(row['covered']):.0f}" if row["covered"] else "",
-                    f"{row['rollouts']:.0f}",
-                    f"{1000 * row['seconds']:.3g}",
-                    in_words(row["results"]),
-                )
-                if out is not None:
-                    report = {"version": jaxos4.__version__, "seed": seed, "channels": channels, "rows": rows}
-                    out.write_text(json.dumps(report, indent=2) + "\n")
-    Console(width=170).print(table)
-
-
-if __name__ == "__main__":
-    typer.run(main)
+    print_table(title, headings, cells, width=170)

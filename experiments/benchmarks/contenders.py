@@ -3,7 +3,7 @@
 import importlib.util
 from typing import Any, NamedTuple
 
-from benchmarks.opponents.c_shots import COMPILERS, compiler
+from experiments.benchmarks.opponents.c_shots import COMPILERS, compiler
 
 REFERENCE_FIT = "CasADi, single shooting"
 REFERENCE_SHOT = "C -O3, one core"

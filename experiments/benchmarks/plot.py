@@ -1,20 +1,13 @@
 """The benchmark as a figure: time of one flight by contender, growth, and the roofline."""
 
-import json
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.shared import plotter, read_json
 from jaxos4.report.style import FAINT, INK, log_axis, styles
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import write_figure
 
 _AXES = {"flights": "flights in one call", "steps": "steps (rates alone)", "unknowns": "unknowns"}
 
@@ -80,11 +73,4 @@ def draw(report: dict[str, Any]) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draw the results of run.py."""
-    report = json.loads(results.read_text())
-    write_figure(lambda: draw(report), figures, "benchmarks")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_json, {"benchmarks": draw})

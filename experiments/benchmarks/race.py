@@ -1,6 +1,7 @@
 """A race: each contender is a process of its own, is checked, and is then timed in turns with the others."""
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -8,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.case import Case
-from benchmarks.contenders import Contender
 
-WORKER = Path(__file__).with_name("worker.py")
+from experiments.benchmarks.case import Case
+from experiments.benchmarks.contenders import Contender
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Racer:
@@ -25,7 +27,7 @@ class Racer:
         self.laps: list[dict[str, float]] = []
         self._errors = tempfile.TemporaryFile("w+")
         arguments = [contender.entry, str(case), str(flights), json.dumps(contender.options)]
-        command = [sys.executable, str(WORKER), *arguments]
+        command = [sys.executable, "-m", "experiments.benchmarks.worker", *arguments]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
             command,
@@ -33,6 +35,7 @@ class Racer:
             stdout=pipe,
             stderr=self._errors,
             text=True,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))},
             cwd=case.parent,  # some libraries write logs where they run
         )
         ready = self._read()

@@ -5,28 +5,19 @@ contender is timed only if it reaches the same optimum. Each runs in a process o
 alternate, so that each ratio compares laps under the same load of the machine.
 """
 
-import json
-import os
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
-from jaxos4._files import write_atomically
+from experiments.benchmarks.case import ALL, RATES, Case, costs, trajectories
+from experiments.benchmarks.contenders import FITS, NETWORKS, REFERENCE_FIT, REFERENCE_SHOT, SHOTS, Contender
+from experiments.benchmarks.race import line_up, race, ratios
+from experiments.benchmarks.tables import print_report
+from experiments.monte_carlo import machine, write_report
 from jaxos4.flight import Inputs
-
-jax.config.update("jax_enable_x64", True)
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from benchmarks.case import ALL, RATES, Case, costs, trajectories
-from benchmarks.contenders import FITS, NETWORKS, REFERENCE_FIT, REFERENCE_SHOT, SHOTS, Contender
-from benchmarks.race import line_up, race, ratios
-from benchmarks.tables import print_report
 
 DT = 0.01
 SAME_COST = 0.01  # an error of a seventh of a standard deviation costs as much
@@ -179,11 +170,7 @@ def main(
     skipped: list[str] = []
     report: dict[str, Any] = {
         "provenance": {
-            "version": jaxos4.__version__,
-            "jax": jax.__version__,
-            "device": jax.devices()[0].device_kind,
-            "cores": os.cpu_count(),
-            "precision": "float64",
+            **machine(),
             "settings": {"flights": flights, "alone": alone, "repeats": repeats, "steps": steps, "seed": seed},
         }
     }
@@ -199,11 +186,5 @@ def main(
     report["networks"] = networks(network_steps, simulations, min(flights, 100), skipped) if network_steps else {}
     report["roofline"] = roofline(report["shots"], skipped)
     report["skipped"] = list(dict.fromkeys(skipped))
-    print_report(Console(width=120), report)
-    if out is not None:
-        with write_atomically(out) as beside:
-            beside.write_text(json.dumps(report, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+    print_report(report)
+    write_report(out, report)

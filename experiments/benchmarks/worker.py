@@ -1,4 +1,4 @@
-"""One contender in a process of its own: `python worker.py CONTENDER CASE.npz FLIGHTS [OPTIONS as JSON]`.
+"""One contender in a process of its own: `python -m experiments.benchmarks.worker CONTENDER CASE.npz ...`.
 
 It prepares itself, runs once, and then once more for each line on its standard input. It answers with one line of JSON
 each time. A process of its own has its own peak memory, and no library disturbs another.
@@ -15,9 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from benchmarks.case import Case
+from experiments.benchmarks.case import Case
 
 
 def peak_mib() -> float:
@@ -30,14 +28,14 @@ def peak_mib() -> float:
     return int(line.split()[1]) / 1024
 
 
-def main(contender: str, path: str, flights: str, options: str = "{}") -> None:
+def serve(contender: str, path: str, flights: str, options: str = "{}") -> None:
     """Answer lines of standard input with the time of a run. The arguments are those of the command line."""
     # Libraries print: only our answers go to the real standard output.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     begin = time.perf_counter()
     module, _, function = contender.partition(":")
-    make = getattr(importlib.import_module(f"benchmarks.opponents.{module}"), function)
+    make = getattr(importlib.import_module(f"experiments.benchmarks.opponents.{module}"), function)
     run = make(Case.load(Path(path)).first(int(flights)), **json.loads(options))
     answer = run()
     setup = time.perf_counter() - begin
@@ -56,4 +54,4 @@ def main(contender: str, path: str, flights: str, options: str = "{}") -> None:
 
 if __name__ == "__main__":
     with contextlib.suppress(BrokenPipeError):
-        main(*sys.argv[1:])
+        serve(*sys.argv[1:])

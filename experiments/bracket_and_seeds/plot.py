@@ -1,27 +1,20 @@
 """Plots RMSE / bound, hit rate and rollouts against the width of the bracket, with one line for each seed."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.shared import plotter, read_each
 from jaxos4.report.study_page import dodged
 from jaxos4.report.style import INK, grid, log_axis, styles
-from jaxos4.study import metrics, read_results
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import write_figure
+from jaxos4.study import metrics
 
 
-def draw(studies: list[xr.Dataset]) -> Figure:
+def draw(studies: dict[str, xr.Dataset]) -> Figure:
     """One panel for each quantity. `studies`: one for each seed."""
     figure, (above, middle, right) = grid(3, columns=3, height=2.8)
     above.axhline(1, color=INK, linewidth=1.0)
-    for seed, data in enumerate(studies):
+    for seed, data in enumerate(studies.values()):
         data = data.squeeze([d for d in metrics.SCENARIO if d not in ("width", "estimator")])
         x = dodged(data["width"].values, seed, len(studies)) if len(studies) > 1 else data["width"].values
         for name, look in styles(list(data["estimator"].values)).items():
@@ -33,7 +26,7 @@ def draw(studies: list[xr.Dataset]) -> Figure:
             if hits["hit_rate"].notnull().any():
                 middle.plot(x, 100 * hits["hit_rate"], **line)
                 middle.vlines(x, 100 * hits["low"], 100 * hits["high"], color=look.color, linewidth=1.0)
-    widths = studies[0]["width"].values
+    widths = next(iter(studies.values()))["width"].values
     for panel, title in (
         (above, "RMSE / bound, worst parameter"),
         (middle, "seeds that hold the truth [%]"),
@@ -53,11 +46,4 @@ def draw(studies: list[xr.Dataset]) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draw the results of run.py."""
-    folders = [path.parent for path in sorted(results.glob("*/results.nc"))]
-    write_figure(lambda: draw([read_results(folder) for folder in folders]), figures, "bracket_and_seeds")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_each, {"bracket_and_seeds": draw})

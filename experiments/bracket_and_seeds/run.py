@@ -1,17 +1,13 @@
 """How do the network and the hybrid depend on the width of the bracket and on the random seed of the training?"""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from msgspec.structs import replace
 
+from experiments.shared import run_studies
 from jaxos4.study import load_study
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import run_studies
 
 
 def main(
@@ -22,7 +18,3 @@ def main(
     """Run the study once for each training seed, on the same flights, in a folder for each seed."""
     study = load_study(specification)
     run_studies({f"seed {s}": replace(study, network=replace(study.network, seed=s)) for s in seeds}, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

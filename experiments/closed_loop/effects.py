@@ -7,8 +7,8 @@ a thrust coefficient that is 20 % wrong and moments of inertia that are 25 % wro
 a Crazyflie. The true thrust of `sag` is that at the begin of the flight; on average it is 5 % smaller.
 """
 
+import functools
 import itertools
-import sys
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -19,13 +19,9 @@ import numpy as np
 import typer
 
 import jaxos4
-
-sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
-
-from fits import given_airframe, print_table, run_cases
-from run import CHUNK, DELAY, DT, LAG, LARGEST, VEHICLE, stacked, turned_over
-
-jax.config.update("jax_enable_x64", True)
+from experiments.closed_loop.run import CHUNK, DELAY, DT, LAG, LARGEST, VEHICLE, stacked, turned_over
+from experiments.fits import fit, given_airframe, print_summaries, summary
+from experiments.monte_carlo import Row, monte_carlo
 
 GUST = 5.0  # [rad/s^2]
 
@@ -134,10 +130,11 @@ def main(
 ) -> None:
     """Measure errors and coverage for each effect."""
     settings = {"flights": flights, "duration": duration, "seed": seed}
-    cases = list(itertools.product(effects, estimators))
-    report = run_cases(out, settings, cases, VEHICLE, lambda kind: flights_of(kind, flights, duration, seed))
-    print_table(f"effects of real flights, {duration:g} s in closed loop", report)
+    cases = [{"kind": kind, "estimator": name} for kind, name in itertools.product(effects, estimators)]
+    flown = functools.cache(lambda kind: flights_of(kind, flights, duration, seed))
 
+    def row_of(flight: jaxos4.Flight, i: int, kind: str, estimator: str) -> Row:
+        return fit(estimator, flight, VEHICLE, i)
 
-if __name__ == "__main__":
-    typer.run(main)
+    report = monte_carlo(out, settings, cases, lambda kind, **_: flown(kind), row_of, summary)
+    print_summaries(f"effects of real flights, {duration:g} s in closed loop", report)

@@ -1,17 +1,9 @@
 """Bias and interval coverage of the moments of inertia against the strength of gusts, a line for each estimator."""
 
-import json
-import sys
-from pathlib import Path
-
-import typer
 from matplotlib.figure import Figure
 
+from experiments.shared import plotter, read_json
 from jaxos4.report.style import INK, grid, styles
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import write_figure
 
 INERTIAS = ("Ix", "Iy", "Iz")
 
@@ -43,11 +35,4 @@ def draw(report: dict) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote: a JSON file."""
-    report = json.loads(results.read_text())
-    write_figure(lambda: draw(report), figures, "closed_loop")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_json, {"closed_loop": draw})

@@ -1,19 +1,11 @@
 """Errors and intervals of each quantity for each effect of real flights, an estimator each figure's colour."""
 
-import json
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 from matplotlib.figure import Figure
 
+from experiments.fits import INERTIAS, THRUST
+from experiments.shared import plotter, read_json
 from jaxos4.report.style import INK, grid, styles
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from fits import INERTIAS, THRUST
-from shared import write_figure
 
 
 def draw(report: dict) -> Figure:
@@ -45,11 +37,4 @@ def draw(report: dict) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draws what effects.py wrote: a JSON file."""
-    report = json.loads(results.read_text())
-    write_figure(lambda: draw(report), figures, "closed_loop_effects")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_json, {"closed_loop_effects": draw})

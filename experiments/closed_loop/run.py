@@ -14,10 +14,10 @@ the whole flight fitted.
 `jaxos4.design_references` finds for the true airframe. All have the same length and the same largest angle.
 """
 
+import functools
 import itertools
-import json
-import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -25,17 +25,12 @@ import equinox as eqx
 import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.fits import whole
+from experiments.monte_carlo import Row, covered_error, monte_carlo, print_table, results_of
 from jaxos4.design import standard_references
 from jaxos4.results import NINETY_FIVE
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import count_results, in_words, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 THRUST, FULL = 0.15, 2500.0  # of one rotor at full speed [N], and that speed [rad/s]
 VEHICLE = jaxos4.Airframe(
@@ -118,35 +113,34 @@ def stacked(modules: list) -> object:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *modules)
 
 
-def fit(name: str, flights: list[tuple[int, jaxos4.Flight]], wrong: float) -> list[dict]:
-    """The rows of many flights without a disturbance. Their standard deviations are those of white gyro noise alone."""
+def regress(estimator: str, flights: dict[int, jaxos4.Flight], wrong: float) -> list[Row]:
+    """The rows of some flights, by their numbers, without a disturbance, in one call.
+
+    Their standard deviations are those of white gyro noise alone.
+    """
+    known = [known_airframe(i, wrong) for i in flights]
+    spare = CHUNK - len(flights)  # one program for all calls
+    batch = (stacked(some + some[-1:] * spare) for some in (list(flights.values()), known))
+    begin = time.perf_counter()
+    found, stds = jax.block_until_ready(_fit(WITHOUT_DISTURBANCE[estimator], *batch))
+    results, seconds = jaxos4.result_names(found.result), time.perf_counter() - begin
+    places = [jaxos4.CorrectedOS4().parameter_names.index(alpha) for alpha in INERTIAS.values()]
+    values = 1 / np.asarray(found.parameters)[:, places]
+    errors = np.asarray(stds)[:, places] * values**2
     rows = []
-    for first in range(0, len(flights), CHUNK):
-        some = flights[first : first + CHUNK]
-        padded = some + some[-1:] * (CHUNK - len(some))  # one program
-        batch = (stacked([f for _, f in padded]), stacked([known_airframe(i, wrong) for i, _ in padded]))
-        begin = time.perf_counter()
-        found, stds = jax.block_until_ready(_fit(WITHOUT_DISTURBANCE[name], *batch))
-        results, seconds = jaxos4.result_names(found.result), time.perf_counter() - begin
-        alphas = np.asarray(found.parameters)
-        for k, (i, _) in enumerate(some):
-            row: dict = {"flight": i, "result": str(results[k]), "seconds": seconds / len(some)}
-            for inertia, alpha in INERTIAS.items():
-                place = jaxos4.CorrectedOS4().parameter_names.index(alpha)
-                value = 1 / alphas[k, place]
-                std = float(value * stds[k, place] / alphas[k, place])
-                row[inertia] = {"estimate": float(value), "std": std, "bound": std}
-            rows.append(row)
+    for k in range(len(flights)):
+        row: Row = {"result": str(results[k]), "seconds": seconds / len(flights)}
+        for name, value, std in zip(INERTIAS, values[k].tolist(), errors[k].tolist(), strict=True):
+            row[name] = {"estimate": value, "std": std, "bound": std}
+        rows.append(row)
     return rows
 
 
-def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> dict:
+def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> Row:
     """The row of one flight by an estimator of `jaxos4.identify`."""
     begin = time.perf_counter()
-    # One length of all flights: one program.
-    whole = jaxos4.VehicleSettings(begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0)
-    found = jaxos4.identify(flight, known_airframe(i, wrong), settings=whole, estimator=estimator)
-    row: dict = {"flight": i, "result": found.result, "seconds": time.perf_counter() - begin}
+    found = jaxos4.identify(flight, known_airframe(i, wrong), settings=whole(flight), estimator=estimator)
+    row: Row = {"result": found.result, "seconds": time.perf_counter() - begin}
     constants = found.rigid_body.constants
     for name, alpha in INERTIAS.items():
         if name in constants:
@@ -157,7 +151,7 @@ def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> dict:
     return row
 
 
-def summary(rows: list[dict]) -> dict[str, dict]:
+def summary(rows: list[Row]) -> dict[str, Row]:
     """For each moment of inertia: figures over the flights with an estimate, each with its Monte-Carlo error.
 
     `bias`, `rmse`: as shares of the truth. `std`, `bound`: root mean square, as shares of the truth. `wrong`: the
@@ -183,29 +177,24 @@ def summary(rows: list[dict]) -> dict[str, dict]:
             "efficiency": rmse / least,
             "efficiency_error": rmse / least / np.sqrt(2 * count),
             "covered": float(covered.mean()),
-            "covered_error": float(np.sqrt(max(covered.mean() * (1 - covered.mean()), 0.05 * 0.95) / count)),
+            "covered_error": covered_error(covered.mean(), count),
             "wrong": float((successful & ~covered).sum() / len(rows)),
         }
     return found
 
 
-def print_table(report: dict, duration: float) -> None:
+def table_rows(report: Row) -> Iterator[tuple[str, ...]]:
     """One line for each estimator, strength of gusts and moment of inertia."""
-    figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
-    title = f"moments of inertia from flights of {duration:g} s in closed loop"
-    table = table_of(title, ("gust", "references", "estimator", "", *figures))
     for case in report["cases"]:
-        results = in_words(count_results(np.array([row["result"] for row in case["flights"]])))
-        for name, row in summary(case["flights"]).items():
+        for name, row in case["summary"].items():
             error = "" if row["bias_error"] is None else f" +- {100 * row['bias_error']:.2g}"
-            table.add_row(
+            yield (
                 *(f"{case['gust']:g}", case["references"], case["estimator"], name, str(row["flights"])),
                 *(f"{100 * row['bias']:.3g}{error}", f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}"),
                 f"{row['efficiency']:.2f} +- {row['efficiency_error']:.2f}",
                 f"{100 * row['covered']:.1f} +- {100 * row['covered_error']:.1f}",
-                results,
+                results_of(case),
             )
-    Console(width=150).print(table)
 
 
 def main(
@@ -223,47 +212,29 @@ def main(
     out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure bias and coverage of moments of inertia over the strength of gusts."""
-    settings = {
-        "duration": duration,
-        "seed": seed,
-        "wrong": wrong,
-        "version": jaxos4.__version__,
-        "precision": "float64",
-    }
-    report: dict = {**settings, "cases": []}
-    if out is not None and out.exists():
-        earlier = json.loads(out.read_text())
-        if {name: earlier[name] for name in settings} != settings:
-            raise SystemExit(f"{out}: has other settings; give --out another name.")
-        report = earlier
 
-    def save() -> None:
-        for case in report["cases"]:
-            case["summary"] = summary(case["flights"])
-        if out is not None:
-            out.write_text(json.dumps(report, indent=2) + "\n")
+    @functools.cache
+    def flown(gust: float, references: str) -> list[jaxos4.Flight | None]:
+        wanted = references_of(references, gust, duration, seed)
+        every = (fly(gust, i, duration, seed, wrong, wanted) for i in range(flights))
+        return [None if turned_over(flight) else flight for flight in every]
 
-    for gust, kind in itertools.product(gusts, references):
-        wanted_references = references_of(kind, gust, duration, seed)
-        flown = [(i, fly(gust, i, duration, seed, wrong, wanted_references)) for i in range(flights)]
-        flown = [(i, flight) for i, flight in flown if not turned_over(flight)]
-        for name in estimators:
-            what = {"gust": gust, "references": kind, "estimator": name}
-            case = next((c for c in report["cases"] if {key: c[key] for key in what} == what), None)
-            if case is None:
-                case = {**what, "flights": []}
-                report["cases"].append(case)
-            done = {row["flight"] for row in case["flights"]}
-            wanted = [(i, flight) for i, flight in flown if i not in done]
-            if name in WITHOUT_DISTURBANCE:
-                case["flights"] += fit(name, wanted, wrong)
-                save()
-                continue
-            for i, flight in wanted:
-                case["flights"].append(search(name, flight, i, wrong))
-                save()
-    print_table(report, duration)
+    @functools.cache
+    def regressed(gust: float, references: str, estimator: str, first: int) -> dict[int, Row]:
+        some = {i: f for i, f in enumerate(flown(gust, references)) if f is not None and first <= i < first + CHUNK}
+        return dict(zip(some, regress(estimator, some, wrong), strict=True))
 
+    def row_of(flight: jaxos4.Flight, i: int, gust: float, references: str, estimator: str) -> Row:
+        if estimator in WITHOUT_DISTURBANCE:
+            return regressed(gust, references, estimator, i - i % CHUNK)[i]
+        return search(estimator, flight, i, wrong)
 
-if __name__ == "__main__":
-    typer.run(main)
+    settings = {"duration": duration, "seed": seed, "wrong": wrong}
+    cases = [
+        {"gust": gust, "references": kind, "estimator": name}
+        for gust, kind, name in itertools.product(gusts, references, estimators)
+    ]
+    report = monte_carlo(out, settings, cases, lambda gust, references, **_: flown(gust, references), row_of, summary)
+    figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
+    title = f"moments of inertia from flights of {duration:g} s in closed loop"
+    print_table(title, ("gust", "references", "estimator", "", *figures), table_rows(report))

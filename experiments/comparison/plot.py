@@ -1,30 +1,22 @@
 """The comparison as a coloured table: rows are estimators, columns are parameters, panels are noise scales."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from experiments.shared import plotter, read_by_noise
 from jaxos4.report.study_tables import error_unit
 from jaxos4.report.style import INK, PAPER, grid
 from jaxos4.report.text import plain
-from jaxos4.study import metrics, read_results
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import write_figure
+from jaxos4.study import metrics
 
 WORST = 30.0
 
 
 def draw(data: xr.Dataset) -> Figure:
     """Numbers: RMS errors, in percent if that has a meaning. Colour: RMS error / smallest bound of any estimator."""
-    data = data.squeeze([d for d in metrics.SCENARIO if d not in ("scale", "estimator")])
     found, least = metrics.estimator_error(data), metrics.bound_error(data)["absolute"].min("estimator")
     ratio = (found["absolute"] / least).transpose("scale", "estimator", "parameter").values
     kinds = [error_unit(data, place)[:2] for place in range(data.sizes["parameter"])]
@@ -52,10 +44,4 @@ def draw(data: xr.Dataset) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draws the results of `jaxos4 study`."""
-    write_figure(lambda: draw(read_results(results)), figures, "comparison")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_by_noise, {"comparison": draw})

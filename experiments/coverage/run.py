@@ -5,8 +5,7 @@ within 80 % of the default half-widths around the truth. The constants Ix, Iy, I
 flight and their covariance.
 """
 
-import json
-import sys
+import functools
 import time
 from pathlib import Path
 from typing import Annotated
@@ -15,17 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
+from experiments.shared import PARAMETERS, brackets_around, identify, measure, noise_and_bracket_keys
 from jaxos4.models import MODELS
 from jaxos4.results import NINETY_FIVE
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 ESTIMATORS = {"ibss": jaxos4.IBSS, "hybrid": jaxos4.Hybrid, "output-error": jaxos4.OutputError}
 CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
@@ -35,10 +29,10 @@ CHUNK = 250
 
 def cover(
     estimator: jaxos4.AbstractEstimator, problem: jaxos4.ShootingProblem, scale: float, flights: int, seed: int
-) -> dict:
+) -> Row:
     """The coverage of one estimator at one noise scale: a row of the table. `problem` has the flight without noise."""
     model, exact, noise = problem.model, problem.flight, jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
-    noise_keys, start_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+    noise_keys, start_keys = noise_and_bracket_keys(seed, flights)
     brackets, begin = brackets_around(model, start_keys), time.perf_counter()
 
     def part(first: int) -> jaxos4.Estimate:
@@ -74,43 +68,39 @@ def main(
     estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = tuple(ESTIMATORS),
     scales: Annotated[list[float], typer.Option(help="Noise / standard noise.")] = (0.1, 1.0, 10.0),
     steps: Annotated[int, typer.Option(help="Training steps of the hybrid's network.")] = jaxos4.NetworkEstimator.steps,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure the coverage of 95 % intervals."""
     vehicle = MODELS[model](jaxos4.OS4)
     exact = jaxos4.simulate(vehicle, vehicle.alpha, jaxos4.multisine(vehicle.airframe), dt=0.01)
-    rows, network = [], None
     error = np.sqrt(0.95 * 0.05 / flights)
-    headings = "scale", "estimator", *PARAMETERS, *CONSTANTS, "p < 5 %", "s", "results"
-    table = table_of(f"95 % intervals that contain the truth [%], {flights} flights, {model}, {channels}", headings)
 
     def problem(scale: float) -> jaxos4.ShootingProblem:
         sigma = scale * jaxos4.SENSOR_SIGMA
         return jaxos4.ShootingProblem(vehicle, exact, sigma=sigma, initial_state=exact.states[0], channels=channels)
 
-    for scale in scales:
-        for name in estimators:
-            if name == "hybrid" and network is None:
-                training = jaxos4.NetworkEstimator(channels=channels, steps=steps)
-                network = training.fit(problem(1.0), jaxos4.Bracket.default(vehicle), key=jax.random.key(0))
-            estimator = jaxos4.Hybrid(network) if name == "hybrid" else ESTIMATORS[name]()
-            row = cover(estimator, problem(scale), scale, flights, seed)
-            rows.append({"scale": scale, "estimator": name, **row})
-            table.add_row(
-                f"{scale:g}",
-                name,
-                *(f"{100 * x:.1f}" for x in row["covered"] + row["constants_covered"]),
-                f"{100 * row['inconsistent']:.1f}",
-                f"{row['seconds']:.0f}",
-                in_words(row["results"]),
-            )
-            if out is not None:
-                report = {"version": jaxos4.__version__, "seed": seed, "monte_carlo_error": error, "rows": rows}
-                out.write_text(json.dumps(report | {"flights": flights, "model": model}, indent=2) + "\n")
-    console = Console(width=170)
-    console.print(table)
-    console.print(f"Monte-Carlo error of each number: {100 * error:.2f} %.")
+    @functools.cache
+    def network() -> jaxos4.TrainedNetwork:
+        training = jaxos4.NetworkEstimator(channels=channels, steps=steps)
+        return training.fit(problem(1.0), jaxos4.Bracket.default(vehicle), key=jax.random.key(0))
 
+    def row_of(scale: float, estimator: str) -> Row:
+        found = jaxos4.Hybrid(network()) if estimator == "hybrid" else ESTIMATORS[estimator]()
+        return cover(found, problem(scale), scale, flights, seed)
 
-if __name__ == "__main__":
-    typer.run(main)
+    settings = {"seed": seed, "flights": flights, "model": model, "channels": channels, "monte_carlo_error": error}
+    report = continued(out, settings, "rows")
+    trials = ({"scale": scale, "estimator": name} for scale in scales for name in estimators)
+    fill(out, report, report["rows"], trials, row_of)
+    cells = (
+        (
+            *(f"{row['scale']:g}", row["estimator"]),
+            *(f"{100 * x:.1f}" for x in (*row["covered"], *row["constants_covered"], row["inconsistent"])),
+            *(f"{row['seconds']:.0f}", in_words(row["results"])),
+        )
+        for row in report["rows"]
+    )
+    title = f"95 % intervals that contain the truth [%], {flights} flights, {model}, {channels}"
+    headings = "scale", "estimator", *PARAMETERS, *CONSTANTS, "p < 5 %", "s", "results"
+    print_table(title, headings, cells, width=170)
+    print(f"Monte-Carlo error of each number: {100 * error:.2f} %.")

@@ -5,8 +5,7 @@ for all vehicles of the default bracket and for the airframe's vehicle alone. It
 standard inputs. Then IBSS identifies simulated flights of the designed input. The initial state is known.
 """
 
-import json
-import sys
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -14,18 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
+from experiments.shared import brackets_around, identify, measure
 from jaxos4.design import Design
 from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.models import MODELS
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import brackets_around, count_results, identify, in_words, measure, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 DT = 0.01
 # Widths of the bracket, in multiples of the default: that of all vehicles, and almost none.
@@ -78,42 +72,37 @@ def main(
     flights: Annotated[int, typer.Option(help="Number of flights of each designed input.")] = 256,
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 5.0,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure what designed inputs gain."""
-    cases = []
-    for name in models:
-        model = MODELS[name](jaxos4.OS4)
-        for some in channels:
-            for vehicles in (one for one in widths if name not in ONLY_AIRFRAME or one == "airframe"):
-                found = designed(model, some, WIDTHS[vehicles], duration, seed)
-                cases.append(
-                    {
-                        "model": name,
-                        "channels": some,
-                        "vehicles": vehicles,
-                        "gains": {key: found.gain(key) for key in found.standard},
-                        "bounds": found.designed.bounds.tolist(),
-                        "uses": found.designed.uses,
-                        "others": excess(model, found, WIDTHS[vehicles], seed),
-                        **efficiency(model, found, some, flights, seed),
-                    }
-                )
-                if out is not None:
-                    report = {"seed": seed, "duration": duration, "version": jaxos4.__version__, "cases": cases}
-                    out.write_text(json.dumps(report, indent=2) + "\n")
-    headings = ("model", "channels", "vehicles", "/ multisine", "/ doublet", "largest use", "RMSE / bound", "results")
-    table = table_of(f"geometric mean of the bounds, of {duration:g} s", headings)
-    for case in cases:
-        table.add_row(
+
+    def row_of(model: str, channels: str, vehicles: str) -> Row:
+        subject, width = MODELS[model](jaxos4.OS4), WIDTHS[vehicles]
+        found = designed(subject, channels, width, duration, seed)
+        return {
+            "gains": {key: found.gain(key) for key in found.standard},
+            "bounds": found.designed.bounds.tolist(),
+            "uses": found.designed.uses,
+            "others": excess(subject, found, width, seed),
+            **efficiency(subject, found, channels, flights, seed),
+        }
+
+    report = continued(out, {"seed": seed, "duration": duration}, "cases")
+    trials = (
+        {"model": name, "channels": some, "vehicles": vehicles}
+        for name, some, vehicles in itertools.product(models, channels, widths)
+        if vehicles == "airframe" or name not in ONLY_AIRFRAME
+    )
+    fill(out, report, report["cases"], trials, row_of)
+    cells = (
+        (
             *(case["model"], case["channels"], case["vehicles"]),
             *("{:.3g} ({})".format(*case["gains"][name]) for name in ("multisine", "doublet")),
             f"{case['others']:.3f}",
             f"{min(case['efficiency']):.2f} to {max(case['efficiency']):.2f}",
             in_words(case["results"]),
         )
-    Console(width=140).print(table)
-
-
-if __name__ == "__main__":
-    typer.run(main)
+        for case in report["cases"]
+    )
+    headings = "model", "channels", "vehicles", "/ multisine", "/ doublet", "largest use", "RMSE / bound", "results"
+    print_table(f"geometric mean of the bounds, of {duration:g} s", headings, cells, width=140)

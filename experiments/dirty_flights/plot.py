@@ -1,18 +1,10 @@
 """A row a parameter: the share of 95 % intervals that hold the truth, with two Monte-Carlo errors, of each airframe."""
 
-import json
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 from matplotlib.figure import Figure
 
+from experiments.shared import plotter, read_json
 from jaxos4.report.style import INK, grid, styles
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import write_figure
 
 
 def draw(report: dict) -> Figure:
@@ -39,11 +31,4 @@ def draw(report: dict) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote: a JSON file."""
-    report = json.loads(results.read_text())
-    write_figure(lambda: draw(report), figures, "dirty_flights")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_json, {"dirty_flights": draw})

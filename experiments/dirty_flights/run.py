@@ -7,8 +7,9 @@ recording is averaged to 4 ms and fitted by the likelihood of its innovations. P
 counted.
 """
 
-import json
+import functools
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -17,17 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
 import jaxos4
+from experiments.monte_carlo import Row, continued, fill, print_table, write_report
 from jaxos4.estimators import make_estimator
 from jaxos4.identification.fit import fit_innovations
 from jaxos4.logs.sampling import averages
 from jaxos4.models.flight_model import DEFAULT_TERMS
 from jaxos4.results import NINETY_FIVE
-
-jax.config.update("jax_enable_x64", True)
 
 # As large as a Crazyflie 2.
 CRAZYFLIE = jaxos4.Airframe(
@@ -133,24 +131,23 @@ def recorded(omega: np.ndarray, seen: np.ndarray) -> jaxos4.Flight:
     return jaxos4.Flight(grid, speeds, states, force)
 
 
-def identify(airframe: jaxos4.Airframe, estimator: str, duration: float, seed: int, i: int) -> dict:
+def identify(airframe: jaxos4.Airframe, estimator: str, settings: Row, flight: int) -> Row:
     """One flight: its true parameters, their estimates, and why others are held."""
-    rng = np.random.default_rng([seed, i])
+    rng = np.random.default_rng([settings["seed"], flight])
     model = jaxos4.FlightModel(airframe, terms=TERMS)
     truth = truth_of(model, rng)
-    omega = commands(model, truth, duration, rng)
+    omega = commands(model, truth, settings["duration"], rng)
     exact = np.asarray(fly(model, jnp.asarray(truth), jnp.asarray(omega)))
-    flight = recorded(omega, dirty(exact, rng))
+    measured = recorded(omega, dirty(exact, rng))
     sigma = np.append(3 * jaxos4.SENSOR_SIGMA, np.full(3, 0.3))
-    problem = jaxos4.ShootingProblem(model, flight, sigma=sigma, channels="rates", method="rk4")
+    problem = jaxos4.ShootingProblem(model, measured, sigma=sigma, channels="rates", method="rk4")
     begin = time.perf_counter()
-    one_recording = np.zeros(flight.time.shape[0], dtype=int)
+    one_recording = np.zeros(measured.time.shape[0], dtype=int)
     fit = fit_innovations(make_estimator(estimator), jaxos4.InnovationsProblem(problem), one_recording)
     seconds, values = time.perf_counter() - begin, np.asarray(fit.estimate.parameters)
     half_width = np.asarray(fit.estimate.half_width(0.95))
     free = {model.parameter_names[i]: i for i in fit.free}
     return {
-        "flight": i,
         "fastest": float(np.abs(exact[:, :3]).max()),
         "result": str(jaxos4.result_names(fit.estimate.result)),
         "truth": dict(zip(model.parameter_names, truth.tolist(), strict=True)),
@@ -162,7 +159,7 @@ def identify(airframe: jaxos4.Airframe, estimator: str, duration: float, seed: i
     }
 
 
-def summary(flights: list[dict]) -> dict[str, dict]:
+def summary(flights: list[Row]) -> dict[str, Row]:
     """For each parameter: in how many flights it was identified, and how often the interval held the truth.
 
     `bias`, `spread`: mean and standard deviation of the errors, in standard deviations of the fits.
@@ -188,57 +185,36 @@ def summary(flights: list[dict]) -> dict[str, dict]:
     return rows
 
 
+def table_rows(summary: Row) -> Iterator[tuple[str, ...]]:
+    """One line for each parameter."""
+    for parameter, row in summary.items():
+        yield (
+            *(parameter, str(row["identified"])),
+            *(f"{100 * row['covered']:.1f}", f"{100 * row['monte_carlo_error']:.1f}", f"{row['bias']:.2f}"),
+            "-" if row["spread"] is None else f"{row['spread']:.2f}",
+            *(f"{row['mean_error']:.2g}", f"{row['claimed_over_bound']:.2f}"),
+        )
+
+
 def main(
     flights: Annotated[int, typer.Option(help="Flights of each airframe.")] = 120,
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 15.0,
     seed: Annotated[int, typer.Option(help="Random seed of parameters, commands and noise.")] = 17,
     airframes: Annotated[list[str], typer.Option(help="Names of airframes.")] = tuple(AIRFRAMES),
     estimator: Annotated[str, typer.Option(help="filter-error or ibss.")] = "filter-error",
-    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the figures; continued if it exists.")] = None,
 ) -> None:
     """Coverage of 95 % intervals on dirty flights."""
-    rows = {}
+    settings = {"seed": seed, "duration": duration, "estimator": estimator}
+    report = continued(out, settings, "airframes")
+    report["airframes"] = report["airframes"] or {}
     for name in airframes:
-        found = []
-        for i in range(flights):
-            found.append(identify(AIRFRAMES[name], estimator, duration, seed, i))
-            rows[name] = {"summary": summary(found), "flights": found}
-            if out is not None:
-                report = {
-                    "version": jaxos4.__version__,
-                    "precision": "float64",
-                    "seed": seed,
-                    "duration": duration,
-                    "estimator": estimator,
-                    "airframes": rows,
-                }
-                out.write_text(json.dumps(report, indent=2) + "\n")
-        seconds = float(np.median([flight["seconds"] for flight in found]))
-        table = Table(title=f"95 % intervals of {flights} flights of {duration:g} s, {name}, {seconds:.1f} s a fit")
-        for heading in (
-            "parameter",
-            "identified",
-            "covered [%]",
-            "+-",
-            "bias [std]",
-            "spread [std]",
-            "mean error",
-            "/ CRB",
-        ):
-            table.add_column(heading)
-        for parameter, row in rows[name]["summary"].items():
-            table.add_row(
-                parameter,
-                str(row["identified"]),
-                f"{100 * row['covered']:.1f}",
-                f"{100 * row['monte_carlo_error']:.1f}",
-                f"{row['bias']:.2f}",
-                "-" if row["spread"] is None else f"{row['spread']:.2f}",
-                f"{row['mean_error']:.2g}",
-                f"{row['claimed_over_bound']:.2f}",
-            )
-        Console(width=120).print(table)
-
-
-if __name__ == "__main__":
-    typer.run(main)
+        case = report["airframes"].setdefault(name, {"summary": {}, "flights": []})
+        numbers = ({"flight": i} for i in range(flights))
+        fill(out, report, case["flights"], numbers, functools.partial(identify, AIRFRAMES[name], estimator, settings))
+        case["summary"] = summary(case["flights"])
+        write_report(out, report)
+        seconds = float(np.median([flight["seconds"] for flight in case["flights"]]))
+        title = f"95 % intervals of {flights} flights of {duration:g} s, {name}, {seconds:.1f} s a fit"
+        headings = "parameter", "identified", "covered [%]", "+-", "bias [std]", "spread [std]", "mean error", "/ CRB"
+        print_table(title, headings, table_rows(case["summary"]), width=120)

@@ -4,8 +4,6 @@ Many noisy standard flights are identified in one call, by IBSS if the case name
 with the model that is fitted (the inverse crime), so that the bound applies.
 """
 
-import json
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -15,16 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, continued, count_results, in_words, print_table, write_report
+from experiments.shared import PARAMETERS
 from jaxos4.results import NINETY_FIVE
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import PARAMETERS, count_results, in_words, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 
 class Case(NamedTuple):
@@ -50,7 +43,7 @@ CASES = {
 }
 
 
-def study(case: Case, flights: int, seed: int, *, scale: float) -> dict:
+def study(case: Case, flights: int, seed: int, *, scale: float) -> Row:
     """Identify noisy standard flights, each from a random start within 80 % of the default bracket."""
     model = case.model(jaxos4.OS4)
     flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
@@ -99,28 +92,21 @@ def main(
     seed: Annotated[int, typer.Option(help="Random seed for noise and starts.")] = 0,
     scale: Annotated[float, typer.Option(help="Noise scale, in multiples of the standard sensor noise.")] = 1.0,
     cases: Annotated[list[str], typer.Option(help="Names of the cases.")] = tuple(CASES),
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure RMSE / Cramer-Rao bound for each parameter."""
-    report = {"flights": flights, "seed": seed, "scale": scale, "version": jaxos4.__version__, "cases": {}}
-    title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
-    table = table_of(title, ("case", *PARAMETERS, "covered", "results", "rollouts", "s"))
+    report = continued(out, {"flights": flights, "seed": seed, "scale": scale}, "cases")
+    report["cases"] = dict(report["cases"])
     for case in cases:
-        row = study(CASES[case], flights, seed, scale=scale)
-        report["cases"][case] = row
-        figures = [f"{x:.2f}" for x in row["efficiency"]]
-        table.add_row(
-            case,
-            *figures,
-            f"{row['covered']:.3f}",
-            in_words(row["results"]),
-            f"{row['rollouts']:.0f}",
-            f"{row['seconds']:.1f}",
+        if case not in report["cases"]:
+            report["cases"][case] = study(CASES[case], flights, seed, scale=scale)
+            write_report(out, report)
+    cells = (
+        (
+            *(case, *(f"{x:.2f}" for x in row["efficiency"]), f"{row['covered']:.3f}"),
+            *(in_words(row["results"]), f"{row['rollouts']:.0f}", f"{row['seconds']:.1f}"),
         )
-    Console(width=150).print(table)
-    if out is not None:
-        out.write_text(json.dumps(report, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+        for case, row in report["cases"].items()
+    )
+    title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
+    print_table(title, ("case", *PARAMETERS, "covered", "results", "rollouts", "s"), cells)

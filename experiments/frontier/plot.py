@@ -4,20 +4,13 @@ One panel for each model and input, one row for each parameter. The vertical lin
 a parameter to its left cannot be distinguished from 0 with them.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from experiments.shared import load_results, plotter
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import load_results, write_figure
 
 
 def draw(data: xr.Dataset) -> Figure:
@@ -64,11 +57,4 @@ def draw(data: xr.Dataset) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draw the results of run.py."""
-    data = load_results(results)
-    write_figure(lambda: draw(data), figures, "frontier")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(load_results, {"frontier": draw})

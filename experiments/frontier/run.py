@@ -5,26 +5,19 @@ and a known initial state. It depends on the model, the input, the duration and 
 """
 
 import itertools
-import sys
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
 import xarray as xr
 
 import jaxos4
+from experiments.shared import save_results
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import save_results
-
-jax.config.update("jax_enable_x64", True)
 
 DIMS = ("model", "excitation", "duration", "channels", "parameter")
 
@@ -51,7 +44,3 @@ def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for
     shape = [len(axis) for axis in coordinates.values()]
     frontier = xr.DataArray(values.reshape(shape), coordinates, DIMS, attrs={"units": "1"})
     save_results(xr.Dataset({"frontier": frontier}), study, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -3,20 +3,13 @@
 One column for each method of the fit, one line for each method of the simulation.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.shared import draw_spread, plotter, read_each
 from jaxos4.report.style import FAINT, INK, grid, log_axis, scale_axis, styles
-from jaxos4.study import metrics, read_results
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import draw_spread, write_figure
+from jaxos4.study import metrics
 
 # 95 % quantile of the largest of eight Gaussian magnitudes, in standard deviations.
 LARGEST_OF_EIGHT = 2.73
@@ -55,11 +48,4 @@ def draw(studies: dict[str, xr.Dataset]) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draw the results of run.py. Dashed line: chance alone exceeds this bias in 5 % of all cases."""
-    folders = [path.parent for path in sorted(results.glob("*/results.nc"))]
-    write_figure(lambda: draw({folder.name: read_results(folder) for folder in folders}), figures, "inverse_crime")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_each, {"inverse_crime": draw})

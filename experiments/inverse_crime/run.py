@@ -4,18 +4,14 @@ The script writes a folder for each method and sample time of the fit. Each fold
 simulation.
 """
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import typer
 
+from experiments.shared import run_studies
 from jaxos4.study import load_study
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import run_studies
 
 
 def main(
@@ -32,7 +28,3 @@ def main(
         for method in fit_methods
     }
     run_studies(variants, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -5,8 +5,8 @@ term for this factor. The simulated body rates drift away from the measured ones
 a window.
 """
 
-import json
-import sys
+import functools
+import itertools
 import time
 from pathlib import Path
 from typing import Annotated
@@ -16,15 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import PARAMETERS, count_results, in_words, table_of
-
-jax.config.update("jax_enable_x64", True)
+from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
+from experiments.shared import PARAMETERS
 
 SHOOTING = {"ibss": jaxos4.IBSS, "output-error": jaxos4.OutputError}
 # The parameters that are compared: those that are identifiable and not 0.
@@ -47,7 +42,7 @@ def drifting(duration: float, drift: float, flights: int, seed: int) -> tuple[ja
     return recorded, fly(jax.random.split(jax.random.key(seed), flights))
 
 
-def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int, steps: int) -> dict:
+def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int, steps: int) -> Row:
     """The results of one estimator with one number of windows: a row of the table."""
     model, flights = jaxos4.PublishedOS4(jaxos4.OS4), states.shape[0]
     bracket = jaxos4.Bracket.default(model)
@@ -77,8 +72,6 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
     answered = results == "successful"
     errors = np.asarray(found.parameters / model.alpha - 1)[:, COMPARED]
     return {
-        "windows": windows,
-        "estimator": name,
         "results": count_results(results),
         "successful": int(answered.sum()),
         "percent": (100 * np.sqrt(np.mean(errors[answered] ** 2, axis=0))).tolist() if answered.any() else None,
@@ -95,31 +88,27 @@ def main(
     windows: Annotated[list[int], typer.Option(help="Numbers of windows.")] = (1, 6, 30, 120),
     estimators: Annotated[list[str], typer.Option(help="Names; also hybrid (slow).")] = tuple(SHOOTING),
     steps: Annotated[int, typer.Option(help="Training steps of the hybrid's networks.")] = 1000,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Compare one window with many on long flights."""
+    flown = functools.cache(lambda drift: drifting(duration, drift, flights, seed))
+
+    def row_of(drift: float, windows: int, estimator: str) -> Row:
+        return identify(estimator, *flown(drift), windows, steps)
+
+    report = continued(out, {"seed": seed, "duration": duration, "flights": flights}, "rows")
+    trials = (
+        {"drift": drift, "windows": count, "estimator": name}
+        for drift, count, name in itertools.product(drifts, windows, estimators)
+    )
+    fill(out, report, report["rows"], trials, row_of)
+    cells = (
+        (
+            *(f"{row['drift']:g}", str(row["windows"]), row["estimator"]),
+            *((f"{x:.2g}" for x in row["percent"]) if row["percent"] else "-" * len(COMPARED)),
+            *(f"{row['rollouts']:.0f}", f"{row['seconds']:.2g}", in_words(row["results"])),
+        )
+        for row in report["rows"]
+    )
     headings = "drift", "windows", "estimator", *(PARAMETERS[i] for i in COMPARED), "rollouts", "s", "results"
-    rows, table = [], table_of(f"RMS error [%] on {flights} flights of {duration:g} s, rates", headings)
-    for drift in drifts:
-        recorded, states = drifting(duration, drift, flights, seed)
-        for count in windows:
-            for name in estimators:
-                row = identify(name, recorded, states, count, steps)
-                rows.append({"drift": drift, **row})
-                table.add_row(
-                    f"{drift:g}",
-                    str(count),
-                    name,
-                    *((f"{x:.2g}" for x in row["percent"]) if row["percent"] else "-" * len(COMPARED)),
-                    f"{row['rollouts']:.0f}",
-                    f"{row['seconds']:.2g}",
-                    in_words(row["results"]),
-                )
-                if out is not None:
-                    report = {"version": jaxos4.__version__, "seed": seed, "duration": duration, "rows": rows}
-                    out.write_text(json.dumps(report, indent=2) + "\n")
-    Console(width=150).print(table)
-
-
-if __name__ == "__main__":
-    typer.run(main)
+    print_table(f"RMS error [%] on {flights} flights of {duration:g} s, rates", headings, cells)

@@ -4,12 +4,10 @@ Each error is in units of the Cramer-Rao bound at that flight's own truth.
 """
 
 import functools
-import json
 import os
 import resource
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -18,16 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, count_results, in_words, print_table, write_report
+from experiments.shared import PARAMETERS, identify, measure
 from jaxos4.study import metrics
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import PARAMETERS, count_results, identify, in_words, measure, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 CHUNK = 250
 LEVELS = (0.5, 0.9, 0.99)
@@ -174,6 +167,16 @@ def amortised(case: Case, network: jaxos4.TrainedNetwork, channels: str, flights
     }
 
 
+def cells(row: Row) -> tuple[str, ...]:
+    """A row of the table."""
+    return (
+        *(row["case"], row["estimator"], f"{row['noise']:g}", *(f"{x:.2f}" for x in row["efficiency"])),
+        " ".join(f"{100 * x:.1f}" for x in row["covered"]),
+        "" if row["hit_rate"] is None else f"{100 * row['hit_rate']:.1f}",
+        *(f"{row['rollouts']:.0f}", f"{row['flights_per_second'] or 0:.0f}", in_words(row["results"])),
+    )
+
+
 def main(
     flights: Annotated[int, typer.Option(help="New flights for each row.")] = 2000,
     seed: Annotated[int, typer.Option(help="Random seed for the new flights; networks are trained with seed 0.")] = 7,
@@ -191,51 +194,32 @@ def main(
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
     """Networks, hybrid and IBSS on flights drawn over the whole bracket."""
-    report: dict = {"flights": flights, "seed": seed, "version": jaxos4.__version__, "load": os.getloadavg()}
+    report: Row = {"flights": flights, "seed": seed, "version": jaxos4.__version__, "load": os.getloadavg()}
     report |= {"rows": [], "training_seconds": {}}
-    console = Console(width=170)
-    headings = "case", "estimator", "noise", *PARAMETERS, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"
-    table = table_of(
-        f"RMSE / Cramer-Rao bound: of the rates for a network alone, of {channels} for the others", headings
-    )
 
-    def add(name: str, label: str, noise: float, row: dict) -> None:
-        report["rows"].append({"case": name, "estimator": label, "noise": noise, **row})
-        table.add_row(
-            name,
-            label,
-            f"{noise:g}",
-            *(f"{x:.2f}" for x in row["efficiency"]),
-            " ".join(f"{100 * x:.1f}" for x in row["covered"]),
-            "" if row["hit_rate"] is None else f"{100 * row['hit_rate']:.1f}",
-            f"{row['rollouts']:.0f}",
-            f"{row['flights_per_second'] or 0:.0f}",
-            in_words(row["results"]),
-        )
-        if out is not None:
-            out.write_text(json.dumps(report, indent=2) + "\n")
+    def add(name: str, label: str, rows: Iterable[tuple[float, Row]]) -> None:
+        for noise, row in rows:
+            report["rows"].append({"case": name, "estimator": label, "noise": noise, **row})
+            write_report(out, report)
 
     def fit(case: Case, settings: dict) -> tuple[jaxos4.TrainedNetwork, float]:
         begin = time.perf_counter()
-        settings = settings if steps is None else {**settings, "steps": steps}
-        trained = jaxos4.NetworkEstimator(**settings).fit(
-            case.problem(case.flight, 1.0), case.bracket, key=jax.random.key(0)
-        )
+        estimator = jaxos4.NetworkEstimator(**settings | ({} if steps is None else {"steps": steps}))
+        trained = estimator.fit(case.problem(case.flight, 1.0), case.bracket, key=jax.random.key(0))
         return trained, time.perf_counter() - begin
 
     for name in cases:
         case = CASES[name]
         for label in networks if name == "standard" else networks[:1]:
             trained, seconds = fit(case, NETWORKS[label])
-            console.print(f"{name}: {label} trained in {seconds:.0f} s", highlight=False)
+            print(f"{name}: {label} trained in {seconds:.0f} s")
             report["training_seconds"][f"{name}: {label}"] = seconds
-            for noise, row in unseen(case, trained, channels, "rates", noises, flights, seed):
-                add(name, label, noise, row)
+            add(name, label, unseen(case, trained, channels, "rates", noises, flights, seed))
             if "features" in NETWORKS[label]:
                 continue
             if name == "standard" and label == networks[0]:
                 report["one_call"] = amortised(case, trained, channels, many)
-                console.print(f"one call: {report['one_call']}", highlight=False)
+                print(f"one call: {report['one_call']}")
             seeds = trained
             if channels != trained.channels:
                 seeds, seconds = fit(case, {**NETWORKS[label], "channels": channels})
@@ -243,18 +227,13 @@ def main(
             searches = {f"hybrid from {label}": jaxos4.Hybrid(seeds)}
             searches |= {"ibss": jaxos4.IBSS()} if label == networks[0] else {}
             for other, estimator in searches.items():
-                for noise, row in unseen(case, estimator, channels, channels, noises, flights, seed):
-                    add(name, other, noise, row)
+                add(name, other, unseen(case, estimator, channels, channels, noises, flights, seed))
         for noise in noises if name == "standard" and separate else ():
             trained, seconds = fit(case, {**NETWORKS[networks[0]], "noise": (noise, noise)})
             label = f"{networks[0]}, this noise only"
             report["training_seconds"][f"{name}: {label} {noise:g}"] = seconds
-            for _, row in unseen(case, trained, channels, "rates", [noise], flights, seed):
-                add(name, label, noise, row)
-    console.print(table)
-    if out is not None:
-        out.write_text(json.dumps(report, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+            add(name, label, unseen(case, trained, channels, "rates", [noise], flights, seed))
+    write_report(out, report)
+    headings = "case", "estimator", "noise", *PARAMETERS, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"
+    title = f"RMSE / Cramer-Rao bound: of the rates for a network alone, of {channels} for the others"
+    print_table(title, headings, map(cells, report["rows"]), width=170)

@@ -1,19 +1,12 @@
 """RMSE / bound of white noise, and coverage of 95 % intervals, for each kind of noise."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.shared import draw_spread, plotter
 from jaxos4.report.style import INK, grid, log_axis, styles
 from jaxos4.study import metrics, read_results
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import draw_spread, write_figure
 
 LEVEL = 0.95
 
@@ -43,10 +36,4 @@ def draw(data: xr.Dataset) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draws the results of `jaxos4 study`."""
-    write_figure(lambda: draw(read_results(results)), figures, "noise_kinds")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_results, {"noise_kinds": draw})

@@ -1,4 +1,4 @@
-"""The pictures of the documentation, drawn from real results: `python experiments/pictures/run.py docs/pictures`."""
+"""The pictures of the documentation, drawn from real results: `python -m experiments pictures.run docs/pictures`."""
 
 import tomllib
 from html import escape
@@ -188,7 +188,6 @@ def main(
     pyproject: Annotated[Path, typer.Option(help="Where the floors are written.")] = Path("pyproject.toml"),
 ) -> None:
     """Draws the pictures of the documentation as SVG."""
-    jax.config.update("jax_enable_x64", True)
     chosen = only or list(PICTURES)
     out.mkdir(parents=True, exist_ok=True)
     if "floors" in chosen:
@@ -217,7 +216,3 @@ def main(
         for name, draw in drawings.items():
             if name in chosen:
                 draw().savefig(out / f"{name}.svg", metadata={"Date": None})
-
-
-if __name__ == "__main__":
-    typer.run(main)

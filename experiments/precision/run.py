@@ -5,26 +5,19 @@ in double precision, and networks are trained in it. Estimators that see the rat
 """
 
 import io
-import json
-import sys
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, count_results, in_words, print_table, write_report
+from experiments.shared import PARAMETERS, brackets_around, identify, measure
 from jaxos4._custom_types import as_float
 from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.networks import encode_network
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 MODEL, DT = jaxos4.PublishedOS4, 0.01
 
@@ -93,10 +86,6 @@ def main(
         trained = jaxos4.NetworkEstimator(steps=steps).fit(standard, bracket, key=jax.random.key(0))
         network = encode_network(trained)
 
-    report: dict = {"flights": flights, "seed": seed, "scale": scale, "known": known, "rows": []}
-    report |= {"version": jaxos4.__version__}
-    title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
-    table = table_of(title, ("estimator", "precision", *PARAMETERS, "covered", "largest difference", "results"))
     bounds, found = {}, {}
     for name in estimators:
         bound = jaxos4.cramer_rao_bound(case.problem(flown, ESTIMATORS[name].looks_at), model.alpha)
@@ -108,18 +97,21 @@ def main(
                 loaded = jaxos4.load_network(io.BytesIO(network)) if ESTIMATORS[name].needs_network else None
                 problem = case.problem(np.zeros_like(flown), ESTIMATORS[name].looks_at)
                 found[name, precision] = Answers.of(make_estimator(name, loaded), problem, brackets, states)
-    for name in estimators:
-        for precision in ("float64", "float32"):
-            row = {"estimator": name, "precision": precision}
-            row |= found[name, precision].summary(found[name, "float64"], truth, bounds[name])
-            report["rows"].append(row)
-            figures = [f"{x:.3g}" for x in row["efficiency"]]
-            numbers = f"{row['covered']:.3f}", f"{row['largest_difference']:.2g}"
-            table.add_row(name, precision, *figures, *numbers, in_words(row["results"]))
-    Console(width=170).print(table)
-    if out is not None:
-        out.write_text(json.dumps(report, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+    report: Row = {"flights": flights, "seed": seed, "scale": scale, "known": known, "version": jaxos4.__version__}
+    report["rows"] = [
+        {"estimator": name, "precision": precision}
+        | found[name, precision].summary(found[name, "float64"], truth, bounds[name])
+        for name in estimators
+        for precision in ("float64", "float32")
+    ]
+    cells = (
+        (
+            *(row["estimator"], row["precision"], *(f"{x:.3g}" for x in row["efficiency"])),
+            *(f"{row['covered']:.3f}", f"{row['largest_difference']:.2g}", in_words(row["results"])),
+        )
+        for row in report["rows"]
+    )
+    title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
+    headings = "estimator", "precision", *PARAMETERS, "covered", "largest difference", "results"
+    print_table(title, headings, cells, width=170)
+    write_report(out, report)

@@ -4,25 +4,16 @@ A radio brings each command as it was at one moment. The flight is the Crazyflie
 is identified with all commands, and with one in 10, 20 and 40, each held until the next.
 """
 
-import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import interval, print_table, write_report
+from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
-from jaxos4.results import NINETY_FIVE
-
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-
-from shared import flight_files, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 AIRFRAME = jaxos4.load_airframe("crazyflie")
 FLIGHT, STEP = "arpl_crazyflie_rollpitch.csv", 0.01
@@ -43,21 +34,13 @@ def main(
     """Identify a flight with all of its commands, and with some."""
     recording = read_recording(*flight_files(flights, [FLIGHT]), AIRFRAME)
     settings, report = jaxos4.VehicleSettings(sample_time=STEP, end=end), {}
-    table = table_of("95 % intervals", ("one command of", *SHOWN, "result", "doubts"))
     for n in every:
         found = jaxos4.identify([thinned(recording, n)], AIRFRAME, settings=settings).to_dict()
         report[n] = {name: found[name] for name in ("result", "doubts", "parameters", "constants")}
-        out.write_text(json.dumps(report, indent=1) + "\n")
-        rows = found["parameters"] | found["constants"]
-        cells = [
-            f"{size * rows[name]['estimate']:.2f} +- {NINETY_FIVE * size * rows[name]['std']:.2f}"
-            if name in rows and rows[name]["estimate"] is not None
-            else ""
-            for name, size in SHOWN.items()
-        ]
-        table.add_row(str(n), *cells, found["result"], "; ".join(each["cause"] for each in found["doubts"]))
-    Console(width=180).print(table)
-
-
-if __name__ == "__main__":
-    typer.run(main)
+        write_report(out, report)
+    rows = []
+    for n, found in report.items():
+        known = found["parameters"] | found["constants"]
+        numbers = (interval(known.get(name), size) for name, size in SHOWN.items())
+        rows.append((str(n), *numbers, found["result"], "; ".join(each["cause"] for each in found["doubts"])))
+    print_table("95 % intervals", ("one command of", *SHOWN, "result", "doubts"), rows, width=180)

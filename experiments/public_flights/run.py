@@ -13,27 +13,20 @@ rates that is trained on the identified flights. Each flight is predicted with t
 """
 
 import itertools
-import json
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, interval, print_table, write_report
+from experiments.public_flights.clocks import aligned
+from experiments.public_flights.rate_network import errors_of, trained
+from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
 from jaxos4.results import NINETY_FIVE
-
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-
-from clocks import aligned
-from rate_network import errors_of, trained
-from shared import flight_files, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 AIRFRAME = jaxos4.load_airframe("crazyflie")
 FITTED = ("B8_star_fast_rep1", "B5_helix_fast_mell_rep1", "B9_trefoil_fast_rep4")
@@ -76,33 +69,34 @@ def agreement(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
     return {"flights": names, "pairs": pairs, "share": float(np.nanmean(inside)), "ci95": ends}
 
 
-def print_flights(report: dict[str, Any]) -> None:
+def print_flights(report: Row) -> None:
     """One line for each flight that was identified alone, and the agreement of these flights."""
-    headings = "flight", "result", *(f"{name} [1e-5 kg m^2]" for name in INERTIAS), "results"
-    table = table_of("each flight alone, 95 % intervals", headings)
-    for flight, row in report["alone"].items():
-        values = [row["constants"].get(name) for name in INERTIAS]
-        numbers = (f"{1e5 * x['estimate']:.2f} +- {1e5 * NINETY_FIVE * x['std']:.2f}" if x else "" for x in values)
-        table.add_row(flight, row["result"], *numbers, "; ".join(each["cause"] for each in row["doubts"]))
-    console = Console(width=180)
-    console.print(table)
-    for which, found in report["pairs"].items():
-        console.print(
-            f"{which}: {found['pairs']} pairs, share inside 95 %: {found['share']}, by flight {found['ci95']}"
+    rows = (
+        (
+            *(flight, row["result"], *(interval(row["constants"].get(name), 1e5) for name in INERTIAS)),
+            "; ".join(each["cause"] for each in row["doubts"]),
         )
+        for flight, row in report["alone"].items()
+    )
+    headings = "flight", "result", *(f"{name} [1e-5 kg m^2]" for name in INERTIAS), "results"
+    print_table("each flight alone, 95 % intervals", headings, rows, width=180)
+    for which, found in report["pairs"].items():
+        print(f"{which}: {found['pairs']} pairs, share inside 95 %: {found['share']}, by flight {found['ci95']}")
 
 
-def print_table(report: dict[str, Any]) -> None:
+def print_errors(report: Row) -> None:
     """One line for each flight and quantity."""
     kinds = "error", "constant", "regression", "network"
+
+    def rows() -> Iterator[tuple[str, ...]]:
+        for flight, found in report["flights"].items():
+            for quantity, row in found["quantities"].items():
+                cells = [row["sum"].get(kind) for kind in kinds]
+                cells += [row[kind][9] if kind in row else None for kind in kinds]
+                yield flight, quantity, row["unit"], *("" if x is None else f"{x:.3g}" for x in cells)
+
     headings = "flight", "quantity", "unit", *kinds, "0.1 s: error", *kinds[1:]
-    table = table_of("mean absolute error: the sum over 50 steps of 10 ms, and 0.1 s ahead", headings)
-    for flight, found in report["flights"].items():
-        for quantity, row in found["quantities"].items():
-            cells = [row["sum"].get(kind) for kind in kinds]
-            cells += [row[kind][9] if kind in row else None for kind in kinds]
-            table.add_row(flight, quantity, row["unit"], *("" if x is None else f"{x:.3g}" for x in cells))
-    Console(width=150).print(table)
+    print_table("mean absolute error: the sum over 50 steps of 10 ms, and 0.1 s ahead", headings, rows())
 
 
 def main(
@@ -123,7 +117,7 @@ def main(
     print(f"{', '.join(fitted)}: {found.result}, {found.seconds:.0f} s", flush=True)
     vehicle = jaxos4.forecast.vehicle_of(found)
     networks = [trained([recordings[name] for name in fitted], batches=batches, seed=seed) for seed in range(SEEDS)]
-    report: dict[str, Any] = {"version": jaxos4.__version__, "identification": found.to_dict(), "flights": {}}
+    report: Row = {"version": jaxos4.__version__, "identification": found.to_dict(), "flights": {}}
     for name in predicted:
         prediction = jaxos4.predict(vehicle, recordings[name], sample_time=STEP)
         row = prediction.to_dict()
@@ -131,16 +125,12 @@ def main(
             row["quantities"][quantity] |= {"network": errors}
             row["quantities"][quantity]["sum"] |= {"network": sum(errors)}
         report["flights"][name] = row
-        out.write_text(json.dumps(report, indent=1) + "\n")
-    print_table(report)
+        write_report(out, report)
+    print_errors(report)
     report["alone"] = {name: alone([recordings[name]], end) for name in compared}
     trusted = {name: row for name, row in report["alone"].items() if row["result"] == "successful"}
     report["pairs"] = {"not refused": agreement(trusted), "all that have a number": agreement(report["alone"])}
     if len(compared) > 1:
         report["alone"]["all together"] = alone([recordings[name] for name in compared], end)
-    out.write_text(json.dumps(report, indent=1) + "\n")
+    write_report(out, report)
     print_flights(report)
-
-
-if __name__ == "__main__":
-    typer.run(main)

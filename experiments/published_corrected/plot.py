@@ -1,19 +1,12 @@
 """Plots what each model can identify, the errors of its fits, and the tests of their residuals."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.shared import load_results, plotter
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
 from jaxos4.results import NINETY_FIVE
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import load_results, write_figure
 
 LEVEL = 0.01
 TESTS = {"white_p": "white", "input_p": "free of\ninputs", "level_p": "of the\nnoise's size"}
@@ -56,11 +49,4 @@ def draw(data: xr.Dataset) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draw the results of run.py."""
-    data = load_results(results)
-    write_figure(lambda: draw(data), figures, "published_corrected")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(load_results, {"published_corrected": draw})

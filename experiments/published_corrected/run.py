@@ -6,7 +6,6 @@ model.
 """
 
 import itertools
-import sys
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -18,15 +17,10 @@ import typer
 import xarray as xr
 
 import jaxos4
+from experiments.shared import measure, save_results
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import measure, save_results
-
-jax.config.update("jax_enable_x64", True)
 
 
 class Fits(NamedTuple):
@@ -109,7 +103,3 @@ def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for
         for case in itertools.product(*cases)
     ]
     save_results(xr.combine_by_coords(parts), study, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

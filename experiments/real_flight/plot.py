@@ -1,19 +1,12 @@
 """The moments of inertia that each flight says, with 95 % intervals, and how well what was not fitted is predicted."""
 
-import json
-import sys
-from pathlib import Path
 from typing import Any
 
-import typer
 from matplotlib.figure import Figure
 
+from experiments.shared import plotter, read_json
 from jaxos4.report.style import BOUND_DASHES, INK, grid, styles
 from jaxos4.results import NINETY_FIVE
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import write_figure
 
 INERTIAS, RATES = ("Ix", "Iy"), ("p", "q")
 
@@ -55,11 +48,4 @@ def draw(report: dict[str, Any]) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote: a JSON file."""
-    report = json.loads(results.read_text(encoding="utf-8"))
-    write_figure(lambda: draw(report), figures, "real_flight")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(read_json, {"real_flight": draw})

@@ -10,24 +10,16 @@ deviation; 99 % of such figures should be below 2.58.
 """
 
 import itertools
-import json
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, interval, print_table, write_report
+from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
-from jaxos4.results import NINETY_FIVE
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import flight_files, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 AIRFRAME = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
 AUTHORS = {"Ix": 1.03e-5, "Iy": 1.11e-5}
@@ -66,24 +58,24 @@ def disagreements(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]
     return table
 
 
-def print_table(report: dict[str, Any]) -> None:
-    """One line for each estimator and flight."""
+def print_report(report: Row) -> None:
+    """One line for each estimator and flight, and the largest disagreement of two flights."""
+
+    def rows() -> Iterator[tuple[str, ...]]:
+        for estimator, found in report["estimators"].items():
+            for flight, row in found["flights"].items():
+                skills = [row["ahead"].get(rate) for rate in "pq"]
+                yield (
+                    *(estimator, flight, row["result"]),
+                    *(interval(row["constants"].get(name), 1e5, "3g", "2g") for name in INERTIAS),
+                    *(f"{x[0]:.2f} +- {x[1]:.2f}" if x else "" for x in skills),
+                )
+
     headings = "estimator", "flight", "result", *(f"{name} [1e-5 kg m^2]" for name in INERTIAS), "skill p", "skill q"
-    table = table_of(f"moments of inertia with 95 % intervals, and the skill {AHEAD:g} s ahead", headings)
-    for estimator, rows in report["estimators"].items():
-        for flight, row in rows["flights"].items():
-            inertias = [row["constants"].get(name) for name in INERTIAS]
-            skills = [row["ahead"].get(rate) for rate in "pq"]
-            table.add_row(
-                *(estimator, flight, row["result"]),
-                *(f"{1e5 * x['estimate']:.3g} +- {1e5 * NINETY_FIVE * x['std']:.2g}" if x else "" for x in inertias),
-                *(f"{x[0]:.2f} +- {x[1]:.2f}" if x else "" for x in skills),
-            )
-    console = Console(width=150)
-    console.print(table)
-    for estimator, rows in report["estimators"].items():
-        worst = ", ".join(f"{name} {max(pairs.values()):.2g}" for name, pairs in rows["z"].items())
-        console.print(f"{estimator}: the largest disagreement of two flights (z): {worst or 'no pair'}")
+    print_table(f"moments of inertia with 95 % intervals, and the skill {AHEAD:g} s ahead", headings, rows())
+    for estimator, found in report["estimators"].items():
+        worst = ", ".join(f"{name} {max(pairs.values()):.2g}" for name, pairs in found["z"].items())
+        print(f"{estimator}: the largest disagreement of two flights (z): {worst or 'no pair'}")
 
 
 def main(
@@ -99,13 +91,9 @@ def main(
     groups = {name: [recording] for name, recording in recordings.items()}
     if len(groups) > 1:
         groups[TOGETHER] = list(recordings.values())
-    report: dict[str, Any] = {"version": jaxos4.__version__, "authors": AUTHORS, "estimators": {}}
+    report: Row = {"version": jaxos4.__version__, "authors": AUTHORS, "estimators": {}}
     for estimator in estimators:
         rows = {name: identified(group, estimator, end=end) for name, group in groups.items()}
         report["estimators"][estimator] = {"flights": rows, "z": disagreements(rows)}
-        out.write_text(json.dumps(report, indent=1) + "\n")
-    print_table(report)
-
-
-if __name__ == "__main__":
-    typer.run(main)
+        write_report(out, report)
+    print_report(report)

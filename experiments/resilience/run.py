@@ -1,6 +1,6 @@
 """Kills a study again and again and resumes it: are the results those of an uninterrupted run?
 
-    python experiments/resilience/run.py SPEC.toml --out FOLDER
+    python -m experiments resilience.run SPEC.toml --out FOLDER
 
 Writes FOLDER/whole, an uninterrupted run; FOLDER/killed, killed ten times; and FOLDER/report.json.
 """
@@ -108,7 +108,3 @@ def _bytes(folder: Path, kind: str) -> dict[str, bytes]:
 def _results(folder: Path) -> xr.Dataset:
     with xr.open_dataset(folder / RESULTS_FILE) as dataset:
         return dataset.load()
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,18 +1,11 @@
 """Plots RMSE / bound, averaged over the parameters, against rollouts. One line for each search."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.shared import load_results, plotter
 from jaxos4.report.style import INK, grid, log_axis, styles
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import load_results, write_figure
 
 SEARCHES = ("IBSS", "output error", "hybrid")
 LOOKS = dict(zip(SEARCHES, styles(["ibss", "output-error", "hybrid"]).values(), strict=True))
@@ -45,11 +38,4 @@ def draw(data: xr.Dataset) -> Figure:
     return figure
 
 
-def main(results: Path, figures: Path) -> None:
-    """Draw the results of run.py."""
-    data = load_results(results)
-    write_figure(lambda: draw(data), figures, "rollout_budget")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+main = plotter(load_results, {"rollout_budget": draw})

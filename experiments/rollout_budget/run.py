@@ -5,7 +5,6 @@ All flights have the same true vehicle. Each bracket's center is drawn within 80
 the truth.
 """
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -18,16 +17,10 @@ import typer
 import xarray as xr
 
 import jaxos4
+from experiments.shared import save_results
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import save_results
-
-jax.config.update("jax_enable_x64", True)
-
 
 SEARCHES: dict[str, Callable[[int], jaxos4.AbstractEstimator]] = {
     "IBSS": lambda most: jaxos4.IBSS(max_sweeps=most),
@@ -103,7 +96,3 @@ def main(
         {"channels": list(study.channels), "search": list(names), "limit": list(limits)},
     )
     save_results(results, study, out)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -123,7 +123,7 @@ def fly(gust: float, duration: float, seed: int, *, captured: bool = False) -> j
     return jaxos4.Flight(time=DT * np.arange(len(omega)), omega=omega, states=states, specific_force=force)
 
 
-def recorded(folder: Path, gust: float, i: int, duration: float, seed: int, *, captured: bool = False) -> Path:
+def recorded(folder: Path, i: int, gust: float, duration: float, seed: int, *, captured: bool = False) -> Path:
     """The file of flight `i`, which is flown only if there is none."""
     path = folder / f"gust{gust:g}_{duration:g}s_seed{seed}_{i:03}{'_captured' * captured}.csv"
     if not path.exists():

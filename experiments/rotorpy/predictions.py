@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from fits import given_airframe
-from flights import VEHICLE, quad_params
 
 import jaxos4
+from experiments.fits import given_airframe, whole
+from experiments.rotorpy.flights import VEHICLE, quad_params
 
 QUANTITIES = ("position", "velocity", "attitude", "rates")
 
@@ -32,12 +32,11 @@ def true_parameters(vehicle: jaxos4.forecast.Vehicle) -> np.ndarray:
 def prediction(flights: Sequence[jaxos4.Flight], i: int, horizon: float = 0.5) -> dict:
     """Identify flight `i` and predict the next one. Errors and shares inside the 95 % band at the horizon."""
     flight, other = flights[i], flights[(i + 1) % len(flights)]
-    whole = jaxos4.VehicleSettings(begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0)
-    found = jaxos4.identify(flight, given_airframe(VEHICLE, i), settings=whole, estimator="filter-error")
+    found = jaxos4.identify(flight, given_airframe(VEHICLE, i), settings=whole(flight), estimator="filter-error")
     vehicle = jaxos4.forecast.vehicle_of(found)
     true = vehicle._replace(parameters=true_parameters(vehicle), covariance=0 * vehicle.covariance)
     own, best = (jaxos4.predict(each, other, horizon=horizon).quality for each in (vehicle, true))
-    row: dict = {"flight": i, "result": found.result}
+    row: dict = {"result": found.result}
     for name in QUANTITIES:
         row[name] = {"error": own[name].error[-1], "true": best[name].error[-1], "held": own[name].coverage[-1]}
     return row

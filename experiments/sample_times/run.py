@@ -7,9 +7,8 @@ several sample times. A sample time of 0 is the one that the rule chooses.
 The simulator is finer than the log: four steps in each of its samples. The controller runs every 4 ms at most.
 """
 
-import json
-import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -17,16 +16,10 @@ import equinox as eqx
 import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.monte_carlo import Row, covered_error, monte_carlo, print_table, results_of
 from jaxos4.results import NINETY_FIVE
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from shared import count_results, in_words, table_of
-
-jax.config.update("jax_enable_x64", True)
 
 VEHICLE = jaxos4.Airframe(
     mass=0.428,
@@ -38,6 +31,7 @@ VEHICLE = jaxos4.Airframe(
     rotor_inertia=9e-7,
     max_rotor_speed=4100.0,
 )
+SAMPLE_TIMES = (0, 0.004, 0.008, 0.016, 0.032)
 LAG, PERIOD = 0.025, 0.004  # of rotors and controller [s]
 TRUTH = {
     "Ix": 6.3e-4,
@@ -66,7 +60,7 @@ def fly(logged: str, dt: float, duration: float, gust: float, noise: float, seed
     return eqx.tree_at(lambda f: f.omega, flight, np.maximum(noisy, 0.0))
 
 
-def fit(flight: jaxos4.Flight, sample_time: float) -> dict:
+def fit(flight: jaxos4.Flight, sample_time: float) -> Row:
     """The answer at one sample time: value and standard deviation of each quantity."""
     begin = time.perf_counter()
     settings = jaxos4.VehicleSettings(sample_time=sample_time or None, holdout=0.0)
@@ -81,7 +75,7 @@ def fit(flight: jaxos4.Flight, sample_time: float) -> dict:
     }
 
 
-def summary(rows: list[dict]) -> dict[str, dict]:
+def summary(rows: list[Row]) -> dict[str, Row]:
     """For each quantity: mean error with its Monte-Carlo error, and coverage. Shares of the truth if that is not 0."""
     found = {}
     for name, truth in TRUTH.items():
@@ -95,52 +89,40 @@ def summary(rows: list[dict]) -> dict[str, dict]:
             "mean": float(error.mean() / scale),
             "mean_error": float(error.std(ddof=1) / np.sqrt(len(pairs)) / scale),
             "covered": covered,
-            "covered_error": float(np.sqrt(max(covered * (1 - covered), 0.05 * 0.95) / len(pairs))),
+            "covered_error": covered_error(covered, len(pairs)),
         }
     return found
 
 
-def print_table(report: dict) -> None:
+def table_rows(report: Row) -> Iterator[tuple[str, ...]]:
     """One line for each sample time and quantity."""
-    table = table_of("errors by sample time", ("ms", "", "flights", "mean error", "covered [%]", "results"))
     for case in report["cases"]:
-        results = in_words(count_results(np.array([row["result"] for row in case["flights"]])))
         for name, row in case["summary"].items():
             factor, unit = UNITS.get(name, (100.0, "%"))
             mean = f"{factor * row['mean']:.2g} +- {factor * row['mean_error']:.1g} {unit}"
             covered = f"{100 * row['covered']:.0f} +- {100 * row['covered_error']:.0f}"
-            table.add_row(f"{1e3 * case['sample_time']:g}", name, str(row["flights"]), mean, covered, results)
-    Console(width=120).print(table)
+            yield f"{1e3 * case['sample_time']:g}", name, str(row["flights"]), mean, covered, results_of(case)
 
 
 def main(
     flights: Annotated[int, typer.Option(help="Number of flights.")] = 40,
     logged: Annotated[str, typer.Option(help="speeds or commands.")] = "speeds",
-    sample_times: Annotated[list[float], typer.Option(help="[s]; 0: the rule chooses.")] = (
-        0,
-        0.004,
-        0.008,
-        0.016,
-        0.032,
-    ),
+    sample_times: Annotated[list[float], typer.Option(help="[s]; 0: the rule chooses.")] = SAMPLE_TIMES,
     dt: Annotated[float, typer.Option(help="Sample time of the log [s].")] = 0.004,
     noise: Annotated[float, typer.Option(help="Noise of rotor speeds, as a share of their median change.")] = 0.0,
     gust: Annotated[float, typer.Option(help="Standard deviation of the gusts [rad/s^2].")] = 1.0,
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 60.0,
     seed: Annotated[int, typer.Option(help="Random seed of the first flight; each has one more.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure errors and coverage at several sample times."""
     settings = {"logged": logged, "dt": dt, "noise": noise, "gust": gust, "duration": duration, "seed": seed}
-    report: dict = {**settings, "version": jaxos4.__version__, "precision": "float64", "cases": []}
     flown = [fly(logged, dt, duration, gust, noise, seed + i) for i in range(flights)]
-    for each in sample_times:
-        rows = [fit(flight, each) for flight in flown]
-        report["cases"].append({"sample_time": each, "flights": rows, "summary": summary(rows)})
-    if out is not None:
-        out.write_text(json.dumps(report, indent=2) + "\n")
-    print_table(report)
+    cases = [{"sample_time": each} for each in sample_times]
 
+    def row_of(flight: jaxos4.Flight, i: int, sample_time: float) -> Row:
+        return fit(flight, sample_time)
 
-if __name__ == "__main__":
-    typer.run(main)
+    report = monte_carlo(out, settings, cases, lambda **_: flown, row_of, summary)
+    headings = "ms", "", "flights", "mean error", "covered [%]", "results"
+    print_table("errors by sample time", headings, table_rows(report), width=120)

@@ -3,8 +3,6 @@
 Double precision, on the device that JAX finds. Each time is the median of runs after a warm-up.
 """
 
-import json
-import os
 import resource
 import time
 from collections.abc import Callable
@@ -16,13 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
 import jaxos4
+from experiments.monte_carlo import Row, machine, print_table, write_report
 from jaxos4.simulation import METHODS
-
-jax.config.update("jax_enable_x64", True)
 
 
 def timed(function: Callable, *arguments, repeats: int) -> tuple[float, float, float, float]:
@@ -49,6 +44,16 @@ def standard_problem(channels: str, steps: int) -> jaxos4.ShootingProblem:
     )
 
 
+def shots(problem: jaxos4.ShootingProblem, trials: jax.Array) -> jax.Array:
+    """The costs of many parameters."""
+    return jax.vmap(problem.cost)(trials)
+
+
+def slopes(problem: jaxos4.ShootingProblem, trials: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The costs of many parameters, and their derivatives along these parameters."""
+    return jax.vmap(lambda x: jax.jvp(problem.cost, (x,), (x,)))(trials)
+
+
 def identify(problem: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, keys) -> jaxos4.RESULTS:
     """Identify one noisy copy of the problem's flight for each key."""
 
@@ -57,6 +62,15 @@ def identify(problem: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, keys) -> 
         return jaxos4.IBSS()(eqx.tree_at(lambda p: p.flight, problem, flight), bracket).parameters
 
     return jax.vmap(one)(keys)
+
+
+def in_chunks(problem: jaxos4.ShootingProblem, count: int, chunk: int) -> float:
+    """The time of identifying many flights in chunks [s]. The memory should not depend on their number."""
+    step, begin = eqx.filter_jit(identify), time.perf_counter()
+    for first in range(0, count, chunk):
+        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(2), i))(jnp.arange(first, first + chunk))
+        jax.block_until_ready(step(problem, jaxos4.Bracket.default(problem.model), keys))
+    return time.perf_counter() - begin
 
 
 def main(
@@ -69,49 +83,23 @@ def main(
     out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
 ) -> None:
     """Measure computing times."""
-    table = Table(
-        title=f"batch {batch}, {steps} steps, float64, {jax.devices()[0].device_kind}, {os.cpu_count()} cores"
-    )
-    for heading in ("measurement", "compile [s]", "median [s]", "smallest [s]", "largest [s]", "rate"):
-        table.add_column(heading)
-    rows = []
+    rows: list[Row] = []
 
     def add(what: str, measured: tuple[float, float, float, float], work: float, unit: str) -> None:
-        compile_seconds, median, least, largest = measured
-        rows.append(
-            {
-                "what": what,
-                "compile_seconds": compile_seconds,
-                "median_seconds": median,
-                "min_seconds": least,
-                "max_seconds": largest,
-                "rate": work / median,
-                "unit": unit,
-                "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            }
-        )
-        scaled = f"{work / median / 1e6:.1f} M{unit}" if unit == "steps/s" else f"{work / median:.1f} {unit}"
-        table.add_row(what, f"{compile_seconds:.2f}", f"{median:.4f}", f"{least:.4f}", f"{largest:.4f}", scaled)
+        names = "compile_seconds", "median_seconds", "min_seconds", "max_seconds"
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        row = {"what": what, **dict(zip(names, measured, strict=True)), "rate": work / measured[1]}
+        rows.append(row | {"unit": unit, "peak_memory_mib": peak})
 
     alpha = jaxos4.PublishedOS4(jaxos4.OS4).alpha
     trials = alpha * (1 + 0.1 * jax.random.normal(jax.random.key(0), (batch, 8)))
     for looked_at in channels:
         problem = standard_problem(looked_at, steps)
-        add(
-            f"shot, {looked_at}",
-            timed(lambda p, a: jax.vmap(p.cost)(a), problem, trials, repeats=repeats),
-            batch * steps,
-            "steps/s",
-        )
-        add(
-            f"slope, {looked_at}",
-            timed(lambda p, a: jax.vmap(lambda x: jax.jvp(p.cost, (x,), (x,)))(a), problem, trials, repeats=repeats),
-            batch * steps,
-            "steps/s",
-        )
+        add(f"shot, {looked_at}", timed(shots, problem, trials, repeats=repeats), batch * steps, "steps/s")
+        add(f"slope, {looked_at}", timed(slopes, problem, trials, repeats=repeats), batch * steps, "steps/s")
     for length in (steps // 2, steps, 2 * steps, 4 * steps):
         problem = standard_problem(channels[0], length)
-        measured = timed(lambda p, a: jax.vmap(p.cost)(a), problem, trials[: batch // 4], repeats=repeats)
+        measured = timed(shots, problem, trials[: batch // 4], repeats=repeats)
         add(f"shot, {length} steps, batch {batch // 4}", measured, batch // 4 * length, "steps/s")
     for method in methods:
         count = batch // 64 if method == "diffrax" else batch // 8
@@ -129,29 +117,19 @@ def main(
             measured = timed(identify, problem, jaxos4.Bracket.default(problem.model), keys, repeats=1)
             add(f"IBSS, {looked_at}, {count} flights", measured, count, "flights/s")
 
-    # In chunks: the memory of a study should not depend on its number of flights.
     problem, chunk = standard_problem("rates", steps), min(256, flights[-1])
-    step = eqx.filter_jit(identify)
     for count in (4 * chunk, 16 * chunk):
-        begin = time.perf_counter()
-        for first in range(0, count, chunk):
-            keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(2), i))(jnp.arange(first, first + chunk))
-            jax.block_until_ready(step(problem, jaxos4.Bracket.default(problem.model), keys))
-        seconds = time.perf_counter() - begin
+        seconds = in_chunks(problem, count, chunk)
         add(f"IBSS, rates, {count} flights by {chunk}", (0.0, seconds, seconds, seconds), count, "flights/s")
-    Console(width=120).print(table)
+    cells = []
+    for row in rows:
+        seconds = (f"{row[name]:.4f}" for name in ("median_seconds", "min_seconds", "max_seconds"))
+        rate = f"{row['rate'] / 1e6:.1f} M" if row["unit"] == "steps/s" else f"{row['rate']:.1f} "
+        cells.append((row["what"], f"{row['compile_seconds']:.2f}", *seconds, rate + row["unit"]))
+    provenance = machine()
+    title = f"batch {batch}, {steps} steps, float64, {provenance['device']}, {provenance['cores']} cores"
+    headings = "measurement", "compile [s]", "median [s]", "smallest [s]", "largest [s]", "rate"
+    print_table(title, headings, cells, width=120)
     peaks = ", ".join(f"{row['what']}: {row['peak_memory_mib']:.0f} MiB" for row in rows[-2:])
-    Console(width=120).print(f"peak memory of the process after {peaks}")
-    if out is not None:
-        provenance = {
-            "version": jaxos4.__version__,
-            "jax": jax.__version__,
-            "device": jax.devices()[0].device_kind,
-            "cores": os.cpu_count(),
-            "precision": "float64",
-        }
-        out.write_text(json.dumps({"provenance": provenance, "rows": rows}, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+    print(f"peak memory of the process after {peaks}")
+    write_report(out, {"provenance": provenance, "rows": rows})

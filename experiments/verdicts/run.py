@@ -6,7 +6,6 @@ The good flights, and the airframe that is given, are those of `closed_loop/effe
 truth. A cause is right if the faults of the table below are named as they are, wherever the answer says so.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,21 +13,17 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxos4
+from experiments.closed_loop.effects import ALL, EFFECTS, flights_of
+from experiments.closed_loop.run import VEHICLE
+from experiments.fits import given_airframe
+from experiments.monte_carlo import Row, continued, fill, print_table
 from jaxos4.errors import InputError
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.recording import Recording
 from jaxos4.recording.motion import rotations_to_body
 from jaxos4.results import NINETY_FIVE
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "closed_loop"), str(Path(__file__).resolve().parents[1])]
-
-from effects import ALL, EFFECTS, flights_of
-from fits import continued, given_airframe, write_report
-from run import VEHICLE
-from shared import table_of
 
 TRUTHS = dict(zip(("Ix", "Iy"), VEHICLE.inertia.tolist(), strict=False))
 SURE, FAR = 3.0, 0.12  # an answer beyond either is wrong: standard deviations, and share of the truth
@@ -148,10 +143,10 @@ CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL)}
 CASES |= {f"{name} {size:g}": ("gusts", fault, size) for name, fault in FAULTS.items() for size in fault.sizes}
 
 
-def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> dict:
+def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> Row:
     """The row of one flight. Errors and standard deviations are shares of the truth."""
     begin, recording = time.perf_counter(), Recording.of(flight, "flight")
-    row: dict = {"flight": i, "result": "refused"}
+    row: Row = {"result": "refused"}
     try:
         found = jaxos4.identify(
             recording if fault is None else fault.spoil(recording, size), given_airframe(VEHICLE, i)
@@ -174,7 +169,7 @@ def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> d
     return row | {"named": named, "causes": causes, "seconds": time.perf_counter() - begin}
 
 
-def counts(rows: list[dict]) -> dict[str, int]:
+def counts(rows: list[Row]) -> dict[str, int]:
     """How many answers for Ix and Iy there are, and how many are right, or wrong, of each kind."""
     found = dict.fromkeys(("answers", "identified", "far", "identified and wrong", "refused and right"), 0)
     for row in rows:
@@ -199,30 +194,29 @@ def share(part: int, whole: int) -> str:
     return f"{100 * part / whole:.0f} +- {100 * np.sqrt(p * (1 - p) / whole):.1f}"
 
 
-def print_tables(report: dict) -> None:
+def print_tables(rows: list[Row]) -> None:
     """A line for each case, and how often the intervals of the frequency response hold 1 in good flights."""
-    headings = "flights", "identified [%]", "beyond 3 std [%]", "3 std or 12 % [%]", "refused, right [%]", "named [%]"
-    table = table_of("verdicts of Ix and Iy", ("case", *headings))
-    groups = {name: [r for r in report["rows"] if r["case"] == name] for name in CASES}
-    groups |= {
-        "good flights": [r for r in report["rows"] if CASES[r["case"]][1] is None],
-        "spoiled flights": [r for r in report["rows"] if CASES[r["case"]][1] is not None],
-    }
-    for name, rows in groups.items():
-        if rows:
-            n, known = counts(rows), [r["named"] for r in rows if r["named"] is not None]
+    good = [row for row in rows if CASES[row["case"]][1] is None]
+    groups = {name: [row for row in rows if row["case"] == name] for name in CASES}
+    groups |= {"good flights": good, "spoiled flights": [row for row in rows if row not in good]}
+    lines = []
+    for name, some in groups.items():
+        if some:
+            n, known = counts(some), [r["named"] for r in some if r["named"] is not None]
             parts = [n[each] for each in ("identified", "identified and wrong", "far", "refused and right")]
             shares = [share(part, n["answers"]) for part in parts]
-            table.add_row(name, str(len(rows)), *shares, share(sum(known), len(known)))
-    Console(width=140).print(table)
-    table = table_of("frequency response of good flights", ("axis", "flights", "mean log gain", "interval holds 1 [%]"))
+            lines.append((name, str(len(some)), *shares, share(sum(known), len(known))))
+    headings = "flights", "identified [%]", "beyond 3 std [%]", "3 std or 12 % [%]", "refused, right [%]", "named [%]"
+    print_table("verdicts of Ix and Iy", ("case", *headings), lines, width=140)
+    lines = []
     for axis in ("roll", "pitch", "yaw"):
-        every = [r["response"][axis] for r in groups["good flights"] if axis in r.get("response", {})]
+        every = [r["response"][axis] for r in good if axis in r.get("response", {})]
         logs, errors = np.log([x for x, _ in every]), np.array([x for _, x in every])
         if every:
             held = int((np.abs(logs) < NINETY_FIVE * errors).sum())
-            table.add_row(axis, str(len(every)), f"{logs.mean():.3f}", share(held, len(every)))
-    Console(width=140).print(table)
+            lines.append((axis, str(len(every)), f"{logs.mean():.3f}", share(held, len(every))))
+    headings = "axis", "flights", "mean log gain", "interval holds 1 [%]"
+    print_table("frequency response of good flights", headings, lines, width=140)
 
 
 def main(
@@ -234,17 +228,15 @@ def main(
 ) -> None:
     """Count right and wrong verdicts for each effect, and for each fault in three sizes."""
     report = continued(out, {"duration": duration, "seed": seed}, "rows")
-    done = {(row["case"], row["flight"]) for row in report["rows"]}
     flown = {kind: flights_of(kind, flights, duration, seed) for kind in {CASES[name][0]: None for name in cases}}
-    for i in range(flights):  # an interrupted report has about as many flights of each case
-        for name in cases:
-            kind, fault, size = CASES[name]
-            flight = flown[kind][i]
-            if flight is not None and (name, i) not in done:
-                report["rows"].append({"case": name} | judged(flight, i, fault, size))
-                write_report(out, report)
-    print_tables(report)
+    # An interrupted report has about as many flights of each case.
+    trials = (
+        {"case": name, "flight": i} for i in range(flights) for name in cases if flown[CASES[name][0]][i] is not None
+    )
 
+    def row_of(case: str, flight: int) -> Row:
+        kind, fault, size = CASES[case]
+        return judged(flown[kind][flight], flight, fault, size)
 
-if __name__ == "__main__":
-    typer.run(main)
+    fill(out, report, report["rows"], trials, row_of)
+    print_tables(report["rows"])

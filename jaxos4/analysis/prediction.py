@@ -1,4 +1,4 @@
-"""Predictions of the body rates some tenths of a second ahead, with the disturbance at their start, and their skill."""
+"""Predictions of the body rates some tenths of a second ahead, in open loop, and their skill."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,20 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import Numeric, Parameters, Scalar, as_float
+from .._custom_types import Numeric, Parameters, as_float
 from ..flight import RATES, Flight
-from ..models.state import State, unstack
+from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST, ShootingProblem
-from ..shooting.gains import LogNoise, Observed, gains_of, is_rate, transition
-from .frequency_response import modelled_acceleration
+from ..shooting.gains import LogNoise, transition
+from .open_loop import gyro_bias, open_loop
 
 HORIZONS = (0.1, 0.25, 0.5)
-# The horizon that decides whether a model predicts [s].
-_DECISIVE = 0.25
-# Time between starts, and time around a start over which the measured rates are averaged [s].
-_EVERY, _AROUND = 0.05, 0.02
-# Number of parts of the flight for the jackknife, which omits one part at a time.
-_PARTS = 10
+"""How far ahead rates are predicted, if nothing else is wanted [s]."""
 
 
 class Predictions(NamedTuple):
@@ -74,9 +69,7 @@ def predictions(
 ) -> Predictions:
     """Predict the body rates from many starts, with the recorded rotor speeds.
 
-    The velocity keeps its value at the start. Starts are 0.05 s apart. The initial rates are the mean of the rates
-    measured within 0.01 s of the start. A start is omitted if one of these rates is missing, or if the longest horizon
-    reaches beyond the stretch.
+    The velocity keeps its value at the start. See `starts` for the starts.
 
     **Arguments:** `problem` gives model, flight and method; its windows and channels have no effect. `horizons` [s] are
     positive. `disturbance` [rad/s^2]: fades from its value at the start, as the past lets expect, by the time constants
@@ -92,21 +85,26 @@ def predictions(
     fading = as_float(np.ones(3) if noise is None else np.exp(np.asarray(noise.time_constant)[:3]))
     begin = start, initial, pushed[start]
     predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
-    return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead], rates[start[:, None] + ahead])
+    measured = rates[start[:, None] + ahead]
+    return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead - 1], measured)
 
 
 def starts(
-    flight: Flight, horizons: tuple[float, ...] = HORIZONS
+    flight: Flight, horizons: tuple[float, ...] = HORIZONS, *, every: float = 0.05, near: float = 0.01
 ) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 3"]]:
-    """The samples at which `predictions` starts, and the measured rates there [rad/s]. Raises the same errors."""
+    """The samples at which `predictions` starts, and the rates there [rad/s]. Raises the same errors.
+
+    Starts are `every` so many seconds. The rates are the mean of those measured up to `near` [s] around the start: less
+    noise than one sample. A start is omitted if one of these rates is missing, or if the longest horizon reaches beyond
+    the stretch.
+    """
     dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
-    around = int(_AROUND / 2 / dt)
+    around = int(near / dt)
     stretch = np.zeros(samples, dtype=int) if flight.stretch is None else np.asarray(flight.stretch)
     rates = np.asarray(flight.states)[:, RATES]
-    start = np.arange(around, samples - ahead.max() - around, max(int(round(_EVERY / dt)), 1))
+    start = np.arange(around, samples - ahead.max() - around, max(int(round(every / dt)), 1))
     start = start[stretch[start - around] == stretch[np.minimum(start + ahead.max(), samples - 1)]]
-    near = start[:, None] + np.arange(-around, around + 1)
-    initial = rates[near].mean(axis=1)
+    initial = rates[start[:, None] + np.arange(-around, around + 1)].mean(axis=1)
     known = np.isfinite(initial).all(axis=1)
     if not known.any():
         raise ValueError(f"`flight` has no stretch with measured rates that is longer than {max(horizons)} s.")
@@ -126,100 +124,56 @@ def _predict(
     disturbance: Float[Numeric, "starts 3"],
     time_constant: Float[Array, "3"],
     steps: int,
-) -> Float[Array, "starts steps_and_one 3"]:
+) -> Float[Array, "starts steps 3"]:
     model, scalars, forcing = problem.model, tuple(parameters), problem.forcing(parameters)
-    kept, reach = transition(time_constant, problem.flight.dt)
+    fading, calm = transition(time_constant, problem.flight.dt), jnp.zeros((steps, time_constant.shape[0], 2))
 
-    def fly(first: Int[Array, ""], measured: Array, pushed: Array) -> Float[Array, "steps_and_one 3"]:
+    def fly(first: Int[Array, ""], measured: Array, disturbance: Array) -> Float[Array, "steps 3"]:
         rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
-        begin = jax.tree.map(lambda leaf: leaf[0], rows)
-        # A gyro bias is part of the measurement, not of the state.
-        added = jnp.stack(model.observe(unstack(measured), begin, scalars)[:3]) - measured
+        begin, later = (jax.tree.map(lambda leaf, part=part: leaf[part], rows) for part in (0, np.s_[1:]))
 
-        def step(carry: tuple[State, Array], row) -> tuple[tuple[State, Array], Float[Array, "3"]]:
-            state, pushed = carry
-            row = row._replace(velocity=begin.velocity)
-            rates = jnp.stack(problem.step(state, row, scalars).rates) + reach * pushed
-            return (unstack(rates), kept * pushed), jnp.stack(model.observe(state, row, scalars)[:3])
+        def advance(rates: Rates, row: Forcing, added: Array) -> Rates:
+            moved = problem.step(State(rates), row._replace(velocity=begin.velocity), scalars).rates
+            return Rates(*(jnp.stack(moved) + added))
 
-        return jax.lax.scan(step, (unstack(measured - added), pushed), rows)[1]
+        def observed(rates: Rates, row: Forcing) -> Float[Array, "3"]:
+            return jnp.stack(model.observe(State(rates), row, scalars)[:3])
+
+        driving = jax.tree.map(lambda leaf: leaf[:-1], rows)
+        start = Rates(*(measured - gyro_bias(model, measured, begin, scalars)))
+        return jax.vmap(observed)(open_loop(advance, start, disturbance, driving, calm, fading), later)
 
     return jax.vmap(fly)(jnp.asarray(start), jnp.asarray(initial), jnp.asarray(disturbance))
 
 
-def skill(predicted: Predictions) -> Skill:
-    """The skill of predictions, compared with persistence."""
+def skill(predicted: Predictions, *, parts: int = 10) -> Skill:
+    """The skill of predictions, compared with persistence. `parts`: of the flight, for the jackknife."""
     measured = np.isfinite(predicted.measured)
     errors = np.where(measured, predicted.predicted - predicted.measured, 0.0)
     changes = np.where(measured, predicted.initial[:, None] - predicted.measured, 0.0)
     # A diverged prediction counts as an error that no gyro could measure: large, but finite.
     squares = np.square(np.clip(np.nan_to_num(errors, nan=FASTEST), -FASTEST, FASTEST))
-    parts = np.array_split(np.arange(errors.shape[0]), min(_PARTS, errors.shape[0]))
+    groups = np.array_split(np.arange(errors.shape[0]), min(parts, errors.shape[0]))
 
     count, sums = np.maximum(measured.sum(axis=0), 1), np.stack([squares, np.square(changes)])
     total = sums.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        without = [np.divide(*np.delete(sums, part, 1).sum(axis=1)) for part in parts]
-        spread = np.sqrt((len(parts) - 1) * np.var(without, axis=0)) if len(parts) > 1 else np.full(count.shape, np.nan)
+        without = [np.divide(*np.delete(sums, group, 1).sum(axis=1)) for group in groups]
+        spread = (
+            np.sqrt((len(groups) - 1) * np.var(without, axis=0)) if len(groups) > 1 else np.full(count.shape, np.nan)
+        )
         rmse, persistence = np.sqrt(total / count)
         return Skill(rmse, persistence, 1 - total[0] / total[1], spread, errors.shape[0])
 
 
 def decisive_horizon(
-    horizons: Sequence[float] | Float[np.ndarray, " horizons"], known: Bool[ArrayLike, " horizons"]
+    horizons: Sequence[float] | Float[np.ndarray, " horizons"],
+    known: Bool[ArrayLike, " horizons"],
+    *,
+    wanted: float = 0.25,
 ) -> int:
-    """The place of the horizon nearest to 0.25 s among those that are `known`: something was measured there."""
-    return int(np.argmin(np.where(known, np.abs(np.asarray(horizons) - _DECISIVE), np.inf)))
+    """The place of the horizon nearest to `wanted` [s] among those that are `known`: something was measured there.
 
-
-def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Float[np.ndarray, "samples 3"]:
-    """The disturbance of each body rate [rad/s^2] at each sample, from the measurements until then.
-
-    Kalman filters find it, for the noise that `FilterError` found. The model is evaluated at the measured rates.
-    `noise`: its first three channels are p, q and r.
+    A quarter of a second is long enough for a wrong model to show, and short enough for gusts not to decide.
     """
-    rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
-    modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
-    own = LogNoise(*(as_float(np.asarray(leaf)[: len(RATES)]) for leaf in noise))
-    number = np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch)
-    known = _known_by(own, as_float(rates), as_float(modelled), number, problem.flight.dt)
-    return np.asarray(known.disturbance)
-
-
-class Filtered(NamedTuple):
-    """The rate of each channel, and its disturbance, at each sample from all measurements until then."""
-
-    rate: Float[Array, "samples channels"]
-    disturbance: Float[Array, "samples channels"]
-
-
-def filtered(
-    noise: LogNoise,
-    measured: Float[Array, "samples channels"],
-    modelled: Float[Array, "samples channels"],
-    stretch: Int[Numeric, " samples"],
-    dt: Scalar,
-) -> Filtered:
-    """The rates and disturbances at each sample. Filters begin anew in each stretch.
-
-    `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model.
-    """
-    begins = jnp.diff(stretch, prepend=-1) != 0
-    is_known, memory = ~jnp.isnan(measured), is_rate(measured.shape[1])
-    gains = gains_of(Observed(measured[:, :, None], begins[:, None], begins[:, None]), noise, dt)
-    kept, reach = transition(jnp.exp(noise.time_constant), dt)
-
-    def step(known: Filtered, row) -> tuple[Filtered, Filtered]:
-        y, is_known, added, begins, by_rate, by_disturbance = row
-        rate, disturbance = (jnp.where(begins, 0.0, x) for x in known)
-        error = jnp.where(is_known, y - jnp.where(memory, rate, disturbance), 0.0)
-        rate, disturbance = rate + by_rate * error, disturbance + by_disturbance * error
-        later = Filtered(memory * rate + added * dt + reach * disturbance, kept * disturbance)
-        return later, Filtered(rate, disturbance)
-
-    zero = jnp.zeros(measured.shape[1], dtype=float)
-    rows = measured, is_known, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]
-    return jax.lax.scan(step, Filtered(zero, zero), rows)[1]
-
-
-_known_by = eqx.filter_jit(filtered)
+    return int(np.argmin(np.where(known, np.abs(np.asarray(horizons) - wanted), np.inf)))

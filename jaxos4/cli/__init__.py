@@ -3,4 +3,4 @@
 A command imports the library when it runs, not before: help, wrong arguments and shell completion answer at once.
 """
 
-from ._app import console as console, main as main
+from ._app import app as app, main as main

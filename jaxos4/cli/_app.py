@@ -64,8 +64,9 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")  # names of files may hold what no encoding can print
     try:
         code = app(prog_name="jaxos4", standalone_mode=False) or 0
-    except BrokenPipeError:  # the reader of our output has gone
-        sys.stderr.close()
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output has gone: Python would complain about what is left of it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except (InputError, OSError, TrainingError) as error:
         what = " ".join(str(error).split())
@@ -79,23 +80,6 @@ def main() -> None:
         typer.echo(_parser_message(error), err=True)
         raise SystemExit(2) from None
     raise SystemExit(code)
-
-
-def console() -> None:
-    """The console command: `main`, and then the end of the process.
-
-    Python alone would take another half second, a fifth of `jaxos4 estimate`, to free what JAX made.
-    """
-    try:
-        main()
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-        try:
-            sys.stdout.flush()
-            sys.stderr.flush()
-        except (OSError, ValueError):  # the reader has gone, or the disk is full: output is lost
-            code = code or 1
-        os._exit(code)
 
 
 def _parser_message(error: Any) -> str:

@@ -10,8 +10,6 @@ from .._xla import add_flags
 NO_CACHE = "JAXOS4_NO_CACHE"
 """The environment variable that switches off the cache of compiled programs."""
 
-_MOST_BYTES = 1 << 30
-
 
 def prepare(*, batch: bool) -> None:
     """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off.
@@ -32,7 +30,7 @@ def prepare(*, batch: bool) -> None:
         if folder is None:
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
+        jax.config.update("jax_compilation_cache_max_size", 1 << 30)  # 1 GB
     if jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 1.0:  # JAX's default [s]
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
     # Another process may be writing the same program, or remove it: it is then compiled again.

@@ -17,31 +17,30 @@ import typer
 from .._files import check_writable, write_file
 from ..errors import InputError
 
-_PHRASES = {
+_ARGUMENTS = (
+    *("angle", "bandwidth", "bracket", "channels", "criterion", "distance", "dt", "duration", "estimator", "fastest"),
+    *("gust", "holdout", "horizon", "initial_state", "network", "rate", "sample_time", "samples", "seed", "slew"),
+    *("slowest", "spacing", "terms", "validate", "velocity", "window"),
+)
+OPTIONS = {
     "an `Airframe` as `subject`": "--model flight",
     "`subject`": "--model",
     "`begin`": "--from",
     "`end`": "--to",
+    **{f"`{name}`": f"--{name.replace('_', '-')}" for name in _ARGUMENTS},
 }
-_OPTIONS = (
-    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|gust|holdout|horizon|initial_state|"
-    "network|rate|sample_time|samples|seed|slew|slowest|spacing|terms|validate|velocity|window"
-)
+"""Options by the library's arguments, which stand in backticks in its messages."""
 
 
 def in_options(text: str, **files: Path | None) -> str:
-    """A message with options for the library's arguments: `--from` for `` `begin` ``.
+    """A message with options in the place of the library's arguments: `--from` for `` `begin` ``.
 
     `files`: file names to print behind an option.
     """
-    for phrase, option in _PHRASES.items():
-        text = text.replace(phrase, option)
-
-    def option_of(match: re.Match[str]) -> str:
-        path = files.get(match[1])
-        return f"--{match[1].replace('_', '-')}{'' if path is None else f' {path}'}"
-
-    return re.sub(f"`({_OPTIONS})`", option_of, text)
+    for argument, option in OPTIONS.items():
+        path = files.get(argument.strip("`"))
+        text = text.replace(argument, option if path is None else f"{option} {path}")
+    return text
 
 
 @contextlib.contextmanager

@@ -4,20 +4,16 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
+import jaxos4
+
 from ..errors import InputError, named, printable
 from . import _options as options
 from ._output import check_outputs, end, in_options, option_names, stages, write_json
-
-if TYPE_CHECKING:
-    from ..airframe import Airframe
-    from ..identification import Identification
-    from ..models.abstract import AbstractModel
-    from ..recording import Recording
 
 _OS4, _PUBLISHED = "os4", "published"
 # The defaults of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
@@ -61,20 +57,19 @@ def estimate(
     asked = {"channels": channels, "initial_state": initial_state, "window": window}
     asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
     with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
-        from ..airframe import Airframe, load_airframe
-        from ..identification import identify, settings_for
+        from ..identification import settings_for
         from ..recording import read_recording
 
         progress("reading")
-        vehicle = load_airframe(airframe or _OS4)
+        vehicle = jaxos4.load_airframe(airframe or _OS4)
         # Without an airframe, commands are read only to find out that one is needed.
         full_scale = 1.0 if airframe is None and model in (None, "flight") else None
         recordings = [read_recording(path, vehicle, full_scale=full_scale, columns=columns) for path in flights]
         subject, evidence = _subject(recordings, model, vehicle, given=airframe is not None)
-        if report is not None and not isinstance(subject, Airframe):
+        if report is not None and not isinstance(subject, jaxos4.Airframe):
             sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
             raise InputError(f"--report: is for real vehicles, {sign}; leave it out.")
-        found = identify(
+        found = jaxos4.identify(
             recordings,
             subject,
             settings=settings_for(subject, asked),
@@ -84,13 +79,12 @@ def estimate(
             validate=None if validate is None else read_recording(validate, vehicle, columns=columns),
             progress=progress,
         )
-    notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
-    _publish(_with_command(found, airframe or _OS4, notes), out, report, verbose=verbose)
+    _publish(_with_command(found, airframe or _OS4, evidence), out, report, verbose=verbose)
 
 
 def _subject(
-    recordings: "list[Recording]", model: options.VehicleModel | None, vehicle: "Airframe", *, given: bool
-) -> "tuple[Airframe | AbstractModel, str]":
+    recordings: "list[jaxos4.Recording]", model: options.VehicleModel | None, vehicle: "jaxos4.Airframe", *, given: bool
+) -> "tuple[jaxos4.Airframe | jaxos4.AbstractModel, str]":
     """The airframe of a real vehicle, or a model of an OS4; and why a log is evidently of a real vehicle, if one is.
 
     `given`: whether the user gave the airframe.
@@ -107,10 +101,11 @@ def _subject(
     return vehicle, evidence
 
 
-def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "Identification":
+def _with_command(found: "jaxos4.Identification", airframe: str, evidence: str) -> "jaxos4.Identification":
     """The identification with its command; notes, doubts and verdicts in the words of the command line."""
     import msgspec
 
+    notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
     provenance = msgspec.structs.replace(
         found.provenance,
         airframe=printable(airframe),
@@ -125,23 +120,19 @@ def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "
     return msgspec.structs.replace(found, doubts=tuple(doubts), verdicts=verdicts, provenance=provenance)
 
 
-def _publish(found: "Identification", out: Path | None, report: Path | None, *, verbose: bool) -> None:
+def _publish(found: "jaxos4.Identification", out: Path | None, report: Path | None, *, verbose: bool) -> None:
     """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
     from rich.console import Console
-
-    from ..report import print_identification
 
     console = Console()
     if out is not None:
         write_json(found.to_dict(), out)
-    print_identification(console, found, verbose=verbose)
+    jaxos4.report.print_identification(console, found, verbose=verbose)
     if found.is_vehicle and found.has_answer and not verbose:
         console.print("--verbose shows all parameters, the noise, and how well rates are predicted", highlight=False)
     if report is not None:
         with stages("drawing"):
-            from ..report import write_flight_page
-
-            write_flight_page(report, found)
+            jaxos4.report.write_flight_page(report, found)
         console.print(f"report: {report}", markup=False, highlight=False)
     end(found.result)
 
@@ -172,17 +163,15 @@ def train(
 ) -> None:
     """Train a network that identifies any flight with the inputs of this one."""
     with stages("loading the library") as progress:
-        from ..airframe import load_airframe
         from ..identification.problem import train_network
         from ..models import MODELS
-        from ..networks import NetworkEstimator, save_network
         from ..recording import read_recording
 
         with named("options"):
-            settings = NetworkEstimator(features=features, architecture=architecture, noise=noise, steps=steps)
+            settings = jaxos4.NetworkEstimator(features=features, architecture=architecture, noise=noise, steps=steps)
         check_outputs(flight, airframe, bracket, out=out)
         progress("reading")
-        subject = MODELS[model](load_airframe(airframe))
+        subject = MODELS[model](jaxos4.load_airframe(airframe))
         recording = read_recording(flight, subject.airframe)
     for note in recording.notes:
         typer.echo(f"note: {note}")
@@ -197,7 +186,7 @@ def train(
             initial_state=initial_state,
             seed=seed,
         )
-    save_network(network, out)
+    jaxos4.save_network(network, out)
     low, high = noise
     typer.echo(
         f"{out}: {architecture}, {features} features of the {network.channels}, noise {low:g} to {high:g} times the "

@@ -6,12 +6,12 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+import jaxos4
+
 from .._files import check_writable, write_file
 from ..errors import InputError
 from . import _options as options
 from ._output import check_outputs, end, in_options, option_names, stages, write_folder, write_json
-
-MOST_SAMPLES = 100_000
 
 
 def export(
@@ -24,8 +24,8 @@ def export(
     seed: options.SeedOption = 0,
 ) -> None:
     """Write an identified vehicle as a model for a simulator, and vehicles drawn from its uncertainty."""
-    if samples > MOST_SAMPLES:
-        raise InputError(f"--samples: must be at most {MOST_SAMPLES}, got {samples}.")
+    if samples > (most := 100_000):
+        raise InputError(f"--samples: must be at most {most}, got {samples}.")
     if samples and out is None:
         raise InputError("--samples: are written into a folder beside --out; give that too.")
     check_outputs(result, out=out)
@@ -75,31 +75,26 @@ def predict(
     """Predict a flight with an identified vehicle, and compare with constant rates and a regression."""
     check_outputs(result, flight, columns, out=out, json=json, figure=figure)
     with stages("loading the library") as progress, option_names():
-        from ..forecast import check_suffix, predict as predict_flight, vehicle_of
         from ..recording import read_recording
 
         if out is not None:
-            check_suffix(out, ".nc", ".csv")
+            jaxos4.forecast.check_suffix(out, ".nc", ".csv")
         progress("reading")
-        vehicle = vehicle_of(result)
+        vehicle = jaxos4.forecast.vehicle_of(result)
         recording = read_recording(flight, vehicle.model.airframe, columns=columns)
         progress("predicting")
-        found = predict_flight(vehicle, recording, horizon=horizon, sample_time=sample_time, spacing=spacing, seed=seed)
+        found = jaxos4.predict(vehicle, recording, horizon=horizon, sample_time=sample_time, spacing=spacing, seed=seed)
         progress("writing")
         if out is not None:
             found.write(out)
         if json is not None:
             write_json(found.to_dict(), json)
         if figure is not None:
-            from ..report import write_prediction_figure
-
-            write_prediction_figure(figure, found)
+            jaxos4.report.write_prediction_figure(figure, found)
     from rich.console import Console
 
-    from ..report import print_prediction
-
     console = Console()
-    print_prediction(console, found._replace(notes=tuple(in_options(note) for note in found.notes)))
+    jaxos4.report.print_prediction(console, found._replace(notes=tuple(in_options(note) for note in found.notes)))
     for path in filter(None, (out, json, figure)):
         console.print(f"written: {path}", markup=False, highlight=False)
     end(vehicle.result)

@@ -1,24 +1,16 @@
 """`jaxos4 inspect` and `jaxos4 identifiability`: what a log contains, and which parameters a flight can identify."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from typer import Argument, Option
+
+import jaxos4
 
 from .._files import write_file
 from ..errors import InputError
 from . import _options as options
 from ._output import check_outputs, option_names, stages, write_json
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from ..recording.inspection import Inspection
-
-# If a log has more parts, only the longest are printed.
-_MOST_PARTS = 14
-_UNITS = {"p q r": "rad/s", "phi theta psi": "rad", "x y z": "m", "vx vy vz": "m/s", "ax ay az": "m/s^2"}
-_UNITS |= {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 
 
 def inspect(
@@ -43,12 +35,12 @@ def inspect(
     with stages("loading the library") as progress:
         from rich.console import Console
 
-        from ..airframe import load_airframe
         from ..recording import read_recording
         from ..recording.inspection import airframe_draft, inspect_log
+        from ..report.log_text import print_inspection
 
         progress("reading")
-        vehicle = None if airframe is None else load_airframe(airframe)
+        vehicle = None if airframe is None else jaxos4.load_airframe(airframe)
         recording = read_recording(log, vehicle, full_scale=1.0, columns=columns)
         found = inspect_log(recording, vehicle)
         text, missing = ("", ()) if airframe_out is None else airframe_draft(recording)
@@ -57,52 +49,10 @@ def inspect(
         write_json(found.to_dict(), out)
     if airframe_out is not None:
         write_file(airframe_out, text)
-    _print_contents(console, found, recording.facts.format.label if recording.facts.format else "")
-    _print_parts(console, found)
+    print_inspection(console, found, recording.facts.format.label if recording.facts.format else "")
     if airframe_out is not None:
         still = f"; weigh or measure, and fill in: {', '.join(missing)}"
         console.print(f"airframe: {airframe_out}{still}", soft_wrap=True)
-
-
-def _print_contents(console: "Console", found: "Inspection", label: str) -> None:
-    console.print(
-        f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
-        f"one every {1e3 * found.sample_time:.4g} ms",
-        soft_wrap=True,
-    )
-    for finding in found.findings:
-        console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
-    for each in found.checks:
-        verb = "contradicts" if each.contradicted else "concerns"
-        console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
-    for names, unit in _UNITS.items():
-        measured = {name: found.measured[name] for name in names.split() if name in found.measured}
-        if not measured:
-            continue
-        largest = max(abs(end) for channel in measured.values() for end in (channel.least, channel.most))
-        rate = min(channel.rate for channel in measured.values())
-        gap = max(channel.longest_gap for channel in measured.values())
-        gaps = f", at most {1e3 * gap:.3g} ms apart" if gap > 1.5 * found.sample_time else ""
-        commands = "rotor1" in names and 0 < largest <= 1
-        size = f"up to {largest:.3g} {'of full scale (commands)' if commands else unit}"
-        console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
-    for note in found.notes:
-        console.print(f"note: {note}")
-
-
-def _print_parts(console: "Console", found: "Inspection") -> None:
-    from ..report.text import Listing
-
-    rows = []
-    shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:_MOST_PARTS]
-    for part in sorted(shown, key=lambda part: part.begin):
-        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
-        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
-    headings, numbers = ("from [s]", "to [s]", "use", "roll", "pitch", "yaw"), ("from [s]", "to [s]")
-    Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
-    if len(found.parts) > len(shown):
-        console.print(f"and {len(found.parts) - len(shown)} shorter parts")
-    console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
 
 
 def identifiability(
@@ -120,16 +70,14 @@ def identifiability(
     with stages("loading the library") as progress, option_names(bracket=bracket):
         from rich.console import Console
 
-        from ..airframe import load_airframe
-        from ..identification import assess
         from ..models import MODELS
         from ..recording import read_recording
-        from ..report.text import Listing
+        from ..report.log_text import print_information
 
         progress("reading")
-        subject = MODELS[model](load_airframe(airframe))
+        subject = MODELS[model](jaxos4.load_airframe(airframe))
         recording = read_recording(flight, subject.airframe)
-        found = assess(
+        found = jaxos4.assess(
             recording,
             subject,
             bracket=options.read_bracket(bracket),
@@ -143,19 +91,4 @@ def identifiability(
     console = Console(highlight=False, markup=False)
     for note in recording.notes:
         console.print(f"note: {note}")
-    if not found.fitted:
-        console.print("note: no fit; all numbers below hold at the bracket's centre")
-    rows = []
-    for name, row in found.parameters.items():
-        bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
-        limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
-        rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit))
-    numbers = ("bound", "others known", "of bracket", "noise limit")
-    notes = [row.note for row in found.parameters.values()]
-    Listing(("parameter", "unit", *numbers), rows, numbers, notes).print_on(console)
-    console.print(
-        "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
-        "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
-        "identifiable; noise limit: the largest noise, in multiples of the noise that was found, at which the "
-        "airframe's value can be distinguished from 0."
-    )
+    print_information(console, found)

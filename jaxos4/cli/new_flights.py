@@ -3,25 +3,24 @@
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer import Option
+
+import jaxos4
 
 from ..errors import InputError, named
 from . import _options as options
 from ._output import check_outputs, end, option_names, stages
 
-if TYPE_CHECKING:
-    from ..closed_loop import ClosedLoop
-    from ..design import Design
-    from ..flight import Flight
-
-MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
-
 OpenLoopModelOption = Annotated[options.Model | None, Option(help="Equations of motion. Default: published.")]
 DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
 SampleTimeOption = Annotated[float | None, Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.")]
+AccuracyOption = Annotated[
+    float | None,
+    Option(help="Wanted standard deviation [% of half a bracket]. Default: 1; with --closed-loop: 5 % of inertias."),
+]
 GustOption = Annotated[
     float | None, Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5.")
 ]
@@ -76,23 +75,20 @@ def simulate(
     for name in names:
         if file is not None and given[name] is not None:
             raise InputError(f"--{name}: {file} has its own; leave it out.")
-    if asked["dt"] > 0 and asked["duration"] / asked["dt"] > MOST_SAMPLES:
-        many = f"more than {MOST_SAMPLES} samples of {asked['dt']:g} s; ask for fewer."
+    most = 5_000_000  # more do not fit into the memory of an ordinary machine
+    if asked["dt"] > 0 and asked["duration"] / asked["dt"] > most:
+        many = f"more than {most} samples of {asked['dt']:g} s; ask for fewer."
         raise InputError(f"--duration {asked['duration']:g}: {many}")
     with stages("loading the library") as progress:
-        from ..airframe import load_airframe
-        from ..logs import write_flight
-        from ..results import result_names
-
         progress("compiling and simulating")
         flight, how = (_closed_loop if closed_loop else _open_loop)(asked)
-        end(str(result_names(flight.result)))
+        end(str(jaxos4.result_names(flight.result)))
         progress("writing")
-        write_flight(flight, out, load_airframe(airframe))
+        jaxos4.write_flight(flight, out, jaxos4.load_airframe(airframe))
     typer.echo(f"{out}: {flight.time.shape[0]} samples of {how}")
 
 
-def _closed_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
+def _closed_loop(asked: dict[str, Any]) -> tuple["jaxos4.Flight", str]:
     """A flight of a real vehicle, and how it was made."""
     from ..closed_loop import fly_standard
     from ..design import read_references
@@ -105,24 +101,22 @@ def _closed_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
     return flight, f"{dt:g} s, closed loop, {loop.logged}, gusts of {asked['gust']:g} rad/s^2"
 
 
-def _open_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
+def _open_loop(asked: dict[str, Any]) -> tuple["jaxos4.Flight", str]:
     """A flight with the rotor speeds of an excitation, or of a file, and how it was made."""
     from .._custom_types import as_float
-    from ..airframe import load_airframe
     from ..design import read_input
     from ..excitation import EXCITATIONS
     from ..models import MODELS
-    from ..noise import SENSOR_SIGMA, WhiteNoise, measure
-    from ..simulation import simulate as fly
+    from ..noise import measure
 
-    model, shape, dt = MODELS[asked["model"]](load_airframe(asked["airframe"])), asked["excitation"], asked["dt"]
+    model, shape, dt = MODELS[asked["model"]](jaxos4.load_airframe(asked["airframe"])), asked["excitation"], asked["dt"]
     with named("" if asked["speeds"] else f"--excitation {shape}"):
         if asked["speeds"] is None:
             omega = EXCITATIONS[shape](model.airframe, duration=asked["duration"], dt=dt)
         else:
             omega = as_float(read_input(asked["speeds"], dt))
-        flight = fly(model, model.alpha, omega, dt=dt, method=asked["method"])
-    flight = measure(flight, WhiteNoise(asked["noise"] * SENSOR_SIGMA), seed=asked["seed"])
+        flight = jaxos4.simulate(model, model.alpha, omega, dt=dt, method=asked["method"])
+    flight = measure(flight, jaxos4.WhiteNoise(asked["noise"] * jaxos4.SENSOR_SIGMA), seed=asked["seed"])
     return flight, f"{dt:g} s, {asked['model']} model, {asked['method']}, noise {asked['noise']:g}"
 
 
@@ -156,12 +150,7 @@ def design(
         options.Criterion,
         Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound."),
     ] = "D",
-    accuracy: Annotated[
-        float | None,
-        Option(
-            help="Wanted standard deviation [% of half a bracket]. Default: 1; with --closed-loop: 5 % of inertias."
-        ),
-    ] = None,
+    accuracy: AccuracyOption = None,
     gust: GustOption = None,
     lag: LagOption = None,
     delay: DelayOption = None,
@@ -191,10 +180,9 @@ def design(
     typer.echo(f"{out}: {rows} samples of {asked['dt']:g} s, {kind}, {time.perf_counter() - begin:.0f} s")
 
 
-def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "Design":
+def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "jaxos4.Design":
     """The design of the kind that was asked for, beside the standard inputs."""
-    from ..airframe import load_airframe
-    from ..design import design_input, design_references, model_of
+    from ..design import model_of
     from ..identification.problem import bracket_of
     from ..models import MODELS
 
@@ -208,10 +196,10 @@ def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "Design":
         loop = make_loop(asked)
         settings |= options.given(angle=limits.pop("angle"))
         bracket = bracket_of(intervals, model_of(loop))
-        return design_references(loop, bracket=bracket, limits=options.given(**limits), **settings)
-    subject, known = MODELS[asked["model"]](load_airframe(asked["airframe"])), asked["initial_state"] == "known"
+        return jaxos4.design_references(loop, bracket=bracket, limits=options.given(**limits), **settings)
+    subject, known = MODELS[asked["model"]](jaxos4.load_airframe(asked["airframe"])), asked["initial_state"] == "known"
     settings |= {"limits": options.given(**limits), "channels": asked["channels"], "start_is_known": known}
-    return design_input(subject, bracket=bracket_of(intervals, subject), **settings)
+    return jaxos4.design_input(subject, bracket=bracket_of(intervals, subject), **settings)
 
 
 def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -229,16 +217,15 @@ def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
     return dict(asked) | {name: default for name, default in own.items() if asked.get(name) is None}
 
 
-def make_loop(asked: Mapping[str, Any]) -> "ClosedLoop":
+def make_loop(asked: Mapping[str, Any]) -> "jaxos4.ClosedLoop":
     """The vehicle in closed loop with these options."""
-    from ..airframe import load_airframe
-    from ..closed_loop import ClosedLoop
-
-    vehicle = load_airframe(asked["airframe"])
+    vehicle = jaxos4.load_airframe(asked["airframe"])
     logged, scaled = asked["sensors"], vehicle.has_full_scale
     if logged == "commands" and not scaled:
         raise InputError(
             f"--sensors commands: {asked['airframe']} has no max_rotor_speed [rad/s]; set it, or log speeds."
         )
     settings = options.given(rotor_lag=asked["lag"], rotor_delay=asked["delay"])
-    return ClosedLoop(vehicle, logged=logged or ("commands" if scaled else "speeds"), gust=asked["gust"], **settings)
+    return jaxos4.ClosedLoop(
+        vehicle, logged=logged or ("commands" if scaled else "speeds"), gust=asked["gust"], **settings
+    )

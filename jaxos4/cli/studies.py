@@ -4,17 +4,16 @@ import shlex
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
+import jaxos4
+
 from ..errors import InputError, printable
 from ._options import ESTIMATORS
 from ._output import check_outputs, stages
-
-if TYPE_CHECKING:
-    from ..study import Study
 
 
 def study(
@@ -25,9 +24,7 @@ def study(
 ) -> None:
     """Run a noise study, or resume it: finished cells are kept."""
     with stages("loading the library"):
-        from ..study import load_study, run_on_cluster
-
-        wanted = load_study(specification)
+        wanted = jaxos4.study.load_study(specification)
     if dry_run:
         _print_plan(wanted, out)
         return
@@ -37,33 +34,32 @@ def study(
         dataset = run_with_bar(wanted, out)
     else:
         with _connected(scheduler) as client:
-            dataset = run_with_bar(wanted, out, device="Dask cluster", run=partial(run_on_cluster, client=client))
+            run = partial(jaxos4.study.run_on_cluster, client=client)
+            dataset = run_with_bar(wanted, out, device="Dask cluster", run=run)
     typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
 
 
-def run_with_bar(wanted: "Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
+def run_with_bar(wanted: "jaxos4.study.Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
     """The Dataset of `jaxos4.study.carry_out`, with a progress bar. `device`: by default those of this process."""
-    from ..study import carry_out, device_name
-
     try:
         with stages("compiling", wanted.count) as show:
-            return carry_out(wanted, out, device or device_name(), progress=show, **how)
+            return jaxos4.study.carry_out(wanted, out, device or jaxos4.study.device_name(), progress=show, **how)
     except KeyboardInterrupt:
         typer.echo(f"jaxos4: {out}: interrupted; run the same command again to continue.", err=True)
         raise
 
 
-def _print_plan(wanted: "Study", out: Path) -> None:
+def _print_plan(wanted: "jaxos4.study.Study", out: Path) -> None:
     from rich.console import Console
 
     from ..report.text import Listing
-    from ..study import device_name, plan
 
-    rows = plan(wanted, out)
+    rows = jaxos4.study.plan(wanted, out)
     table = [(estimator, *map(str, counts)) for estimator, counts in rows.items()]
     Listing(("estimator", "cells", "flights"), table, ("cells", "flights")).print_on(Console(highlight=False))
     cells, flights = (sum(column) for column in zip(*rows.values(), strict=True))
-    typer.echo(f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}.")
+    device = jaxos4.study.device_name()
+    typer.echo(f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device}.")
 
 
 def _connected(address: str):
@@ -93,22 +89,16 @@ def report(
     elif out is not None:
         raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
     with stages("loading the library") as progress:
-        from ..report import write_flight_page, write_report
-
         progress("reading")
         figures: list[Path] = []
         if source.is_dir():
-            from ..study import read_results
-
-            dataset = read_results(source)
+            dataset = jaxos4.study.read_results(source)
             progress("drawing")
-            page, *figures = write_report(dataset, source)
+            page, *figures = jaxos4.report.write_report(dataset, source)
         else:
-            from ..result_file import read_result
-
-            found = read_result(source)
+            found = jaxos4.read_result(source)
             progress("drawing")
-            write_flight_page(page, found)
+            jaxos4.report.write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
         typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")
@@ -142,16 +132,13 @@ def _compare_results(results: list[Path], page: Path | None) -> None:
     with stages("loading the library") as progress:
         from rich.console import Console
 
-        from ..comparison import compare_results
-        from ..report import print_comparison, write_comparison
-
         progress("reading")
-        found = compare_results(results)
+        found = jaxos4.compare_results(results)
         if page is not None:
             progress("drawing")
             command = shlex.join(["jaxos4", "compare", *map(str, results), "--report", str(page)])
-            write_comparison(page, found, command=printable(command))
-    print_comparison(Console(), found)
+            jaxos4.report.write_comparison(page, found, command=printable(command))
+    jaxos4.report.print_comparison(Console(), found)
     if page is not None:
         typer.echo(f"report: {page}")
     if found.different:
@@ -164,38 +151,35 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     with stages("loading the library"):
         from rich.console import Console
 
-        from ..report import error_table, write_report
         from ..report.study_tables import count_outcomes
         from ..report.text import print_whole
 
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
     dataset = run_with_bar(comparison(quick=quick), directory)
-    print_whole(Console(highlight=False), error_table(dataset))
+    print_whole(Console(highlight=False), jaxos4.report.error_table(dataset))
     with stages("drawing"):
-        page, *_ = write_report(dataset, directory)
+        page, *_ = jaxos4.report.write_report(dataset, directory)
     typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")
 
 
-def comparison(*, quick: bool) -> "Study":
+def comparison(*, quick: bool) -> "jaxos4.study.Study":
     """The study that compares the estimators: the whole one, or a short one.
 
     The training is shorter than the best one. The network loses accuracy, the hybrid does not: its search starts from a
     network of the rates, and a short training is enough for that.
     """
-    from ..study import Study, Training
-
     if quick:
-        return Study(
+        return jaxos4.study.Study(
             title="IBSS, network, hybrid and a Kalman filter under sensor noise, body rates alone, in short",
             channels=("rates",),
             estimators=("ibss", "network", "hybrid", "kalman"),  # kalman: the baseline that compiles fastest
             flights=128,
-            network=Training(steps=500, held_out=1000),
+            network=jaxos4.study.Training(steps=500, held_out=1000),
         )
-    return Study(
+    return jaxos4.study.Study(
         title="IBSS, network, hybrid and baselines under sensor noise",
         estimators=tuple(name for name, kind in ESTIMATORS.items() if kind.in_comparison),
         flights=256,
-        network=Training(steps=2000, held_out=5000, hybrid_channels="rates"),
+        network=jaxos4.study.Training(steps=2000, held_out=5000, hybrid_channels="rates"),
     )

@@ -21,16 +21,27 @@ from .result import Identified
 from .vehicle import RigidVehicle
 
 _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. Rotor 1 is the airframe's first."
-# RotorPy and Gazebo need a lag: this one is too short to notice [s].
-_NO_LAG = 1e-3
-# Radius and thickness of a drawn rotor, in arms.
-_ROTOR, _FLAT = 0.5, 0.02
-# MuJoCo keeps enough past controls for the delay in scenes with time steps down to this [s].
-_SHORTEST_TIMESTEP = 0.0002
-# Gazebo needs links with a mass: that of a rotor's link, as a share of the vehicle's.
-_ROTOR_MASS = 1e-3
-# Gazebo's links of rotors turn this many times slower than the rotors, so that long time steps can follow them.
-_SLOWDOWN = 10.0
+
+
+class Assumed(NamedTuple):
+    """What simulators need and no flight shows.
+
+    - `lag`: for RotorPy and Gazebo, which need one: too short to notice [s].
+    - `radius`, `thickness`: of a drawn rotor, in arms.
+    - `shortest`: MuJoCo keeps enough past controls for the delay in scenes with time steps down to this [s].
+    - `rotor_mass`: of the link of a rotor in Gazebo, as a share of the vehicle's: links need a mass.
+    - `slowdown`: links of rotors in Gazebo turn this many times slower than the rotors, for long time steps.
+    """
+
+    lag: float = 1e-3
+    radius: float = 0.5
+    thickness: float = 0.02
+    shortest: float = 0.0002
+    rotor_mass: float = 1e-3
+    slowdown: float = 10.0
+
+
+_ASSUMED = Assumed()
 
 
 class Target(NamedTuple):
@@ -91,7 +102,8 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
         made = f"Made by jaxos4 {__version__} from {found.source}."
         notes = (f"Note: {note}" for note in found.notes)
         comments = [made, *lines, *warning, _FRAME, *notes]
-        sizes = {"radius": _ROTOR * vehicle.arm, "thickness": _FLAT * vehicle.arm, "lag": vehicle.lag or _NO_LAG}
+        sizes = {"radius": _ASSUMED.radius * vehicle.arm, "thickness": _ASSUMED.thickness * vehicle.arm}
+        sizes["lag"] = vehicle.lag or _ASSUMED.lag
         values = {"vehicle": vehicle, "comments": comments, **sizes, **target.values(vehicle)}
         return _templates(target.suffix).get_template(f"{to}{target.suffix}.j2").render(values)
 
@@ -108,8 +120,8 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 def _mujoco(vehicle: RigidVehicle) -> dict[str, Any]:
     """The controls are the thrusts of the rotors [N]. Constant forces of the rotors make the constant torque."""
     constant = vehicle._replace(torque=np.zeros(3)).hover_thrust - vehicle.hover_thrust
-    delayed = math.ceil(vehicle.delay / _SHORTEST_TIMESTEP) + 1
-    return {"constant": constant, "delayed": delayed, "shortest": _SHORTEST_TIMESTEP}
+    delayed = math.ceil(vehicle.delay / _ASSUMED.shortest) + 1
+    return {"constant": constant, "delayed": delayed, "shortest": _ASSUMED.shortest}
 
 
 def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
@@ -119,16 +131,16 @@ def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
         """The inertia of a unit mass at a place about the origin [m^2]."""
         return place @ place * np.eye(3) - np.outer(place, place)
 
-    share = _ROTOR_MASS * vehicle.mass
+    share = _ASSUMED.rotor_mass * vehicle.mass
     # The link of a rotor is a thin disc.
-    about_axis = vehicle.rotor_inertia or share * (_ROTOR * vehicle.arm) ** 2 / 2
+    about_axis = vehicle.rotor_inertia or share * (_ASSUMED.radius * vehicle.arm) ** 2 / 2
     rotor = np.diag([about_axis / 2, about_axis / 2, about_axis])
     places = np.column_stack([vehicle.rotor_positions, np.zeros(4)])
     mass = vehicle.mass - 4 * share
     center = -share * places.sum(axis=0) / mass
     rest = np.diag(vehicle.inertia) - 4 * rotor - mass * steiner(center)
     body = mass, center, rest - share * sum(steiner(place) for place in places)
-    return {"body": body, "rotor": (share, np.zeros(3), rotor), "slowdown": _SLOWDOWN}
+    return {"body": body, "rotor": (share, np.zeros(3), rotor), "slowdown": _ASSUMED.slowdown}
 
 
 @functools.cache

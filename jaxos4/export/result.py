@@ -16,9 +16,6 @@ from ..linalg import covariance_root
 from ..result_file import vehicle_result
 from .vehicle import CARRIED, INERTIAS, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
-# An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
-# differs from 1 by as many.
-_SIGNIFICANT = 3.0
 # Why some parameters are not carried; notes on the rotors' inertia name alpha2 and alpha5. All others have one note.
 _NOT_CARRIED = {
     ("voltage_exponent", "battery_fade"): "no simulator has the battery's voltage",
@@ -26,8 +23,6 @@ _NOT_CARRIED = {
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
-# The uncertainty is too large if so many draws for one sample are impossible.
-_MOST_DRAWS = 1000
 
 
 class Identified(NamedTuple):
@@ -61,24 +56,24 @@ class Identified(NamedTuple):
         """The vehicle with the estimated parameters."""
         return rigid_vehicle(self.airframe, self.values)
 
-    def draw(self, number: int, *, seed: int) -> tuple[RigidVehicle, int]:
+    def draw(self, number: int, *, seed: int, most: int = 1000) -> tuple[RigidVehicle, int]:
         """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
 
         Vehicle `number` does not depend on how many are drawn. A damping, drag, lag or delay that is drawn negative
         is 0.
 
-        **Raises:** `InputError` if hardly any draw is possible.
+        **Raises:** `InputError` if `most` draws are impossible: the uncertainty is too large.
         """
         generator = np.random.default_rng([seed, number])
         root = covariance_root(self.covariance)
-        for impossible in range(_MOST_DRAWS):
+        for impossible in range(most):
             errors = root @ generator.standard_normal(len(root))
             changed = {name: self.values[name] + float(error) for name, error in zip(self.drawn, errors, strict=True)}
             vehicle = rigid_vehicle(self.airframe, _clipped(self.values | changed))
             if not vehicle.impossible:
                 return vehicle, impossible
         raise InputError(
-            f"`samples`: the estimate is too uncertain: {_MOST_DRAWS} draws gave no possible vehicle; export without "
+            f"`samples`: the estimate is too uncertain: {most} draws gave no possible vehicle; export without "
             "samples, or fly with more excitation."
         )
 
@@ -123,19 +118,23 @@ def _vehicles_own(name: str) -> str:
     return re.sub(r"_\d+$", "", name)
 
 
-def _parts(file: Identification) -> tuple[dict[str, float], list[str], list[str]]:
-    """Values by name, the names of those that were estimated, and notes."""
+def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str, float], list[str], list[str]]:
+    """Values by name, the names of those that were estimated, and notes.
+
+    `significant`: by how many standard deviations an inertia of the rotors must differ from 0, and a thrust curve from
+    1, to be exported.
+    """
     rows, constants, notes = file.parameters, file.rigid_body.constants, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
     for moment, name in INERTIAS.items():
         if constants and moment not in constants:
             found.pop(name, None)  # the estimate says that this one is not to be trusted
-    if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SIGNIFICANT * found["rotor_reaction"][1]:
+    if "rotor_reaction" in found and not found["rotor_reaction"][0] > significant * found["rotor_reaction"][1]:
         del found["rotor_reaction"]
     if "rotor_reaction" not in found and "rotor_reaction" in (*rows, *file.held):
         notes.append("rotor_reaction: below noise; the inertia of the rotors is the airframe's")
     curve, error = found.get("thrust_curve", (1.0, 0.0))
-    if abs(curve - 1) < _SIGNIFICANT * error:
+    if abs(curve - 1) < significant * error:
         del found["thrust_curve"]
     values = {name: value for name, (value, _) in found.items()}
     values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values

@@ -16,10 +16,6 @@ INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 NOT_NEGATIVE = ("rotor_lag", "rotor_delay", *(f"{x}_damping" for x in AXES), "x_drag", "y_drag", "z_drag")
 CARRIED = (*INERTIAS.values(), "thrust_gain", *(f"{x}_offset" for x in AXES), "roll_thrust", "pitch_thrust")
 CARRIED += ("roll_velocity", "pitch_velocity", "rotor_reaction", "thrust_curve", *NOT_NEGATIVE)
-# The full-scale rotor speed, in hover speeds, if the airframe does not have it.
-_FULL_SCALE = 2.0
-# No constant is this large in SI units.
-_BEYOND = 1e9
 
 
 class RigidVehicle(NamedTuple):
@@ -106,7 +102,7 @@ class RigidVehicle(NamedTuple):
                 return f"{name} = {moment:.3g} kg m^2 is not positive"
             if 2 * moment > self.inertia.sum():
                 return f"{name} = {moment:.3g} kg m^2 exceeds the sum of the other two moments of inertia"
-        if not all((np.abs(each) < _BEYOND).all() for each in self):
+        if not all((np.abs(each) < 1e9).all() for each in self):  # in SI units
             return "one of its constants is beyond those of every vehicle"
         if not self.thrust_coefficient > 0:
             return "the thrust is not positive"
@@ -165,7 +161,7 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
         thrust_curve=values.get("thrust_curve", 1.0),
     )
     if not np.isfinite(speed) and gain > 0:
-        return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed)
+        return vehicle._replace(max_rotor_speed=2 * vehicle.hover_speed)  # a note says so
     # The load of the propeller shortens the lag of a motor: that of small changes in hover (`jaxos4.models.rotors`).
     curve, share = vehicle.thrust_curve, vehicle.hover_speed / speed if gain > 0 else 0.0
     return vehicle._replace(lag=vehicle.lag / (curve + 2 * (1 - curve) * share)) if 0 < curve < 2 else vehicle

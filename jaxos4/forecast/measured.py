@@ -7,11 +7,8 @@ from jaxtyping import Float, Int
 
 from ..flight import STATE_NAMES, Flight
 from ..recording.noise import white_noise
+from .flight_prediction import known_mean
 from .motion import PARTS, departures, inverse, product, turned
-from .prediction import known_mean
-
-# The share of a Gaussian within one standard deviation, and the fewest starts for it.
-_ONE_SIGMA, _FEWEST = 0.6827, 10
 
 
 class Measured(NamedTuple):
@@ -70,7 +67,7 @@ class Measured(NamedTuple):
         return self._replace(**parts)
 
     def contradictions(
-        self, start: Int[np.ndarray, " starts"], steps: int, gravity: float
+        self, start: Int[np.ndarray, " starts"], steps: int, gravity: float, *, fewest: int = 10
     ) -> Float[np.ndarray, "steps 9"]:
         """How far position, velocity and attitude are from dead reckoning with gyro and accelerometer.
 
@@ -78,7 +75,8 @@ class Measured(NamedTuple):
         each other, by noise of any colour, or by shifted clocks. The mean error of the accelerometer is corrected.
 
         **Returns:** the standard deviation after each step, without what the white noise of gyro and accelerometer
-        causes, and at least what the white noise of the start and of the end causes.
+        causes, and at least what the white noise of the start and of the end causes; that alone if fewer than `fewest`
+        starts were measured.
         """
         rows, dt, down = start[:, None] + np.arange(steps + 1), self.dt, np.array([0.0, 0.0, gravity])
         begin, rates = self.states[start], self.states[rows[:, 1:], 10:]
@@ -89,8 +87,9 @@ class Measured(NamedTuple):
         velocity = begin[:, None, 3:6] + dt * np.cumsum((push[:, 1:] + push[:, :-1]) / 2, axis=1)
         reckoned = _moved(begin, rates, velocity, dt)
         departed = np.abs(departures(reckoned, self.states[rows[:, 1:]]))[..., :9]
-        enough = np.isfinite(departed).sum(axis=0) >= _FEWEST
-        size = np.nanquantile(np.where(enough, departed, 0.0), _ONE_SIGMA, axis=0)
+        one_sigma = 0.6827  # the share of a Gaussian within one standard deviation
+        enough = np.isfinite(departed).sum(axis=0) >= fewest
+        size = np.nanquantile(np.where(enough, departed, 0.0), one_sigma, axis=0)
         seconds, white = dt * np.arange(1, steps + 1)[:, None], np.nan_to_num([white_noise(x, 4) for x in self.force.T])
         jerky, gyro = white**2 * dt * seconds, self.noise[9:] ** 2 * dt * seconds
         known = np.concatenate([jerky * seconds**2 / 3, jerky, gyro], axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Numeric, Scalar
-from ..analysis.prediction import filtered
+from ..analysis.open_loop import filtered, gyro_bias, open_loop
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
@@ -23,16 +23,26 @@ Quaternion = tuple[_Samples, _Samples, _Samples, _Samples]
 PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10], "rates": np.r_[10:13]}
 """The places of the parts of a state in an array of 13. The attitude is the quaternion w, x, y, z, body to earth."""
 
-CHUNK = 32
-"""The number of starts that fly in one call of a program."""
 
-# A recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
-_MEMORY = 5.0
-# The standard deviation of an offset of the specific force, and of the force that a model lacks [m/s^2]; and the
-# correlation time of the latter [s].
-PUSH, _PUSH_TIME = 1.0, 0.25
-# Rows after which the covariance of a filter no longer changes.
-_SETTLED = 512
+class Tuning(NamedTuple):
+    """What tunes predictions of whole flights.
+
+    - `memory`: a recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
+    - `push`: the standard deviation of an offset of the specific force, and of the force that a model lacks [m/s^2].
+    - `push_time`: the correlation time of the latter [s].
+    - `settled`: the rows after which the covariance of a filter no longer changes.
+    - `draws`: the futures of each start for the band.
+    - `ninety_five`: half the width of a 95 % interval in their standard deviations (Student).
+    - `chunk`: the number of starts that fly in one call of a program.
+    """
+
+    memory: float = 5.0
+    push: float = 1.0
+    push_time: float = 0.25
+    settled: int = 512
+    draws: int = 64
+    ninety_five: float = 1.9977
+    chunk: int = 32
 
 
 class Motion(NamedTuple):
@@ -49,7 +59,7 @@ class Known(NamedTuple):
 
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: of the filters [rad/s], [rad/s^2; m/s^2].
-    - `unsure`: the standard deviation of each offset, see `Lanes`.
+    - `unsure`: the standard deviation of each offset, see `Futures`.
     """
 
     state: Float[Numeric, "... 13"]
@@ -58,7 +68,7 @@ class Known(NamedTuple):
     unsure: Float[Numeric, "... 6"]
 
 
-class Lanes(NamedTuple):
+class Futures(NamedTuple):
     """Several futures of each start.
 
     - `parameters`: of the model. `forcing`: of these parameters, one row for each sample.
@@ -70,14 +80,14 @@ class Lanes(NamedTuple):
     - `gusts`: what rate and disturbance of each channel gain in each step besides the model.
     """
 
-    parameters: Float[Array, "lanes parameters"]
+    parameters: Float[Array, "futures parameters"]
     forcing: Forcing
-    offset: Float[Array, "lanes samples 6"]
-    filtered: Bool[Array, " lanes"]
-    begin: Float[Array, "lanes 3"]
-    pushed: Float[Array, "lanes channels"]
-    off: Float[Array, "lanes 2 6"]
-    gusts: Float[Array, "lanes steps channels 2"]
+    offset: Float[Array, "futures samples 6"]
+    filtered: Bool[Array, " futures"]
+    begin: Float[Array, "futures 3"]
+    pushed: Float[Array, "futures channels"]
+    off: Float[Array, "futures 2 6"]
+    gusts: Float[Array, "futures steps channels 2"]
 
 
 class _Free(NamedTuple):
@@ -144,37 +154,34 @@ def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _fly(
-    model: FlightModel, lane: Lanes, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
+    model: FlightModel, future: Futures, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
 ) -> Float[Array, "steps 13"]:
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
-    kept, reach = transition(jnp.exp(noise.time_constant), dt)
-    scalars, axes = tuple(lane.parameters), model.force_axes
+    scalars, axes = tuple(future.parameters), model.force_axes
     p, v, q, w = (start.state[places] for places in PARTS.values())
-    # A gyro bias is part of the measurement, not of the state.
-    steps = lane.gusts.shape[0]
-    rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), lane.forcing)
+    steps = future.gusts.shape[0]
+    rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    biased = jnp.stack(model.observe(State(Rates(*w)), still, scalars)[:3])
-    w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin
-    error, absorbed = start.unsure * lane.off
-    offset = lane.offset[first] + error
+    w = jnp.where(future.filtered, start.rates, w) - gyro_bias(model, w, still, scalars) + future.begin
+    error, absorbed = start.unsure * future.off
+    offset = future.offset[first] + error
     begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
 
-    def step(carry: tuple[Motion, Array, Array], row) -> tuple[tuple[Motion, Array, Array], Array]:
-        (motion, disturbance, feasible), (forcing, gust) = carry, row
-        pushed = reach * disturbance + gust[:, 0]
-        turning = offset[:3] + pushed[:3] / dt
-        pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(pushed[3:])
+    def advance(carry: tuple[Motion, Array], forcing: Forcing, added: Array) -> tuple[Motion, Array]:
+        motion, feasible = carry
+        turning = offset[:3] + added[:3] / dt
+        pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(added[3:])
         moved = rk4_step(_Free(model, tuple(turning), tuple(pushing)), motion, forcing, scalars, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
-        values = jnp.stack(jax.tree.leaves(moved))
-        feasible = feasible & jnp.isfinite(values).all() & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
-        motion = jax.tree.map(lambda new, old: jnp.where(feasible, new, old), moved, motion)
-        return (motion, kept * disturbance + gust[:, 1], feasible), jnp.stack(jax.tree.leaves(motion))
+        finite = jnp.isfinite(jnp.stack(jax.tree.leaves(moved))).all()
+        feasible = feasible & finite & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
+        return jax.tree.map(lambda new, old: jnp.where(feasible, new, old), moved, motion), feasible
 
-    pushed = jnp.where(lane.filtered, start.disturbance, 0.0) + lane.pushed
-    pushed = pushed.at[:3].add(absorbed[:3])
-    return jax.lax.scan(step, (begin, pushed, jnp.array(True)), (rows, lane.gusts))[1]
+    disturbance = jnp.where(future.filtered, start.disturbance, 0.0) + future.pushed
+    disturbance = disturbance.at[:3].add(absorbed[:3])
+    fading = transition(jnp.exp(noise.time_constant), dt)
+    motion, _ = open_loop(advance, (begin, jnp.array(True)), disturbance, rows, future.gusts, fading)
+    return jnp.stack(jax.tree.leaves(motion), axis=1)
 
 
 def _unit(a: Quaternion) -> Quaternion:
@@ -195,13 +202,13 @@ def departures(states: Any, others: Any) -> Any:
 
 @eqx.filter_jit
 def fly_chunk(
-    model: FlightModel, lanes: Lanes, known: Known, first: Int[Array, " starts"], noise: LogNoise, dt: Scalar
+    model: FlightModel, futures: Futures, known: Known, first: Int[Array, " starts"], noise: LogNoise, dt: Scalar
 ) -> tuple[Float[Array, "starts 2 steps 13"], Float[Array, "starts steps 12"]]:
-    """The first two lanes from each sample `first`, and the root mean square `departures` of the others from them."""
+    """The first two futures from each sample `first`, and the root mean square `departures` of the others from them."""
 
     def every(first: Int[Array, ""]) -> tuple[Array, Array]:
         start = jax.tree.map(lambda leaf: leaf[first], known)
-        states = jax.vmap(lambda lane: _fly(model, lane, first, start, noise, dt))(lanes)
+        states = jax.vmap(lambda future: _fly(model, future, first, start, noise, dt))(futures)
         off = departures(jnp.broadcast_to(states[0], states[2:].shape), states[2:])
         return states[:2], jnp.sqrt(jnp.square(off).mean(axis=0))
 
@@ -213,12 +220,13 @@ def known_at_samples(
     model: FlightModel,
     flight: Flight,
     length: Count,
-    parameters: Float[Array, "lanes parameters"],
+    parameters: Float[Array, "futures parameters"],
     measured: tuple[Float[Array, "samples 13"], Float[Array, "samples 6"], Float[Array, "3"]],
     noise: LogNoise,
     prior: Float[Array, "6"],
-) -> tuple[Known, Forcing, Float[Array, "lanes samples 6"]]:
-    """The knowledge at each sample, by the first row of `parameters`; and forcing and offsets of each row: see `Lanes`.
+    tuning: Tuning,
+) -> tuple[Known, Forcing, Float[Array, "futures samples 6"]]:
+    """The knowledge at each sample, by the first row of `parameters`; forcing and offsets of each row: see `Futures`.
 
     The velocity is left out of the forcing: it will be that of the prediction.
 
@@ -231,11 +239,11 @@ def known_at_samples(
     state, accelerations, velocity_noise = measured
     rates, inputs = flight.states[:, RATES], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
-    kept = jnp.exp(-flight.dt / _MEMORY)
+    kept = jnp.exp(-flight.dt / tuning.memory)
     sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), velocity_noise])
-    weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt)
+    weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt, tuning)
 
-    def of_lane(values: Array) -> tuple[Forcing, Array, Array, Array]:
+    def of_future(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
         turning = jnp.stack(model.angular_acceleration(Rates(*middle.T), forcing, scalars), axis=1)
         pushing = jnp.stack(model.specific_force(forcing.thrust, forcing, scalars), axis=1)
@@ -245,7 +253,7 @@ def known_at_samples(
         seen = observe(jnp.nan_to_num(rates), forcing)
         return forcing._replace(velocity=None, recording=()), offset, turning, jnp.stack(seen[3:], axis=1)
 
-    forcing, offset, turning, expected = jax.vmap(of_lane)(parameters)
+    forcing, offset, turning, expected = jax.vmap(of_future)(parameters)
     force = flight.channels[:, len(STATE_NAMES) + np.asarray(model.force_axes, dtype=int)] - expected[0]
     # The bias of an accelerometer is its mean over the memory.
     force = force - _past(jnp.nan_to_num(force), kept) / jnp.maximum(_past(~jnp.isnan(force), kept), 1.0)
@@ -256,7 +264,14 @@ def known_at_samples(
 
 
 def _offset_weights(
-    model: FlightModel, accelerations: Array, noise: LogNoise, sensor: Array, prior: Array, kept: Scalar, dt: Scalar
+    model: FlightModel,
+    accelerations: Array,
+    noise: LogNoise,
+    sensor: Array,
+    prior: Array,
+    kept: Scalar,
+    dt: Scalar,
+    tuning: Tuning,
 ) -> tuple[Float[Array, "samples 6"], Float[Array, "samples 6"]]:
     """The factor of the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
 
@@ -264,7 +279,7 @@ def _offset_weights(
     as offsets are known not to differ.
     """
     channels = np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
-    strength, time_constant = (jnp.full(6, x) for x in (PUSH, _PUSH_TIME))
+    strength, time_constant = (jnp.full(6, x) for x in (tuning.push, tuning.push_time))
     strength = strength.at[channels].set(jnp.exp(noise.strength))
     time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant))
     is_known, prior = ~jnp.isnan(accelerations), jnp.square(prior)
@@ -286,17 +301,15 @@ def _past(values: Array, kept: Scalar) -> Float[Array, "samples columns"]:
 
 
 @eqx.filter_jit
-def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[Array, " channels"]]:
-    """The state of each channel's filter when its gains no longer change.
+def settled(noise: LogNoise, dt: Scalar, rows: int) -> tuple[Covariance, Covariance, Float[Array, " channels"]]:
+    """The state of each channel's filter when its gains no longer change, after so many `rows`.
 
     **Returns:** the covariance of rate and disturbance after a measurement; what a step adds to it; and the share of a
     constant acceleration that the disturbance absorbs.
     """
     step = step_of(noise, dt)
     measured, never = jnp.ones(step.variance.shape, dtype=bool), jnp.zeros(1, dtype=bool)
-    p, gains = jax.lax.scan(
-        lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=_SETTLED
-    )
+    p, gains = jax.lax.scan(lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=rows)
     rate, disturbance = 1 - gains.rate[-1], gains.disturbance[-1]
     seen = step.memory * p.cross + step.seen * p.disturbance
     after = Covariance(p.rate * rate, p.cross * rate, p.disturbance - seen * disturbance)

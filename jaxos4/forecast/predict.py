@@ -17,13 +17,11 @@ from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording.prepared import Prepared, prepare
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
+from .flight_prediction import FlightPrediction
 from .measured import Measured, constant_rates, regressed
-from .motion import CHUNK, PARTS, PUSH, Lanes, fly_chunk, known_at_samples, settled, turned
-from .prediction import FlightPrediction
+from .motion import PARTS, Futures, Tuning, fly_chunk, known_at_samples, settled, turned
 from .vehicle import Vehicle, vehicle_of
 
-# Futures of each start for the band, and half the width of a 95 % interval in their standard deviations (Student).
-_DRAWS, _NINETY_FIVE = 64, 1.9977
 # Inputs that no prediction can replace.
 _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
@@ -70,28 +68,41 @@ def predict(
     vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
     recording = as_recording(flight, airframe=vehicle.model.airframe)
     prepared = _prepare(vehicle, recording, sample_time)
-    measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
+    fitted = found.problem if isinstance(found, Identification) else None
+    trained = None if fitted is None else Measured.of(fitted.flight)
+    return _predicted(vehicle, recording.name, prepared, trained, horizon, spacing, seed)
+
+
+def _predicted(
+    vehicle: Vehicle,
+    name: str,
+    prepared: Prepared,
+    trained: Measured | None,
+    horizon: float,
+    spacing: float,
+    seed: int,
+) -> FlightPrediction:
+    """The prediction of a flight of this name. The regression is fitted to `trained`, or to the flight's first half."""
+    tuning, measured, problem = Tuning(), Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     missing = tuple(part for part in ("position", "velocity") if not measured.has(part))
-    start = _starts(measured, recording.name, steps, max(round(spacing / dt), 1), missing)
+    start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed)
-    ahead = start[:, None] + np.arange(1, steps + 1)
+    begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed, tuning)
+    ahead, trained = start[:, None] + np.arange(1, steps + 1), measured.first_half if trained is None else trained
     gravity = float(vehicle.model.airframe.gravity)
-    fitted = found.problem if isinstance(found, Identification) else None
-    trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
     sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(
         found=vehicle.name,
-        flight=recording.name,
+        flight=name,
         time=prepared.time[start],
         horizons=dt * np.arange(1, steps + 1),
         begin=begin,
         predicted=states[:, 0],
         unaware=states[:, 1],
-        half_width=_NINETY_FIVE * np.sqrt(spread**2 + sensors**2),
+        half_width=tuning.ninety_five * np.sqrt(spread**2 + sensors**2),
         measured=measured.states[ahead],
         constant=constant_rates(begin, steps, dt),
         regression=regressed(trained, begin, measured.omega[ahead - 1], dt, gravity),
@@ -158,6 +169,7 @@ def _fly(
     noise: LogNoise,
     steps: int,
     seed: int,
+    tuning: Tuning,
 ) -> tuple[
     Float[np.ndarray, "starts 13"], Float[np.ndarray, "starts 2 steps 13"], Float[np.ndarray, "starts steps 12"]
 ]:
@@ -167,7 +179,8 @@ def _fly(
     force has no offset.
     """
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, problem.flight.dt
-    parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(_DRAWS, generator)]))
+    draws, chunk = tuning.draws, tuning.chunk
+    parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(draws, generator)]))
     model = dataclasses.replace(vehicle.model, recordings=(0,) * (int(measured.stretch.max()) + 1))
     state, samples, noise = measured.states.copy(), len(measured.stretch), LogNoise(*map(as_float, noise))
     if "velocity" in missing:
@@ -178,20 +191,20 @@ def _fly(
     accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
     padding = ((0, problem.flight.time.size - samples), (0, 0))
     rows, changes = (as_float(np.pad(x, padding, constant_values=np.nan)) for x in (state, accelerations))
-    prior = as_float(np.append(vehicle.offset, [PUSH * ("velocity" not in missing)] * 3))
+    prior = as_float(np.append(vehicle.offset, [tuning.push * ("velocity" not in missing)] * 3))
     seen, length = (rows, changes, as_float(measured.noise[3:6])), jax.device_put(np.asarray(samples))
-    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, seen, noise, prior)
+    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, seen, noise, prior, tuning)
 
-    after, added, absorbed = jax.tree.map(np.asarray, settled(noise, dt))
-    first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
-    gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
-    off = generator.standard_normal((_DRAWS, 6))
+    after, added, absorbed = jax.tree.map(np.asarray, settled(noise, dt, tuning.settled))
+    first = _pairs(after, generator.standard_normal((draws, channels, 2)))
+    gusts = _pairs(added, generator.standard_normal((draws, steps, channels, 2)))
+    off = generator.standard_normal((draws, 6))
     drawn = first[:, :3, 0], first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
     surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
-    lanes = Lanes(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
+    futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
-    chunks = (np.minimum(np.arange(i, i + CHUNK), start.size - 1) for i in range(0, start.size, CHUNK))
-    found = [fly_chunk(vehicle.model, lanes, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]
+    chunks = (np.minimum(np.arange(i, i + chunk), start.size - 1) for i in range(0, start.size, chunk))
+    found = [fly_chunk(vehicle.model, futures, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]
     states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[: start.size] for i in range(2))
     return state[start], states, spread
 

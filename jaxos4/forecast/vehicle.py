@@ -19,8 +19,6 @@ from ..models.terms import TERMS
 from ..result_file import vehicle_result
 from ..shooting.gains import LogNoise
 
-_LEAST = 1e-9  # of a noise level, whose logarithm must be finite
-
 
 class Vehicle(NamedTuple):
     """The vehicle that predicts.
@@ -97,7 +95,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
             np.array(values),
             shares @ covariance @ shares.T,
             np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
-            LogNoise(*np.log(np.maximum(table, _LEAST)).T),
+            LogNoise(*np.log(np.maximum(table, 1e-9)).T),  # finite
             used.sample_time,
             file.result,
             (*file.reasons, *notes),

@@ -12,7 +12,8 @@ from .._custom_types import Numeric, as_float
 from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate
 from ..analysis.frequency_response import frequency_response
-from ..analysis.prediction import Predictions, Skill, disturbances, predictions, skill
+from ..analysis.open_loop import disturbances
+from ..analysis.prediction import Predictions, Skill, predictions, skill
 from ..estimate import fit_start
 from ..estimators import EquationError
 from ..shooting import ShootingProblem, padded, with_room

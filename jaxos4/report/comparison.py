@@ -13,12 +13,7 @@ from .._files import check_writable, write_file
 from ..comparison import ComparedQuantity, Comparison
 from .html import draw, render
 from .style import FAINT, INK, Style, drawing, grid, style
-from .text import MISSING, Listing, plain
-
-_COLUMNS = 3
-_LINE = 0.19  # the height of a result in the figure [inch]
-# Answers that do not count reach at most this many times as far as those that do; the figure shows no more.
-_FAR = 2.0
+from .text import MISSING, Listing, plain, say
 
 
 def print_comparison(console: Console, found: Comparison) -> None:
@@ -26,11 +21,7 @@ def print_comparison(console: Console, found: Comparison) -> None:
 
     Other quantities are listed result by result if the results differ in them.
     """
-
-    def say(line: str) -> None:
-        console.print(line, markup=False, highlight=False)
-
-    say(agreement(found))
+    say(console, agreement(found))
     count, rows = len(found.names), []
     for each in found.quantities:
         low, high = map(plain, each.ci95)
@@ -46,10 +37,11 @@ def print_comparison(console: Console, found: Comparison) -> None:
         headings = (f"{each.name} [{each.unit}]", "estimate", "95 % interval")
         Listing(headings, [row[:-1] for row in rows], ("estimate",), [row[-1] for row in rows]).print_on(console)
     for note in found.notes:
-        say(f"note: {note}")
+        say(console, f"note: {note}")
     say(
+        console,
         "p: the probability that results of one value scatter this much or more. Agreement says nothing about what all "
-        "results share: mass, arms, and the model."
+        "results share: mass, arms, and the model.",
     )
 
 
@@ -80,14 +72,15 @@ def forest(found: Comparison, look: Style) -> Figure:
 
     Hollow and grey: does not count. Results are numbered in the order of `found.names`.
     """
-    count, columns = len(found.names), min(_COLUMNS, len(found.quantities))
-    figure, panels = grid(len(found.quantities), columns=columns, height=0.9 + _LINE * count)
+    count = len(found.names)
+    figure, panels = grid(len(found.quantities), columns=3, height=0.9 + 0.19 * count)
     for panel, each in zip(panels, found.quantities, strict=True):
         ends = [end for row, used in zip(each.answers, each.used, strict=True) if row and used for end in row.ci95]
         ends = ends or [end for row in each.answers if row for end in row.ci95]
         low, high = min(ends), max(ends)
         room = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-300)
-        panel.set_xlim(low - (_FAR - 1) / 2 * room, high + (_FAR - 1) / 2 * room)
+        # Answers that do not count may reach far; the figure shows twice the room of those that do.
+        panel.set_xlim(low - room / 2, high + room / 2)
         if math.isfinite(each.value):
             panel.axvspan(*each.ci95, color=look.color, alpha=0.18, linewidth=0)
             panel.axvline(each.value, color=look.color, linewidth=1.1)

@@ -11,10 +11,6 @@ from ..design import Design
 from .text import Listing, plain
 
 _COLUMNS = 4
-_LONGEST_REPEATED = 1e4
-# The inputs are drawn for so many periods. Bounds that fall with the root of the duration are drawn up to this
-# multiple of the flight.
-_PERIODS, _LONGER = 2, 10
 # By the kind of design: what a missing bound means, what the geometric mean is taken of, what the other inputs share
 # with the design, and the titles of the panels of the inputs.
 _WORDS = {
@@ -69,7 +65,7 @@ def _lengths(found: Design, accuracy: float) -> str:
         so = f"So fly at least {longest:.3g} s; the references repeat every {designed.period:.3g} s."
         return f"known to {100 * accuracy:g} %: {after}. {so}"
     repeats, how = longest / designed.duration, "not by this input"
-    if repeats < _LONGEST_REPEATED:
+    if repeats < 1e4:
         how = f"the first {longest:.2f} s are enough" if repeats <= 1 else f"fly it {math.ceil(repeats)} times"
     return f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}."
 
@@ -77,7 +73,8 @@ def _lengths(found: Design, accuracy: float) -> str:
 def write_design(found: Design, accuracy: float, out: Path) -> None:
     """Write the figure as SVG: above what to fly, below the bound of each target against the time of flight.
 
-    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds).
+    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds). The inputs are drawn
+    for two periods. Bounds that fall with the root of the duration are drawn up to ten times the flight.
     """
     from .style import INK, drawing, grid, label, log_axis, styles, svg  # a second that the table does not need
 
@@ -85,7 +82,7 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
     every, targets = {"designed": designed, **found.standard}, task.scale.size
     with drawing():
         figure, panels = grid(_COLUMNS + targets, columns=_COLUMNS, height=1.9)
-        looks, shown = styles(list(every)), round(_PERIODS * designed.period / designed.dt)
+        looks, shown = styles(list(every)), round(2 * designed.period / designed.dt)
         time = designed.dt * np.arange(designed.inputs.shape[0])
         for i, (panel, title) in enumerate(zip(panels, _WORDS[task.kind][-1], strict=False)):
             for name in ("designed",) if in_percent else ("multisine", "designed"):
@@ -97,7 +94,7 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
             panel.axhline(100 * accuracy if in_percent else float(task.scale[i]), color=INK, linewidth=0.8)
             for name, one in every.items():
                 if one.history is None:
-                    seconds = np.geomspace(designed.period, _LONGER * designed.duration, 50)
+                    seconds = np.geomspace(designed.period, 10 * designed.duration, 50)
                     bound = one.bounds[i] * np.sqrt(one.duration / seconds)
                     bound = np.where(bound < task.unexcited[i], 100 * bound / task.scale[i], np.nan)
                 else:

@@ -13,8 +13,6 @@ from .._templates import templates
 from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
 from .text import MISSING, plain
 
-# CSS pixels in a point, and by how much a panel may shrink and grow.
-_PIXELS, _SHRINKS, _GROWS = 4 / 3, 0.78, 1.5
 _THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)", PAPER: "none"}
 
 
@@ -68,8 +66,9 @@ def inline(drawing: Drawing, description: str, estimators: Sequence[str] = ()) -
         text = text.replace(color, themed)
     panels = re.findall(r'^  <g id="\S+--axes_\d+">$.*?^  </g>$', text, flags=re.DOTALL | re.MULTILINE)
     panels[-1] += text[text.rindex("<defs>") : text.rindex("</svg>")]
-    width, columns = _PIXELS * drawing.boxes[0][2], len({round(box[0]) for box in drawing.boxes})
-    style = f"--least: {_SHRINKS * width:.0f}px; --most: {_GROWS * width:.0f}px; --columns: {columns}"
+    points, columns = drawing.boxes[0][2], len({round(box[0]) for box in drawing.boxes})
+    width, shrinks, grows = 4 / 3 * points, 0.78, 1.5  # a CSS pixel is 3/4 of a point
+    style = f"--least: {shrinks * width:.0f}px; --most: {grows * width:.0f}px; --columns: {columns}"
     shown = [
         f'<svg viewBox="{" ".join(f"{x:.1f}" for x in box)}">{panel}</svg>'
         for box, panel in zip(drawing.boxes, panels, strict=True)

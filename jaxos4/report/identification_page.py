@@ -24,20 +24,16 @@ from ..identification.results import Constant, Identification, SampleTime
 from ..identification.verdict import headline, reasons
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
+from .identification_plots import GAINS, HIGHEST, INERTIAS, draw_response, gain_band, gaps
 from .identification_text import quantity_rows
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
 
 # The share of the errors that the band of the predictions holds.
 _BAND = 0.95
-_INERTIAS = ("Ix", "Iy", "Iz")
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
-# The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
-HIGHEST, GAINS = 40.0, (0.2, 5.0)
-_WIDEST = 50.0  # the logarithm of a factor that no figure shows
 _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 0.2, "hspace": 0.6}
-_FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 
 
 def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
@@ -139,7 +135,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
     above.margins(0.08)
     above.set_aspect("equal", adjustable="datalim")
     above.set_title("from above [mm], front up")
-    for row, (name, given) in enumerate(zip(_INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
+    for row, (name, given) in enumerate(zip(INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
         bars.plot([given, given], [row - 0.36, row + 0.36], color=INK, linewidth=1.4, linestyle=BOUND_DASHES[2])
         if name not in constants:
             bars.text(0, row, "  not identified", va="center")
@@ -147,7 +143,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
         value, half = constants[name].estimate, NINETY_FIVE * constants[name].std
         bars.barh(row, value, height=0.5, color=look.color, alpha=0.35)
         bars.errorbar(value, row, xerr=half, color=look.color, capsize=4, marker=look.marker)
-    bars.set_yticks(range(3), _INERTIAS)
+    bars.set_yticks(range(3), INERTIAS)
     bars.set_ylim(2.6, -0.6)
     bars.set_xlim(left=0)
     bars.grid(axis="y", visible=False)
@@ -165,8 +161,7 @@ def predicted_rates(predicted: Predictions, sample_time: float, look: Style) -> 
     **Arguments:** `sample_time`: of the flight [s].
     """
     start, errors = predicted.start, np.abs(predicted.predicted - predicted.measured)
-    usual = np.median(np.diff(start)) if start.size > 1 else 1
-    breaks = np.flatnonzero(np.diff(start) > 1.5 * usual) + 1
+    breaks, usual = gaps(start)
     half = np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), _BAND, axis=0)
     measured, values = (
         np.insert(each, breaks, np.nan, axis=0).transpose(1, 2, 0) for each in (predicted.measured, predicted.predicted)
@@ -190,18 +185,12 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     for row, (name, axis) in enumerate(found._asdict().items()):
         gain, phase, coherence = panels[3 * row : 3 * row + 3]
         degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
-        factor = np.exp(np.minimum(axis.half_width, _WIDEST))
-        bands = np.array([axis.gain / factor, axis.gain * factor]), degrees + np.array([-spread, spread])
-        for panel, values, band, model in zip((gain, phase), (axis.gain, degrees), bands, (1.0, 0.0), strict=True):
-            panel.plot(axis.frequency, values, color=FAINT, linewidth=0.8)
-            low, high = np.where(axis.clear, band, np.nan)
-            panel.fill_between(axis.frequency, low, high, color=look.color, alpha=0.25, linewidth=0)
-            panel.plot(axis.frequency, np.where(axis.clear, values, np.nan), color=look.color)
-            panel.axhline(model, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
+        draw_response(gain, axis, axis.gain, gain_band(axis), 1.0, look.color)
+        draw_response(phase, axis, degrees, np.array([degrees - spread, degrees + spread]), 0.0, look.color)
         coherence.plot(axis.frequency, axis.coherence, color=look.color)
         gain.set_yscale("log")
         gain.set_ylim(GAINS)
-        ticks_at(gain.yaxis, _GAIN_TICKS)
+        ticks_at(gain.yaxis, (0.2, 0.5, 1, 2, 5))
         phase.set_ylim(-180, 180)
         phase.yaxis.set_major_locator(MultipleLocator(90))
         coherence.set_ylim(0, 1.03)
@@ -209,7 +198,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
             panel.set_title(f"{name}: {title}")
             panel.set_xscale("log")
             panel.set_xlim(1.0, top)
-            ticks_at(panel.xaxis, _FREQUENCY_TICKS)
+            ticks_at(panel.xaxis, (1, 2, 5, 10, 20, 40))
     label(figure, x="frequency [Hz]")
     return figure
 
@@ -221,7 +210,7 @@ def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: 
     """
     figure, panels = grid(3, columns=3, height=2.4)
     ticks = [1e3 * each.sample_time for each in answers]
-    for panel, name in zip(panels, _INERTIAS, strict=True):
+    for panel, name in zip(panels, INERTIAS, strict=True):
         rows = {each.sample_time: each.constants[name] for each in answers if name in each.constants}
         for sample_time, row in rows.items():
             if math.isclose(sample_time, chosen):

@@ -3,16 +3,49 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 
+from ..analysis.frequency_response import AxisResponse
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
 from ..identification.results import Identification
-from .identification_page import GAINS, HIGHEST
 from .style import BOUND_DASHES, FAINT, INK, log_axis, styles
 
-_RATES, _INERTIAS = ("p", "q", "r"), ["Ix", "Iy", "Iz"]
+HIGHEST, GAINS = 40.0, (0.2, 5.0)
+"""The highest frequency [Hz] and the gains that a figure of the response shows."""
+
+INERTIAS: tuple[str, ...] = ("Ix", "Iy", "Iz")
+_RATES = ("p", "q", "r")
+
+
+def gaps(start: Int[np.ndarray, " starts"]) -> tuple[Int[np.ndarray, " gaps"], float]:
+    """The places before which a line breaks, because another stretch begins; and the usual step between starts."""
+    usual = float(np.median(np.diff(start))) if start.size > 1 else 1.0
+    return np.flatnonzero(np.diff(start) > 1.5 * usual) + 1, usual
+
+
+def gain_band(one: AxisResponse) -> Float[np.ndarray, "2 frequencies"]:
+    """The ends of the 95 % interval of the gain, finite."""
+    factor = np.exp(np.minimum(one.half_width, 50.0))  # beyond every figure
+    return np.array([one.gain / factor, one.gain * factor])
+
+
+def draw_response(
+    panel: Axes,
+    one: AxisResponse,
+    values: Float[np.ndarray, " frequencies"],
+    band: Float[np.ndarray, "2 frequencies"],
+    model: float,
+    color: str,
+) -> None:
+    """Draws gain or phase with its band; faintly at frequencies without a clear response; dashed: the model."""
+    panel.plot(one.frequency, values, color=FAINT, linewidth=0.8)
+    low, high = np.where(one.clear, band, np.nan)
+    panel.fill_between(one.frequency, low, high, color=color, alpha=0.25, linewidth=0)
+    panel.plot(one.frequency, np.where(one.clear, values, np.nan), color=color)
+    panel.axhline(model, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
 
 
 class Plots(NamedTuple):
@@ -38,9 +71,7 @@ class Plots(NamedTuple):
         nearest = decisive_horizon(ahead.horizons, known) if far is None else int(far.argmin())
         time = ahead.start * self.found.provenance.sample_time + ahead.horizons[nearest]
         columns = np.stack([time, ahead.measured[:, nearest, column], ahead.predicted[:, nearest, column]])
-        steps = np.diff(ahead.start)
-        gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1 if steps.size else []
-        time, measured, predicted = np.insert(columns, gaps, np.nan, axis=1)  # lines break between stretches
+        time, measured, predicted = np.insert(columns, gaps(ahead.start)[0], np.nan, axis=1)
         ax = _axes(ax)
         ax.plot(time, measured, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1], label="measured")
         label = f"predicted {ahead.horizons[nearest]:.3g} s ahead"
@@ -51,10 +82,10 @@ class Plots(NamedTuple):
 
     def inertias(self, *, ax: Axes | None = None) -> Axes:
         """The moments of inertia with 95 % intervals, and those of the airframe's file (crosses)."""
-        rows = [row for row in physical_quantities(self.found) if row.name in _INERTIAS]
+        rows = [row for row in physical_quantities(self.found) if row.name in INERTIAS]
         if not rows:
             raise InputError("the result has no moments of inertia.")
-        ax, given = _axes(ax), dict(zip(_INERTIAS, np.asarray(self.found.airframe.inertia), strict=True))
+        ax, given = _axes(ax), dict(zip(INERTIAS, np.asarray(self.found.airframe.inertia), strict=True))
         for place, row in enumerate(rows):
             ax.plot([place, place], row.ci95, color=self._color if row.trusted else FAINT)
             ax.plot(place, row.value, "o", color=self._color if row.trusted else FAINT)
@@ -70,13 +101,8 @@ class Plots(NamedTuple):
         """
         if (response := self.found.response) is None:
             raise InputError("the result has no frequency response: it is of an OS4, has no answer, or is older.")
-        one = response[_place("axis", axis, response._fields)]
-        gain, factor = np.where(one.clear, one.gain, np.nan), np.exp(np.where(one.clear, one.half_width, np.nan))
-        ax = _axes(ax)
-        ax.plot(one.frequency, one.gain, color=FAINT, linewidth=0.8)
-        ax.plot(one.frequency, gain, color=self._color)
-        ax.fill_between(one.frequency, gain / factor, gain * factor, color=self._color, alpha=0.25, linewidth=0)
-        ax.axhline(1.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
+        one, ax = response[_place("axis", axis, response._fields)], _axes(ax)
+        draw_response(ax, one, one.gain, gain_band(one), 1.0, self._color)
         ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, HIGHEST), ylim=GAINS)
         for which in ("x", "y"):
             log_axis(ax, which)

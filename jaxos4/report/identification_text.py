@@ -11,7 +11,7 @@ from ..identification.physical import PhysicalQuantity, physical_quantities
 from ..identification.results import COLOURED, Identification
 from ..identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED, reasons, statuses
 from ..results import NINETY_FIVE
-from .text import Listing
+from .text import Listing, say
 
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
@@ -37,7 +37,7 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
             if isinstance(part, Listing):
                 part.print_on(console)
             else:
-                console.print(part, style=_COLOURS.get(part.split(":")[0]), markup=False, highlight=False)
+                say(console, part, _COLOURS.get(part.split(":")[0]))
 
 
 def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:

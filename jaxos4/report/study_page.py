@@ -23,8 +23,6 @@ MOST_DRAWN = 12
 # Attributes of the Dataset, and their labels on the page.
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
 _COLUMNS = 4
-_DODGE = 0.3  # the markers of all estimators are spread over this share of the gap between two noise scales
-_NO_ROLLOUTS = 0.5  # the place on a logarithmic axis for an estimator without rollouts
 
 
 def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
@@ -187,7 +185,8 @@ def overview(data: xr.Dataset) -> Figure | None:
     if not known.any():
         return None
     figure, (by_noise, by_rollouts) = grid(2, columns=2, height=3.6)
-    spent = np.maximum(rollouts, _NO_ROLLOUTS)
+    none = 0.5  # the place on the logarithmic axis for an estimator without rollouts
+    spent = np.maximum(rollouts, none)
     for row, look in _looks(data):
         at, line = known[:, row], {"color": look.color, "linestyle": look.dash, "gid": estimator_gid(row)}
         x, y, across = dodged(data["scale"].values, row, data.sizes["estimator"])[at], values[at, row], spent[at, row]
@@ -211,7 +210,7 @@ def overview(data: xr.Dataset) -> Figure | None:
     by_rollouts.set_title("RMSE / least bound, by rollouts")
     by_rollouts.set_xscale("log")
     powers = 10.0 ** np.arange(np.ceil(np.log10(max(spent[known].max(), 10.0))) + 1)
-    ticks = {_NO_ROLLOUTS: "none"} if (rollouts[known] <= 0).any() else {}
+    ticks = {none: "none"} if (rollouts[known] <= 0).any() else {}
     ticks |= {power: f"{power:,.0f}" for power in powers}
     by_rollouts.set_xticks(list(ticks), list(ticks.values()))
     by_rollouts.xaxis.set_minor_locator(NullLocator())
@@ -222,9 +221,12 @@ def overview(data: xr.Dataset) -> Figure | None:
 
 
 def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
-    """The noise scales, shifted for the estimator `place` of `count`, so that markers do not cover each other."""
+    """The noise scales, shifted for the estimator `place` of `count`, so that markers do not cover each other.
+
+    Those of all estimators are spread over 0.3 of the gap between two noise scales.
+    """
     gap = np.diff(np.log(np.sort(scales))).min() if len(scales) > 1 else np.log(3.0)
-    return scales * np.exp(_DODGE * gap * (place / max(count - 1, 1) - 0.5))
+    return scales * np.exp(0.3 * gap * (place / max(count - 1, 1) - 0.5))
 
 
 def _looks(data: xr.Dataset) -> Iterator[tuple[int, Style]]:

@@ -25,12 +25,10 @@ _PHRASES = {
 }
 # The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
 _MARKS = ("", "†", "‡")
-# The table of coverage by parameter shows this level, or the nearest one in the study.
-_LEVEL = 0.95
 _MOST_LISTED = 20
 
 
-class Scenario(NamedTuple):
+class ScenarioData(NamedTuple):
     """The data that one table or figure compares: all noise scales and estimators, one value on each other axis."""
 
     number: int
@@ -38,13 +36,13 @@ class Scenario(NamedTuple):
     data: xr.Dataset
 
 
-def scenarios(dataset: xr.Dataset) -> Iterator[Scenario]:
+def scenarios(dataset: xr.Dataset) -> Iterator[ScenarioData]:
     """All scenarios, numbered from 1. The label names the dimensions that differ, or all if there is one scenario."""
     fixed = [name for name in metrics.SCENARIO if name in _PHRASES]
     varied = [name for name in fixed if dataset.sizes[name] > 1] or fixed
     for number, at in enumerate(itertools.product(*(range(dataset.sizes[name]) for name in fixed)), start=1):
         data = dataset.isel(dict(zip(fixed, at, strict=True)))
-        yield Scenario(number, ", ".join(_PHRASES[name].format(data[name].item()) for name in varied), data)
+        yield ScenarioData(number, ", ".join(_PHRASES[name].format(data[name].item()) for name in varied), data)
 
 
 def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
@@ -85,7 +83,7 @@ def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
     return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
 
 
-class Cell(NamedTuple):
+class Entry(NamedTuple):
     """A number as text, with its interval and its mark."""
 
     text: str
@@ -103,7 +101,7 @@ class Table(NamedTuple):
     """
 
     headings: list[tuple[str, str]]
-    groups: Sequence[tuple[str, Sequence[tuple[str, tuple[Cell, ...], int | None]]]]
+    groups: Sequence[tuple[str, Sequence[tuple[str, tuple[Entry, ...], int | None]]]]
     notes: tuple[str, ...] = ()
 
 
@@ -124,19 +122,19 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
 
 
 def shown_level(data: xr.Dataset) -> float:
-    """The level of the intervals in the table of coverage."""
-    return min(data["level"].values.tolist(), key=lambda level: abs(level - _LEVEL))
+    """The level of the intervals in the table of coverage: the study's nearest to 95 %."""
+    return min(data["level"].values.tolist(), key=lambda level: abs(level - 0.95))
 
 
 def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
     """RMS errors in percent of the truth, with rows for the bounds and for the centre of the bracket."""
     found, best, middle = metrics.estimator_error(data), metrics.bound_error(data), metrics.center_error(data)
 
-    def cells(of: xr.Dataset) -> tuple[Cell, ...]:
+    def cells(of: xr.Dataset) -> tuple[Entry, ...]:
         reasons = of["reason"].values.astype(int)
         values = np.where(reasons > 0, of["absolute"].values, of["percent"].values)
         marks = ("" if np.isnan(value) else _MARKS[reason] for value, reason in zip(values, reasons, strict=True))
-        return tuple(Cell(plain(value, digits), mark=mark) for value, mark in zip(values, marks, strict=True))
+        return tuple(Entry(plain(value, digits), mark=mark) for value, mark in zip(values, marks, strict=True))
 
     groups = []
     for place, label in enumerate(scale_labels(data)):
@@ -158,10 +156,10 @@ def _result_table(data: xr.Dataset) -> Table:
     counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
     occurs = np.flatnonzero((counts > 0).any([name for name in counts.dims if name != "code"]).values)
 
-    def cells(at: dict[str, int]) -> tuple[Cell, ...]:
+    def cells(at: dict[str, int]) -> tuple[Entry, ...]:
         hit = _with_intervals(hits.isel(at).expand_dims("parameter"), "hit_rate", percent)
-        numbers = [Cell(str(int(number))) for number in counts.isel(at).values[occurs]]
-        return (*numbers, Cell(plain(float(spent.isel(at)))), *hit)
+        numbers = [Entry(str(int(number))) for number in counts.isel(at).values[occurs]]
+        return (*numbers, Entry(plain(float(spent.isel(at)))), *hit)
 
     headings = [names(counts, "code")[place].replace("_", " ") for place in occurs]
     return _by_estimator(data, [*headings, "rollouts", "seed hits"], cells)
@@ -208,7 +206,7 @@ def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
     return int(missing.sum()), missing.size
 
 
-def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[str, int]], tuple[Cell, ...]]) -> Table:
+def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[str, int]], tuple[Entry, ...]]) -> Table:
     """A table with a row for each noise scale and estimator; `cells` gives the row's cells from its indices."""
     estimators = list(enumerate(names(data, "estimator")))
     groups = [
@@ -218,9 +216,9 @@ def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[s
     return Table([(heading, "") for heading in headings], groups)
 
 
-def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
+def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Entry, ...]:
     rows = (map(text, row) for row in zip(*(one[part].values for part in (measure, "low", "high")), strict=True))
-    return tuple(Cell(value, "" if MISSING in (low, high) else f"{low} to {high}") for value, low, high in rows)
+    return tuple(Entry(value, "" if MISSING in (low, high) else f"{low} to {high}") for value, low, high in rows)
 
 
 def count_outcomes(dataset: xr.Dataset) -> str:

@@ -56,7 +56,6 @@ _STYLES = {
     "ant-colony": Style("#4884fc", "p", (0, (5, 1, 2, 1))),
 }
 BOUND_DASHES = (_SOLID, _DOTTED, _DASHED)
-_LEGEND_WIDTH = 1.4  # the width of one entry [inch]
 
 _INKED = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color", "xtick.color", "ytick.color")
 _RC: dict[Any, Any] = {
@@ -162,7 +161,7 @@ def legend(figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] =
     labels = [f"bound, {name}" for name in bounds[: len(handles)]]
     handles += [Line2D([], [], **look.line) for look in styles(estimators).values()]
     labels += estimators
-    rows = -(-len(labels) // int(figure.get_figwidth() / _LEGEND_WIDTH))
+    rows = -(-len(labels) // int(figure.get_figwidth() / 1.4))  # an entry is 1.4 inches wide
     columns = -(-len(labels) // rows)
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, handlelength=3)
 

@@ -11,8 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 MISSING = "–"
-_WIDEST = 10_000
-_WORDS = 20  # columns of a terminal; a narrower column of words would be hard to read
 
 
 def plain(value: float, digits: int = 3) -> str:
@@ -40,6 +38,7 @@ class Listing(NamedTuple):
     - `notes`: a note for each row, about the item in its first cell; an empty string if there is none.
     - `wraps`: the headings of the columns of words. Their cells can have several lines.
     - `apart`: the number of blanks between columns.
+    - `words`: the least width of a column of words, if they are as long: a narrower one would be hard to read.
     """
 
     headings: Sequence[str]
@@ -48,6 +47,7 @@ class Listing(NamedTuple):
     notes: Sequence[str] = ()
     wraps: Sequence[str] = ()
     apart: int = 2
+    words: int = 20
 
     def print_on(self, console: Console) -> None:
         """Prints the table. Notes are its last column, or lines below it if the terminal is too narrow."""
@@ -62,7 +62,7 @@ class Listing(NamedTuple):
         for row, note in zip(self.rows, self.notes, strict=False):
             names.setdefault(note, []).append(row[0])
         for note in filter(None, names):
-            console.print(f"{', '.join(names[note])}: {note}", markup=False, highlight=False)
+            say(console, f"{', '.join(names[note])}: {note}")
 
     def table(self) -> Table:
         """The table without its notes."""
@@ -70,11 +70,16 @@ class Listing(NamedTuple):
         table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=padding)
         for i, heading in enumerate(self.headings):
             widest, wraps = max(len(row[i]) for row in (self.headings, *self.rows)), heading in self.wraps
-            width, justify = min(widest, _WORDS) if wraps else widest, "right" if heading in self.right else "left"
+            width, justify = min(widest, self.words) if wraps else widest, "right" if heading in self.right else "left"
             table.add_column(heading, justify=justify, no_wrap=not wraps, min_width=width)
         for row in self.rows:
             table.add_row(*map(Text, row))
         return table
+
+
+def say(console: Console, line: str, style: str | None = None) -> None:
+    """Prints a line as it is: no markup, and no colours but those of `style`."""
+    console.print(line, style=style, markup=False, highlight=False)
 
 
 def print_whole(console: Console, table: RenderableType) -> None:
@@ -89,5 +94,5 @@ def print_whole(console: Console, table: RenderableType) -> None:
 
 def _needed_width(table: RenderableType) -> int:
     """The number of terminal columns that a table needs if nothing is cut."""
-    console = Console(width=_WIDEST)
+    console = Console(width=10_000)
     return Measurement.get(console, console.options, table).minimum

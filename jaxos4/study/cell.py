@@ -42,10 +42,10 @@ _KEPT = ("parameters", "std", "cost", "rollouts", "result", "seed")
 # The largest offset of a bracket from the parameters that all flights have, as a share of its half-width.
 _LARGEST_OFFSET = 0.8
 
-Lanes = Float[Array, "lanes samples 12"]
+Batch = Float[Array, "flights samples 12"]
 
 
-class Fleet(NamedTuple):
+class Setup(NamedTuple):
     """Model, bracket and inputs of a scenario. They are the same for all noises."""
 
     model: AbstractModel
@@ -56,17 +56,17 @@ class Fleet(NamedTuple):
 
 # True parameters, true states and measured states of a flight, and of the flights of a cell.
 Flown = tuple[Parameters, States, States]
-Flights = tuple[Float[Array, "lanes parameters"], Lanes, Lanes]
+Flights = tuple[Float[Array, "flights parameters"], Batch, Batch]
 
 
-def fleet_of(study: Study, scenario: Scenario) -> Fleet:
+def setup_of(study: Study, scenario: Scenario) -> Setup:
     """Model, bracket and rotor speeds of a scenario."""
     with jax.enable_x64(True):
         model = MODELS[scenario.model](study.vehicle(scenario.airframe))
         offset = study.truth == "airframe"
         bracket = _bracket(model, np.asarray(scenario.width), key_of(study.seed, 0), offset=offset)
         omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)
-        return Fleet(model, bracket, omega, as_float(study.dt))
+        return Setup(model, bracket, omega, as_float(study.dt))
 
 
 @eqx.filter_jit
@@ -84,14 +84,14 @@ def key_of(seed: int, number: int) -> Key:
     return jax.random.fold_in(jax.random.key(seed), number)
 
 
-def blank_problem(study: Study, fleet: Fleet, scale: float, channels: str) -> ShootingProblem:
+def blank_problem(study: Study, setup: Setup, scale: float, channels: str) -> ShootingProblem:
     """The problem that all flights of a scenario share. `scale`: the noise in multiples of the standard sensors'."""
-    samples, dtype = fleet.omega.shape[0], jnp.result_type(float)
+    samples, dtype = setup.omega.shape[0], jnp.result_type(float)
     # By NumPy: outside jit, JAX would compile a program for each operation, on each device.
     time = as_float(np.asarray(study.dt, dtype) * np.arange(samples, dtype=dtype))
     return ShootingProblem(
-        fleet.model,
-        Flight(time, fleet.omega, as_float(np.zeros((samples, 12)))),
+        setup.model,
+        Flight(time, setup.omega, as_float(np.zeros((samples, 12)))),
         sigma=scale * SENSOR_SIGMA,
         initial_state=as_float(np.zeros(12)) if study.initial_state == "known" else None,
         channels=channels,
@@ -104,22 +104,22 @@ def problem_of(blank: ShootingProblem, states: States) -> ShootingProblem:
     return eqx.tree_at(lambda p: p.flight.states, blank, states)
 
 
-def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
+def fly(study: Study, setup: Setup, cell: Cell) -> Flights:
     """Simulates the flights of a cell. Flights of one number have the same random numbers in all scenarios."""
     scenario, numbers = cell.scenario, cell.first + np.arange(study.batch)
     kinds = {"method": scenario.method, "kind": scenario.noise, "drawn": study.truth == "drawn"}
     with jax.enable_x64(True):
-        return _fly(jnp.asarray(numbers), fleet, key_of(study.seed, 1), as_float(scenario.scale), kinds)
+        return _fly(jnp.asarray(numbers), setup, key_of(study.seed, 1), as_float(scenario.scale), kinds)
 
 
 @on_all_cores
-def _fly(number: Int[Array, ""], fleet: Fleet, key: Key, scale: Scalar, kinds: dict[str, Any]) -> Flown:
+def _fly(number: Int[Array, ""], setup: Setup, key: Key, scale: Scalar, kinds: dict[str, Any]) -> Flown:
     truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
-    truth = fleet.model.alpha
+    truth = setup.model.alpha
     if kinds["drawn"]:
         u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
-        truth = fleet.bracket.center + u * fleet.bracket.half_width
-    exact = simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=kinds["method"])
+        truth = setup.bracket.center + u * setup.bracket.half_width
+    exact = simulate(setup.model, truth, setup.omega, dt=setup.dt, method=kinds["method"])
     return truth, exact.states, NOISES[kinds["kind"]](scale * SENSOR_SIGMA)(exact, key=noise_key).states
 
 
@@ -135,32 +135,32 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
     """Identifies the flights of a cell on the default device; `network`: that of `Study.job`."""
     scenario = cell.scenario
     with jax.enable_x64(True):
-        fleet = fleet_of(study, scenario)
-        truth, exact, measured = fly(study, fleet, cell)
-        blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
-        standard = blank_problem(study, fleet, 1.0, scenario.seen)
+        setup = setup_of(study, scenario)
+        truth, exact, measured = fly(study, setup, cell)
+        blank = blank_problem(study, setup, scenario.scale or 1.0, scenario.seen)
+        standard = blank_problem(study, setup, 1.0, scenario.seen)
         bound = scenario.scale * np.asarray(cramer_rao_std((truth, exact), standard))
-        found = _answers(study, cell, fleet, blank, measured, network)
+        found = _answers(study, cell, setup, blank, measured, network)
         return _results(study, cell, np.asarray(truth), bound, jax.tree.map(np.asarray, found))
 
 
 def _answers(
-    study: Study, cell: Cell, fleet: Fleet, blank: ShootingProblem, states: Lanes, network: TrainedNetwork | None
+    study: Study, cell: Cell, setup: Setup, blank: ShootingProblem, states: Batch, network: TrainedNetwork | None
 ) -> dict[str, Any]:
     """The attributes in `_KEPT` of each flight's estimate, and its `half_width` at `LEVELS`, by name."""
     if network is not None:  # a history of another length would be another program
         network = eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
     estimator, channels = make_estimator(cell.scenario.estimator, network), study.seed_channels(cell.scenario)
     if isinstance(estimator, Hybrid):
-        looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
-        _, seeds = _identify(states, estimator.network, looked_at, fleet.bracket)
-        return _search((states, seeds), estimator.ibss, blank, fleet.bracket)
+        looked_at = blank_problem(study, setup, cell.scenario.scale or 1.0, channels)
+        _, seeds = _identify(states, estimator.network, looked_at, setup.bracket)
+        return _search((states, seeds), estimator.ibss, blank, setup.bracket)
     if isinstance(estimator, IBSS):
         # Without an answer near which to search, it searches the whole bracket.
-        none = Seed.none(len(fleet.model.parameter_names), CHANNELS[channels])
+        none = Seed.none(len(setup.model.parameter_names), CHANNELS[channels])
         seeds = jax.tree.map(lambda leaf: jnp.asarray(np.broadcast_to(leaf, (study.batch, *leaf.shape))), none)
-        return _search((states, seeds), estimator, blank, fleet.bracket) | {"seed": None}
-    return _identify(states, estimator, blank, fleet.bracket)[0]
+        return _search((states, seeds), estimator, blank, setup.bracket) | {"seed": None}
+    return _identify(states, estimator, blank, setup.bracket)[0]
 
 
 @on_all_cores

@@ -25,7 +25,7 @@ from .._version import __version__
 from ..errors import InputError, shortened
 from ..models import MODELS
 from ..networks import TrainedNetwork, load_network
-from .cell import LEVELS, OUTCOMES, fleet_of, fly
+from .cell import LEVELS, OUTCOMES, fly, setup_of
 from .metrics import SCENARIO
 from .specification import AXES, Study
 
@@ -192,12 +192,12 @@ def assemble(store: Store) -> xr.Dataset:
         if (results := store.read(cell.number)) is None:
             continue
         flights = slice(cell.first, min(cell.first + study.batch, study.flights))
-        lanes, shared = (*cell.place, flights), (*cell.place[:-1], flights)
+        own, shared = (*cell.place, flights), (*cell.place[:-1], flights)
         if "failed" in results:
-            arrays["result"][lanes] = OUTCOMES.index("failed")
+            arrays["result"][own] = OUTCOMES.index("failed")
             # Another estimator that has run has stored the same truths, bit for bit.
             if np.isnan(arrays["truth"][shared]).all():
-                truth, *_ = fly(study, fleet_of(study, cell.scenario), cell)
+                truth, *_ = fly(study, setup_of(study, cell.scenario), cell)
                 arrays["truth"][shared] = np.asarray(truth)[: flights.stop - flights.start]
             where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
@@ -205,7 +205,7 @@ def assemble(store: Store) -> xr.Dataset:
         try:
             for name, (_, kind, *_) in VARIABLES.items():
                 found = results[name].astype(kind, casting="same_kind")
-                arrays[name][shared if name == "truth" else lanes] = found
+                arrays[name][shared if name == "truth" else own] = found
             if not np.isin(results["result"], np.arange(len(OUTCOMES))).all():
                 raise ValueError("unknown result")
         except BROKEN:
@@ -250,7 +250,7 @@ def _brackets(study: Study) -> dict[str, tuple]:
     """The brackets of all searches and networks, by model, airframe and width, and the channels that are seen."""
     first = study.cell(0).scenario
     brackets = [
-        fleet_of(study, first._replace(model=model, airframe=airframe, width=width)).bracket
+        setup_of(study, first._replace(model=model, airframe=airframe, width=width)).bracket
         for model, airframe, width in itertools.product(study.models, study.airframes, study.widths)
     ]
     shape = [len(study.models), len(study.airframes), len(study.widths), -1]

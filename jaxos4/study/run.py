@@ -19,7 +19,7 @@ from .._files import write_file, write_netcdf
 from ..errors import InputError, TrainingError
 from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_network
 from ..shooting import cores
-from .cell import blank_problem, fleet_of, key_of, run_cell
+from .cell import blank_problem, key_of, run_cell, setup_of
 from .dataset import RESULTS_FILE, Store, assemble, check_store, open_store
 from .specification import Cell, Scenario, Study
 
@@ -31,8 +31,6 @@ Trained = bytes | str | None
 
 # Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
-# How often a task that raises an unexpected exception is repeated. The cluster itself counts lost workers.
-_RETRIES = 2
 
 
 def device_name() -> str:
@@ -69,11 +67,12 @@ def run_here(store: Store) -> Iterator[tuple[str, int]]:
     yield from _run(store, submit, results)
 
 
-def run_on_cluster(store: Store, client: "Client") -> Iterator[tuple[str, int]]:
+def run_on_cluster(store: Store, client: "Client", *, retries: int = 2) -> Iterator[tuple[str, int]]:
     """Computes the remaining cells on a cluster, in the order in which they finish. Yields as `run_here`.
 
     `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
-    lock of the cluster. Raises `InputError` if the cluster has no workers, or loses a task more often than it allows.
+    lock of the cluster. `retries`: how often a task that raises an unexpected exception is repeated; the cluster itself
+    counts lost workers. Raises `InputError` if the cluster has no workers, or loses a task more often than it allows.
     """
     from distributed import as_completed
 
@@ -91,7 +90,7 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[tuple[str, int]]:
                 raise InputError(f"lost by the cluster ({what}); run the study again to resume.") from None
             yield future, result
 
-    yield from _run(store, functools.partial(client.submit, retries=_RETRIES, pure=False), results)
+    yield from _run(store, functools.partial(client.submit, retries=retries, pure=False), results)
 
 
 def _run(
@@ -140,10 +139,10 @@ def train(study: Study, job: Scenario) -> bytes | str:
     scales = [scale or 1.0 for scale in study.scales]
     try:
         with jax.enable_x64(True):
-            fleet, key = fleet_of(study, job), key_of(study.network.seed, study.jobs()[job])
+            setup, key = setup_of(study, job), key_of(study.network.seed, study.jobs()[job])
             training: dict[str, Any] = {"steps": study.network.steps, "held_out": study.network.held_out}
             settings = NetworkEstimator(channels=job.channels, noise=(min(scales), max(scales)), **training)
-            return encode_network(settings.fit(blank_problem(study, fleet, 1.0, job.channels), fleet.bracket, key=key))
+            return encode_network(settings.fit(blank_problem(study, setup, 1.0, job.channels), setup.bracket, key=key))
     except FAILURES as error:
         return str(error)
 

@@ -18,8 +18,6 @@ from .specification import Scenario
 
 _AXES = get_type_hints(Scenario) | {"flight": int, "parameter": str, "level": float}
 _KINDS: dict[type, str] = {str: "UO", float: "fiu", int: "iu"}
-_LARGEST_RATIO, _SMALL = 1030, 1 << 20  # bytes of arrays for a byte of a compressed file, and those that always fit
-_SECONDS = 4  # to read a file, and one more for every 10 MB
 # HDF5 can loop for ever or crash on a damaged file, so another process reads all of it first.
 _PROBE = """
 import signal, sys, h5py
@@ -65,9 +63,13 @@ def read_results(directory: Path) -> xr.Dataset:
 
 
 def _probe(path: Path) -> None:
-    """Raises `ValueError` if HDF5 cannot read the whole file, or takes longer than a sound one needs."""
+    """Raises `ValueError` if HDF5 cannot read the whole file, or takes longer than a sound one needs.
+
+    A sound file takes less than 4 s, and one more for every 10 MB. A byte of it holds at most 1,030 bytes of arrays,
+    the largest ratio of compression; 1 MB always fits.
+    """
     size = path.stat().st_size
-    limits = str(_SECONDS + size // 10_000_000), str(_LARGEST_RATIO * size + _SMALL)
+    limits = str(4 + size // 10_000_000), str(1030 * size + (1 << 20))
     line = [sys.executable, "-P", "-c", _PROBE, os.path.abspath(path), *limits]
     done = subprocess.run(line, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode:

@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 import casadi
 import numpy as np
-from benchmarks.case import Case, step
+
+from experiments.benchmarks.case import Case, step
 
 OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
 

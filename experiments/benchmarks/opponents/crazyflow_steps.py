@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from benchmarks.case import Case
 from crazyflow.control import Control
 from crazyflow.sim import Sim
+
+from experiments.benchmarks.case import Case
 
 
 def steps(case: Case) -> Callable[[], dict]:

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks.case import Case
 
 import jaxos4
+from experiments.benchmarks.case import Case
 from jaxos4.estimators import make_estimator
 
 jax.config.update("jax_enable_x64", True)

@@ -6,10 +6,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from benchmarks.case import Case
-from benchmarks.opponents.jaxos4_fit import problem_of
 
 import jaxos4
+from experiments.benchmarks.case import Case
+from experiments.benchmarks.opponents.jaxos4_fit import problem_of
 
 
 def network(case: Case, *, steps: int, held_out: int = 5000) -> Callable[[], dict]:

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks.case import Case
-from benchmarks.opponents.jaxos4_fit import problem_of
 
+from experiments.benchmarks.case import Case
+from experiments.benchmarks.opponents.jaxos4_fit import problem_of
 from jaxos4.shooting import cores
 
 BLOCK = 32  # shots at a time

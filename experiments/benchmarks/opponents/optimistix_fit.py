@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from benchmarks.case import Case, step
+
+from experiments.benchmarks.case import Case, step
 
 jax.config.update("jax_enable_x64", True)
 

@@ -6,8 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pypesto
 import pypesto.optimize
-from benchmarks.case import Case
-from benchmarks.opponents.residuals import Residuals, each_flight
+
+from experiments.benchmarks.case import Case
+from experiments.benchmarks.opponents.residuals import Residuals, each_flight
 
 _STATE_BOUND = 10.0  # of a free initial state, in sigma
 _TOLERANCE = 1e-10  # with SciPy's default of 1e-8, a free initial state ends short of the optimum

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from benchmarks.case import Case, trajectories
+
+from experiments.benchmarks.case import Case, trajectories
 
 _TINY = 1e-30  # a complex step this small has no truncation error
 _DIVERGED = 1e6  # a residual in place of one that is not finite

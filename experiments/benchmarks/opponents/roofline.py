@@ -6,9 +6,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks.case import Case
-from benchmarks.opponents.jaxos4_fit import problem_of
 
+from experiments.benchmarks.case import Case
+from experiments.benchmarks.opponents.jaxos4_fit import problem_of
 from jaxos4.models.state import unstack
 
 _LANES = 1024  # of the step that XLA counts

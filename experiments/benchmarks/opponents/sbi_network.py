@@ -9,9 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from benchmarks.case import RATES, Case, trajectories
 from sbi.inference import NPE
 from sbi.utils import BoxUniform
+
+from experiments.benchmarks.case import RATES, Case, trajectories
 
 EVERY = 10
 _DRAWS = 1000  # samples of a posterior, for its mean

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from benchmarks.case import Case
-from benchmarks.opponents.residuals import Residuals, each_flight
 from scipy.optimize import least_squares
+
+from experiments.benchmarks.case import Case
+from experiments.benchmarks.opponents.residuals import Residuals, each_flight
 
 
 def levenberg_marquardt(case: Case) -> Callable[[], dict]:

@@ -8,24 +8,15 @@ from rich.console import Console
 from .._files import write_file
 from ..forecast import QUANTITIES, FlightPrediction
 from ..logs.sampling import euler_angles
-from .text import Listing, percent, plain
-
-# The horizons of the table, as shares of the longest.
-_SHARES = (0.2, 0.5, 1.0)
-# The figure shows at most this much time [s], with as many predictions as fit into it without overlap.
-_SHOWN = 10.0
+from .text import Listing, percent, plain, say
 
 
 def print_prediction(console: Console, found: FlightPrediction) -> None:
-    """Prints notes, the errors by quantity and horizon, and their sums over all horizons."""
-
-    def say(line: str) -> None:
-        console.print(line, markup=False, highlight=False)
-
+    """Prints notes, and errors by quantity: at a fifth, half and all of the horizon, and summed over all horizons."""
     for note in found.notes:
-        say(f"note: {note}")
+        say(console, f"note: {note}")
     last = found.horizons.size - 1
-    places = sorted({max(round(share * (last + 1)) - 1, 0) for share in _SHARES})
+    places = sorted({max(round(share * (last + 1)) - 1, 0) for share in (0.2, 0.5, 1.0)})
     rows = []
     for name, quality in found.quality.items():
         row = name, QUANTITIES[name][0]
@@ -36,19 +27,21 @@ def print_prediction(console: Console, found: FlightPrediction) -> None:
     errors = ("error", "unaware", "constant", "regression", "in band %")
     Listing(("quantity", "unit", "ahead", *errors), rows, errors).print_on(console)
     say(
+        console,
         "error: mean absolute error; sum: over all horizons. unaware: without the disturbance that the filters know at "
-        "the start. constant: velocity and rates stay as they are. in band: inside the 95 % band."
+        "the start. constant: velocity and rates stay as they are. in band: inside the 95 % band.",
     )
     if found.missing:
-        say(f"not measured, and so not compared: {', '.join(found.missing)}.")
+        say(console, f"not measured, and so not compared: {', '.join(found.missing)}.")
     steps = f"{found.time.size} starts, {last + 1} steps to {found.horizons[-1]:.3g} s"
-    say(f"{found.found} predicts {found.flight}, {steps}")
+    say(console, f"{found.found} predicts {found.flight}, {steps}")
 
 
-def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction) -> None:
+def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction, *, most: float = 10.0) -> None:
     """Writes a figure as SVG. Raises `OSError` if it cannot be written.
 
-    It shows measured lines, and predictions with their band from starts that are one horizon apart; 10 s at most.
+    It shows measured lines, and predictions with their band from starts that are one horizon apart; `most`: the
+    longest time that it shows [s], but two horizons at least.
     """
     from .style import BOUND_DASHES, INK, drawing, grid, style, svg  # a second that the table does not need
 
@@ -61,7 +54,7 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
         look, shown, times = style(0), [], found.time.tolist()
         for start, time in enumerate(times):
             is_free = not shown or time >= times[shown[-1]] + found.horizons[-1]
-            if is_free and time + found.horizons[-1] <= times[0] + max(_SHOWN, 2 * found.horizons[-1]):
+            if is_free and time + found.horizons[-1] <= times[0] + max(most, 2 * found.horizons[-1]):
                 shown.append(start)
         # Lines break between predictions.
         x = np.pad(found.time[shown, None] + found.horizons, ((0, 0), (0, 1)), constant_values=np.nan).ravel()

@@ -1,0 +1,38 @@
+"""Experiments in small configurations: their modules, the JSON that they write, and their figures."""
+
+import functools
+import importlib
+import json
+import pathlib
+
+import pytest
+
+import jaxos4
+from experiments import shared
+
+
+def load(name, script="run"):
+    """The module of an experiment."""
+    return importlib.import_module(f"experiments.{name}.{script}")
+
+
+def result_of(folder: pathlib.Path, name, script="run", **options):
+    """Runs an experiment with these options and small networks, and returns the JSON that it writes."""
+    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, tilings=4, cells=8, batch=64, held_out=4000)
+    small.steps = jaxos4.NetworkEstimator.steps
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jaxos4, "NetworkEstimator", small)
+        load(name, script).main(**options, out=folder / "out.json")
+    return json.loads((folder / "out.json").read_text())
+
+
+def plot(folder: pathlib.Path, name, script="plot", results="out.json", *, suffixes=(".svg",)):
+    """Draws the results of an experiment in a folder. Only the comparison is drawn as PDF too."""
+    with pytest.MonkeyPatch.context() as patch:
+        if ".pdf" not in suffixes:
+            patch.setattr(shared, "pdf", lambda figure: b"")
+        load(name, script).main(folder / results, folder / f"{name} {script}")
+    for suffix in suffixes:
+        figures = list((folder / f"{name} {script}").glob(f"*{suffix}"))
+        assert figures
+        assert all(path.name.startswith(name) and path.stat().st_size > 5000 for path in figures)
