@@ -87,7 +87,7 @@ class Gusts:
 
 
 def fly(gust: float, duration: float, seed: int, *, captured: bool = False) -> jaxos4.Flight:
-    """A flight with gyro, attitude, accelerometer, and the mean speed of each rotor in each sample.
+    """A flight with gyro, attitude, accelerometer, and the speed of each rotor, all at the same instants.
 
     `captured`: with position and velocity too. All other columns are the same.
     """
@@ -97,18 +97,14 @@ def fly(gust: float, duration: float, seed: int, *, captured: bool = False) -> j
     hover = np.full(4, float(VEHICLE.hover_speed))
     state = {"x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3)}
     state |= {"wind": np.zeros(3), "rotor_speeds": hover}
-    tau, rows = quad_params["tau_m"], []
-    late = tau / DT * (1 - np.exp(-DT / tau))
+    rows = []
     for k in range(round(duration / DT) + 1):
         state["wind"] = gusts.update(k * DT)
         control = controller.update(k * DT, state, references.update(k * DT))
-        command = np.clip(control["cmd_motor_speeds"], vehicle.rotor_speed_min, vehicle.rotor_speed_max)
-        # The speed approaches a constant command exponentially.
-        means = command + (state["rotor_speeds"] - command) * late
         turn, vdot = Rotation.from_quat(state["q"]), vehicle.statedot(state, control, DT)["vdot"]
         specific = turn.inv().apply(vdot + [0, 0, vehicle.g])
         angles = turn.as_euler("ZYX")[::-1]
-        rows.append(np.concatenate([means, state["w"], angles, specific, state["x"], state["v"]]))
+        rows.append(np.concatenate([state["rotor_speeds"], state["w"], angles, specific, state["x"], state["v"]]))
         state = vehicle.step(state, control, DT)
     omega, rates, angles, specific, position, velocity = np.split(np.array(rows), [4, 7, 10, 13, 16], axis=1)
     states = np.full((len(omega), len(STATE_NAMES)), np.nan)

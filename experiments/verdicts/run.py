@@ -1,8 +1,8 @@
 """Which verdicts are right? Good flights with the effects of real ones, and flights that are spoiled as real logs are.
 
 The good flights, and the airframe that is given, are those of `closed_loop/effects.py`. Each fault spoils the flights
-`gusts` in three sizes, alone. Ix and Iy are judged. A quantity is *identified* with or without a reservation, and
-*wrong* if it is off by more than three standard deviations or 12 %. An answer is *right* if its 95 % interval holds the
+`gusts` in three sizes, alone. Ix and Iy are judged. A quantity is *identified* with or without a reservation. It is
+*wrong* if it is off by more than three standard deviations, or, without a reservation, by more than 12 %. An answer is *right* if its 95 % interval holds the
 truth. A cause is right if the faults of the table below are named as they are, wherever the answer says so.
 """
 
@@ -21,6 +21,7 @@ from experiments.fits import given_airframe
 from experiments.monte_carlo import Row, continued, fill, print_table
 from jaxos4.errors import InputError
 from jaxos4.flight import ANGLES, RATES
+from jaxos4.identification.verdict import IDENTIFIED
 from jaxos4.recording import Recording
 from jaxos4.recording.motion import rotations_to_body
 from jaxos4.results import NINETY_FIVE
@@ -171,16 +172,22 @@ def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> R
 
 def counts(rows: list[Row]) -> dict[str, int]:
     """How many answers for Ix and Iy there are, and how many are right, or wrong, of each kind."""
-    found = dict.fromkeys(("answers", "identified", "far", "identified and wrong", "refused and right"), 0)
+    kinds = "answers", "identified", "unreserved", "far", "identified and wrong", "refused and right"
+    found = dict.fromkeys(kinds, 0)
     for row in rows:
         for name in TRUTHS:
             found["answers"] += 1
             if name not in row:
                 continue
-            off, trusted = abs(row[name]["error"]), row[name]["status"].startswith("identified")
-            wide = off > SURE * row[name]["std"]
+            off, status = abs(row[name]["error"]), row[name]["status"]
+            trusted, unreserved, wide = (
+                status.startswith("identified"),
+                status == IDENTIFIED,
+                off > SURE * row[name]["std"],
+            )
             found["identified"] += trusted
-            found["far"] += trusted and (wide or off > FAR)
+            found["unreserved"] += unreserved
+            found["far"] += unreserved and (wide or off > FAR)
             found["identified and wrong"] += trusted and wide
             found["refused and right"] += not trusted and off < NINETY_FIVE * row[name]["std"]
     return found
@@ -203,10 +210,11 @@ def print_tables(rows: list[Row]) -> None:
     for name, some in groups.items():
         if some:
             n, known = counts(some), [r["named"] for r in some if r["named"] is not None]
-            parts = [n[each] for each in ("identified", "identified and wrong", "far", "refused and right")]
-            shares = [share(part, n["answers"]) for part in parts]
+            shares = [share(n[each], n["answers"]) for each in ("identified", "unreserved", "identified and wrong")]
+            shares += [share(n["far"], n["unreserved"]), share(n["refused and right"], n["answers"])]
             lines.append((name, str(len(some)), *shares, share(sum(known), len(known))))
-    headings = "flights", "identified [%]", "beyond 3 std [%]", "3 std or 12 % [%]", "refused, right [%]", "named [%]"
+    headings = "flights", "identified [%]", "without a reservation [%]", "beyond 3 std [%]"
+    headings += "of those without: 3 std or 12 % [%]", "refused, right [%]", "named [%]"
     print_table("verdicts of Ix and Iy", ("case", *headings), lines, width=140)
     lines = []
     for axis in ("roll", "pitch", "yaw"):
