@@ -15,7 +15,7 @@ from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
 from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.design.task import CRITERIA, criterion_of
 from jaxos4.study import load_study
-from jaxos4.study.cell import fleet_of
+from jaxos4.study.cell import setup_of
 
 pytestmark = pytest.mark.slow
 
@@ -130,7 +130,7 @@ def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, comma
     study = 'excitations = ["best"]\ndurations = [{}]\n[input]\nbest = "new.csv"\n'
     (tmp_path / "study.toml").write_text(study.format(2))
     loaded = load_study(tmp_path / "study.toml")
-    np.testing.assert_allclose(fleet_of(loaded, loaded.cell(0).scenario).omega, omega, rtol=1e-9)
+    np.testing.assert_allclose(setup_of(loaded, loaded.cell(0).scenario).omega, omega, rtol=1e-9)
     (tmp_path / "study.toml").write_text(study.format(3))
     with pytest.raises(jaxos4.InputError, match="its file lasts 2 s; correct `durations`"):
         load_study(tmp_path / "study.toml")

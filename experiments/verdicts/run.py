@@ -203,7 +203,10 @@ def share(part: int, whole: int) -> str:
 
 
 def print_tables(rows: list[Row]) -> None:
-    """A line for each case, and how often the intervals of the frequency response hold 1 in good flights."""
+    """A line for each case, and how often the intervals of the frequency response hold 1 in good flights.
+
+    Unreserved: identified without a reservation; far: off by more than three standard deviations or 12 %.
+    """
     good = [row for row in rows if CASES[row["case"]][1] is None]
     groups = {name: [row for row in rows if row["case"] == name] for name in CASES}
     groups |= {"good flights": good, "spoiled flights": [row for row in rows if row not in good]}
@@ -214,8 +217,8 @@ def print_tables(rows: list[Row]) -> None:
             shares = [share(n[each], n["answers"]) for each in ("identified", "unreserved", "identified and wrong")]
             shares += [share(n["far"], n["unreserved"]), share(n["refused and right"], n["answers"])]
             lines.append((name, str(len(some)), *shares, share(sum(known), len(known))))
-    headings = "flights", "identified [%]", "without a reservation [%]", "beyond 3 std [%]"
-    headings += "of those without: 3 std or 12 % [%]", "refused, right [%]", "named [%]"
+    headings = "flights", "identified [%]", "unreserved [%]", "beyond 3 std [%]"
+    headings += "of unreserved far [%]", "refused, right [%]", "named [%]"
     print_table("verdicts of Ix and Iy", ("case", *headings), lines, width=140)
     lines = []
     for axis in ("roll", "pitch", "yaw"):
