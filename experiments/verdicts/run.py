@@ -2,8 +2,9 @@
 
 The good flights, and the airframe that is given, are those of `closed_loop/effects.py`. Each fault spoils the flights
 `gusts` in three sizes, alone. Ix and Iy are judged. A quantity is *identified* with or without a reservation. It is
-*wrong* if it is off by more than three standard deviations, or, without a reservation, by more than 12 %. An answer is *right* if its 95 % interval holds the
-truth. A cause is right if the faults of the table below are named as they are, wherever the answer says so.
+*wrong* if it is off by more than three standard deviations, or, without a reservation, by more than 12 %. An answer is
+*right* if its 95 % interval holds the truth. A cause is right if the faults of the table below are named as they are,
+wherever the answer says so.
 """
 
 import time
