@@ -75,7 +75,7 @@ def with_profile(fit: Fit, case: Case, *, progress: Progress) -> Fit:
 
 
 def _cost(fit: Fit, whole: InnovationsProblem) -> float:
-    """The cost, with that of the brackets of held parameters."""
+    """The cost, with that of the brackets of fixed parameters."""
     if fit.searched is None:
         raise ValueError("`fit` must be one of innovations.")
     problem, found = fit.searched
