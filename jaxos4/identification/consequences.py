@@ -10,7 +10,7 @@ from .fit import Fit
 from .results import Constant
 from .verdict import Move
 
-# Newton's method stops within so many standard deviations of the minimum.
+# Levenberg-Marquardt stops within so many standard deviations of the minimum.
 _TOLERANCE = 0.04
 
 
