@@ -122,8 +122,8 @@ def test_inertias_lie_in_their_intervals_and_bisection_finds_what_newtons_method
     np.testing.assert_allclose(sensor, GYRO, rtol=0.1)
     newton = found_by("filter error")
     off = np.abs((found.parameters - newton.parameters) / newton.std)[:, :count].max(axis=1)
-    assert off.max() < 0.05, off  # IBSS ends within 0.005 of the minimum, Newton's method within 0.04
-    # IBSS ends within a cost of 1e-4. Newton's promises once counted a tenth for noise levels: up to 0.06 were left.
+    assert off.max() < 0.05, off  # IBSS ends within 0.005 of the minimum, Levenberg-Marquardt within 0.04
+    # IBSS ends within a cost of 1e-4. Promised gains once counted a tenth for noise levels: up to 0.06 were left.
     left = np.abs(newton.cost - found.cost)
     assert left.max() < 2 * jaxos4.FilterError().tolerance, left
     np.testing.assert_allclose(found.std[:, :count], newton.std[:, :count], rtol=0.1)

@@ -149,8 +149,8 @@ def cramer_rao_bound(
     """The smallest covariance that an unbiased estimate can have: the inverse of the Fisher information J^T W^2 J.
 
     J is the Jacobian at `parameters`, W the weights 1 / sigma. A free initial state is unknown too. `initial_state` is
-    where J is computed, by default the measured one. A parameter that is not excited has a huge variance, but not an
-    infinite one.
+    where J is computed, by default the measured one; it is ignored if the problem's initial state is known. A parameter
+    that is not excited has a huge variance, but not an infinite one.
     """
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     information = problem.local_model(problem.join(as_float(parameters), start)).information
@@ -164,7 +164,8 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     too. The residuals are taken as the noise. They lack slow noise that the fit explained as motion. A flight must
     therefore be many times longer than the correlation time of the noise.
 
-    The noise is taken as stationary, or, of at least 20 windows with at most 4,000 residuals each, as that of a window.
+    The noise is taken as stationary. With at least 20 windows of at most 4,000 residuals each, all windows are taken
+    instead as having noise of one covariance.
 
     **Arguments:** the flight, evaluated at the answer of a fit.
 

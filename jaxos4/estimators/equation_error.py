@@ -265,7 +265,7 @@ class EquationError(AbstractEstimator):
         """Identifies one flight.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
-        linear in those that are not held. Inside `jit`, where it is not known which are held, all must be linear.
+        linear in those that are not fixed. Inside `jit`, where it is not known which are fixed, all must be linear.
         """
         mask, parameters = problem.unknowns.free, problem.model.parameters
         free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)

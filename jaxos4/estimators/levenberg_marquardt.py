@@ -119,7 +119,8 @@ class LevenbergMarquardt(AbstractSolver[State]):
         """The best unknowns. A shot counts as one rollout for itself, and one for each of its tangents."""
         (windows, _), count = state.best.shape, stage.unknowns.count
         tangents = count + windows * stage.searched[count:].sum()
-        return Found(state.best, state.model, before.spread, state.shots - 1, state.shots * (1 + tangents), state.done)
+        steps = jnp.maximum(state.shots - 1, 0)  # a search that is skipped makes no shot
+        return Found(state.best, state.model, before.spread, steps, state.shots * (1 + tangents), state.done)
 
     def _is_small(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Bool[Array, ""]:
         """Whether a step ends the stage."""

@@ -31,7 +31,7 @@ class Identified(NamedTuple):
     - `source`: names the file, the estimator, the model and the result.
     - `result`: the name of the result code. If it is not `"successful"`, the estimate cannot be trusted.
     - `airframe`: the constants that were not estimated.
-    - `values`: all parameters by name, estimated or held.
+    - `values`: all parameters by name, estimated or fixed.
     - `drawn`, `covariance`: the names of the parameters that are uncertain, and their covariance.
     - `doubts`: why the estimate cannot be trusted, and what to do; one line each. Empty if the result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.

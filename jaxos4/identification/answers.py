@@ -34,7 +34,7 @@ _FEWEST_SAMPLES = 2
 
 
 def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
-    """Estimates by parameter name, without those that are held.
+    """Estimates by parameter name, without those that are fixed.
 
     The rule of `jaxos4.bracket.is_identifiable` decides which have an estimate. The others have a note instead.
     """
@@ -144,7 +144,7 @@ def vehicle_constants(fit: Fit) -> RigidBody:
         if known[row] and alpha[row] > 0:
             std = float(np.sqrt(covariance[row, row])) / alpha[row] ** 2
             constants[name] = Constant(1 / float(alpha[row]), float(std), UNIT, notes[name])
-    # Alphas that are held are no evidence for or against a rigid body.
+    # Alphas that are fixed are no evidence for or against a rigid body.
     if not known.all():
         return RigidBody(constants)
     rigid = fit_inertia(CorrectedOS4(model.airframe), alpha, covariance)

@@ -10,14 +10,14 @@ from .fit import Fit
 from .results import Constant
 from .verdict import Move
 
-# Newton's method stops within so many standard deviations of the minimum.
+# Levenberg-Marquardt stops within so many standard deviations of the minimum.
 _TOLERANCE = 0.04
 
 
 def consequences(
     fit: Fit, constants: dict[str, Constant], quantities: dict[str, list[str]], name: str, value: float
 ) -> dict[str, Move | None]:
-    """How far each quantity moves if a parameter is held at a value, and all others are fitted again.
+    """How far each quantity moves if a parameter is fixed at a value, and all others are fitted again.
 
     Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
     moves if the search did not find this parameter. `None`: there is no such fit.

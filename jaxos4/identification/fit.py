@@ -30,11 +30,11 @@ _PASSES = 3
 # Noise levels have settled if none changes by more than this share. Weights this close to the right ones cost less
 # than 1 % of the efficiency.
 _SETTLED = 0.2
-# A parameter that must not be negative, and is so by this many standard deviations, is held at 0.
+# A parameter that must not be negative, and is so by this many standard deviations, is fixed at 0.
 _NEGATIVE = 2.0
-# A parameter is held at its plain value unless that raises the cost by more than the first number: near it, a cost with
-# kinks is not quadratic, and standard deviations are too small. A value further off than the second number of standard
-# deviations is never tried.
+# A parameter is fixed at its plain value unless that raises the cost by more than the first number: near it, a cost
+# with kinks is not quadratic, and standard deviations are too small. A value further off than the second number of
+# standard deviations is never tried.
 _CLEARLY, _SURELY = 5.0, 12.0
 PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
 NEGATIVE_NOTE = "came out negative, which is impossible; at the limit"
@@ -56,7 +56,7 @@ class Fit(NamedTuple):
     - `profiled`: by which factor the profile of the likelihood made an interval longer, by parameter.
     - `is_lowest`: false if the cost is known to be lower elsewhere.
     - `disturbances`: by channel. `noise`: the same as logarithms. Only for innovations.
-    - `searched`: the problem of innovations with what is held, and its estimate with the covariance of the search.
+    - `searched`: the problem of innovations with what is fixed, and its estimate with the covariance of the search.
     """
 
     problem: ShootingProblem
@@ -148,8 +148,8 @@ def fit_innovations(
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
 
     The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket is not
-    estimated. A parameter that came out negative, though physics forbids it, is held at 0. One that came
-    out near its plain value is held there. Intervals widen if parts of the flights disagree.
+    estimated. A parameter that came out negative, though physics forbids it, is fixed at 0. One that came
+    out near its plain value is fixed there. Intervals widen if parts of the flights disagree.
 
     **Arguments:**
 
@@ -201,11 +201,11 @@ def not_identifiable(problem: InnovationsProblem, std: Float[np.ndarray, " param
 def _searched(
     estimator: AbstractEstimator, problem: InnovationsProblem, first: Estimate | None, progress: Progress
 ) -> tuple[InnovationsProblem, Estimate, int, dict[str, str], dict[str, tuple[float, float]], np.ndarray]:
-    """The problem with some parameters held at values that the flights do not contradict, and its estimate.
+    """The problem with some parameters fixed at values that the flights do not contradict, and its estimate.
 
-    **Returns:** also the rollouts of all searches, why parameters are held at their plain value, the value and standard
-    deviation of those that came out negative and are held at 0, and the covariance that these would add if they were
-    free.
+    **Returns:** also the rollouts of all searches, why parameters are fixed at their plain value, the value and
+    standard deviation of those that came out negative and are fixed at 0, and the covariance that these would add if
+    they were free.
     """
     table, rollouts = problem.model.parameters, 0 if first is None else int(first.rollouts)
 
@@ -250,7 +250,7 @@ def _searched(
 
 
 def bracket_cost(unknowns: Unknowns, values: Mapping[str, float]) -> float:
-    """The cost that brackets, as Gaussian priors, add at these values. An unknown that is held there has none."""
+    """The cost that brackets, as Gaussian priors, add at these values. An unknown that is fixed there has none."""
     places = [unknowns.names.index(name) for name in values]
     off = np.array(list(values.values())) - np.asarray(unknowns.center)[places]
     return float(np.square(off / np.asarray(unknowns.half_width)[places]).sum()) / 2

@@ -92,7 +92,7 @@ def _fit_vehicle(
     seed: int,
     progress: Callable[[str], None],
 ) -> tuple[Case, Fit, tuple[SampleTime, ...]]:
-    """The case at the chosen sample time and its fit. Newton's method compares several sample times."""
+    """The case at the chosen sample time and its fit. `FilterError` is fitted with several sample times."""
     place, case, fit, sample_times = 0, cases[0], None, ()
     is_default = isinstance(estimator, str) and estimator == DEFAULT
     if is_default or len(cases) > 1:

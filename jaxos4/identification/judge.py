@@ -89,7 +89,7 @@ def _judge_vehicle(case: Case, fit: Fit, sample_times: Sequence[SampleTime], pro
         still = (*still, *({"yaw"} - {*still}))
     own = fit.problem.unknowns
     widths = dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))
-    # What is known of a held one is its bracket.
+    # What is known of a fixed one is its bracket.
     held = {name: (row.value, widths[name]) for name, row in fit.held.items()} | fit.negative
     follow, pair = partial(consequences, fit, body.constants, model.quantities), neighbours(sample_times, step)
     inertias = dict(zip(AXES.values(), INVERSE, strict=True))

@@ -28,7 +28,7 @@ _WELL_KNOWN = 0.1
 # The most fits that look for the end of an interval. They end once the root of twice the rise of the cost is this close
 # to 1.96. It grows by 1 in each standard deviation if the cost is quadratic, and by the last number at least.
 _FITS, _CLOSE, _LEAST_SLOPE = 3, 0.1, 0.1
-# Newton's method needs one or two steps from the start that it is given. A cost that is too large by as much as its
+# Levenberg-Marquardt needs one or two steps from the start that it is given. A cost that is too large by as much as its
 # tolerance moves the end of an interval by 1 %.
 _TOLERANCE = 0.04
 # An end whose cost is lower by more than this shows that the estimate is not at the minimum. The most minima whose ends
@@ -75,7 +75,7 @@ def with_profile(fit: Fit, case: Case, *, progress: Progress) -> Fit:
 
 
 def _cost(fit: Fit, whole: InnovationsProblem) -> float:
-    """The cost, with that of the brackets of held parameters."""
+    """The cost, with that of the brackets of fixed parameters."""
     if fit.searched is None:
         raise ValueError("`fit` must be one of innovations.")
     problem, found = fit.searched

@@ -43,8 +43,8 @@ def fit_at_sample_times(
 
     If not `choose`: the first place.
 
-    The search for all parameters starts at the answer of the sample time before, if that is a minimum. What the flights
-    do not show is held beside it, in another thread.
+    The search for all parameters starts at the answer of the sample time before, if that is a minimum. Meanwhile,
+    another thread completes the fit of the sample time before: it fixes what the flights do not show.
 
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
