@@ -58,7 +58,7 @@ def command(run, tmp_path, monkeypatch):
 
     def call(function, found, bracket, settings, *options):
         asked = []
-        monkeypatch.setattr(design, function, lambda subject, **given: asked.append((subject, given)) or found)
+        monkeypatch.setattr(jaxos4, function, lambda subject, **given: asked.append((subject, given)) or found)
         (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
         code, out, err = run("design", *options, "--out", "new.csv", "--figure", "new.svg")
         assert (code, err) == (0, "")
