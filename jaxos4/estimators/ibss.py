@@ -121,7 +121,7 @@ class IBSS(AbstractSolver[State]):
             trust=jnp.ones((), dtype=float),
             sweeps=jnp.zeros((), dtype=int),
             rollouts=jnp.zeros((), dtype=int),
-            done=before.done,
+            done=jnp.zeros((), dtype=bool),
         )
 
     def step(self, stage: Stage, state: State) -> State:

@@ -94,7 +94,8 @@ class LevenbergMarquardt(AbstractSolver[State]):
         """The first trial is the start. Any cost is better than none."""
         model = before_shots(before.model)
         damping = jnp.full((), self.factor * self.damping, dtype=float)
-        return State(before.unknowns, model, before.unknowns, damping, jnp.zeros((), dtype=int), before.done)
+        none, going = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
+        return State(before.unknowns, model, before.unknowns, damping, none, going)
 
     def step(self, stage: Stage, state: State) -> State:
         """Shoot at the trial, keep the better, and propose the next trial."""

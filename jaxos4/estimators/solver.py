@@ -18,7 +18,7 @@ State = TypeVar("State")
 
 
 class Found(NamedTuple):
-    """What a search has found in a stage, or knows before the first.
+    """The findings of a search in a stage, or its knowledge before the first.
 
     - `unknowns`: the best of each window, and `model`, the local model of the cost there.
     - `spread`: the covariance of the unknowns of each window.
@@ -32,11 +32,6 @@ class Found(NamedTuple):
     steps: Count
     rollouts: Count
     done: Bool[Array, ""]
-
-    @property
-    def cost(self) -> Scalar:
-        """The cost of all windows; infinite for a trajectory that fails."""
-        return cost_of(self.model)
 
 
 class AbstractSolver(AbstractEstimator, Generic[State]):
@@ -53,10 +48,7 @@ class AbstractSolver(AbstractEstimator, Generic[State]):
 
     @abc.abstractmethod
     def init(self, stage: Stage, before: Found) -> State:
-        """The state with which the search of a stage begins: at `before.unknowns`, of the covariance `before.spread`.
-
-        `before.done`: the search of this lane is skipped.
-        """
+        """The first state of a stage's search: at `before.unknowns`, of the covariance `before.spread`."""
 
     @abc.abstractmethod
     def step(self, stage: Stage, state: State) -> State:
@@ -68,7 +60,7 @@ class AbstractSolver(AbstractEstimator, Generic[State]):
 
     @abc.abstractmethod
     def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
-        """What the stage found, from its last state."""
+        """The findings of the stage, from its last state."""
 
     @eqx.filter_jit
     def __call__(
@@ -115,7 +107,7 @@ def solve(
     stages = problem.stages(solver.shares)
     # Traced once, although a solver may call it twice.
     stages = stages._replace(local_model=jax.jit(stages.local_model, inline=True))
-    starts, begin = _starts(problem, start), before_search(problem, stages)._replace(done=jnp.asarray(skip))
+    starts, begin, skip = _starts(problem, start), before_search(problem, stages), jnp.asarray(skip)
     if spread is not None:
         given, wide = spread.shape[0], begin.spread
         # A search that is skipped may have no finite spread.
@@ -128,17 +120,22 @@ def solve(
     def search(place: Count, best: Found) -> Found:
         """From a start in the first stage, or from the best answer in a later one."""
         from_start = place < count
-        own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameters) & (place > 0) & jnp.isfinite(best.cost)
+        own = (
+            (jnp.arange(starts.shape[2]) < problem.unknowns.parameters)
+            & (place > 0)
+            & jnp.isfinite(cost_of(best.model))
+        )
         first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
-        before = chosen(from_start, first, best)._replace(done=begin.done)
+        before = chosen(from_start, first, best)
         stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
         state = jax.lax.while_loop(
-            lambda state: ~solver.terminate(stage, state),
+            lambda state: ~(skip | solver.terminate(stage, state)),
             functools.partial(solver.step, stage),
             solver.init(stage, before),
         )
         found = solver.postprocess(stage, state, before)
-        is_better = (place == 0) | ~from_start | (found.cost < best.cost)
+        found = found._replace(done=skip | found.done)
+        is_better = (place == 0) | ~from_start | (cost_of(found.model) < cost_of(best.model))
         total = {"steps": best.steps + found.steps, "rollouts": best.rollouts + found.rollouts}
         return chosen(is_better, found, best)._replace(**total)
 
@@ -148,7 +145,7 @@ def solve(
 
 
 def before_search(problem: AbstractProblem, stages: Stages) -> Found:
-    """What is known before a search: the first start, how far off it may be, and nothing about the cost."""
+    """The knowledge before a search: the first start, how far off it may be, and nothing about the cost."""
     guess, zero = problem.initial_guess, jnp.zeros((), dtype=int)
     start, spread = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
     shapes = jax.eval_shape(stages.local_model, zero, start, start)
