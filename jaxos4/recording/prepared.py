@@ -17,7 +17,7 @@ from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCIT
 from .checks import INERTIAS, Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import Ups, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
-from .stretches import Stretch, cut, nothing_usable, stretches
+from .stretches import Stretch, cut, nothing_usable
 from .windows import averaged, hold_out, joined, whole_windows
 
 HOLDOUT = 0.25
@@ -171,7 +171,7 @@ def _cleaned(
     doubts = [each for each in found if {*each.quantities} & {*INERTIAS}]
     notes = [str(each) for each in found if each not in doubts]
     slow = (facts._replace(gyro=None) if predicted else facts).too_slow
-    usable, note = _usable(evidence.plausible.recording, airframe, begin, end, slow, predicted=predicted)
+    usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
     if slow:
         raise InputError(f"{name}: {slow}.")
     if limited := at_limit(evidence.plausible.recording, airframe, rules):
@@ -196,23 +196,23 @@ def at_limit(recording: Recording, airframe: Airframe, rules: Preparation = RULE
 
 
 def _usable(
-    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str, *, predicted: bool
+    evidence: Evidence, begin: float | None, end: float | None, slow: str, *, predicted: bool
 ) -> tuple[list[Recording], list[str]]:
     """The usable stretches, or what `begin` and `end` ask for; and notes about the stretches that are not used.
 
     `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
     """
+    recording = evidence.plausible.recording
     name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
     if begin is not None or end is not None:
         with named(name):
             return [cut(recording, Stretch(first if begin is None else begin, last if end is None else end))], []
-    every = stretches(recording, airframe)
-    usable = [stretch for stretch in every if not stretch.reason]
-    refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
+    usable = [stretch for stretch in evidence.every if not stretch.reason]
+    refused = sorted((stretch for stretch in evidence.every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
         remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
         besides = f" Besides, {slow}." if slow else ""
-        raise InputError(f"{name}: {nothing_usable(every)}; {remedy}.{besides}")
+        raise InputError(f"{name}: {nothing_usable(evidence.every)}; {remedy}.{besides}")
     if not refused:
         return [recording], []
     reasons = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in refused[:3])

@@ -15,7 +15,7 @@ from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
 from ...logs.values import Plausible, plausible
-from ..stretches import RULES, cut, stretches
+from ..stretches import RULES, Stretch, cut, stretches
 from .estimates import Measured, Turns, attitude_turns, tilt_slopes, velocity_slopes
 from .response import Response, rotor_response
 
@@ -122,7 +122,7 @@ LIMITS = Limits()
 
 
 class Evidence:
-    """What the checks of one recording share. `airframe`: `None` if it is not known.
+    """The facts that the checks of one recording share. `airframe`: `None` if it is not known.
 
     **Arguments:** of `self_checks`.
     """
@@ -136,6 +136,11 @@ class Evidence:
         return plausible(self.logged)
 
     @functools.cached_property
+    def every(self) -> tuple[Stretch, ...]:
+        """Every stretch of the flight: usable ones, and others with the reason."""
+        return stretches(self.plausible.recording, self.airframe)
+
+    @functools.cached_property
     def stretches(self) -> tuple[Recording, ...]:
         """The usable stretches of the flight."""
         recording = self.plausible.recording
@@ -143,8 +148,7 @@ class Evidence:
             edges = np.flatnonzero(np.diff(recording.stretch)) + 1
             ends = zip([0, *edges], [*edges, recording.time.size], strict=True)
             return tuple(recording.rows(slice(int(begin), int(end))) for begin, end in ends)
-        every = stretches(recording, self.airframe)
-        return tuple(cut(recording, each) for each in every if not each.reason and each.length >= RULES.shortest)
+        return tuple(cut(recording, each) for each in self.every if not each.reason and each.length >= RULES.shortest)
 
     @functools.cached_property
     def airborne(self) -> tuple[Recording, ...]:
