@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CINERAT
 
 import jaxos4
+from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.shooting import InnovationsProblem

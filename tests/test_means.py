@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from disturbances import joint_cost, sample
-from helpers import CINERAT
 from scipy.integrate import simpson
 
 import jaxos4
+from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.flight import RATES
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings

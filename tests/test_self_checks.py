@@ -4,9 +4,10 @@ import equinox as eqx
 import msgspec
 import numpy as np
 import pytest
-from helpers import CINERAT, CRAZYFLIE
+from helpers import CRAZYFLIE
 
 import jaxos4
+from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES, VELOCITY
 from jaxos4.logs import write_flight

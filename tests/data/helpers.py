@@ -33,17 +33,6 @@ CRAZYFLIE = jaxos4.Airframe(
     rotor_inertia=2e-8,
     max_rotor_speed=FULL_SPEED,
 )
-# With measured rotor speeds and a large rotor inertia.
-CINERAT = jaxos4.Airframe(
-    mass=0.428,
-    inertia=(6.3e-4, 7.5e-4, 8.9e-4),
-    rotor_positions=[(-0.0455, -0.0635), (0.0455, -0.0635), (-0.0455, 0.0635), (0.0455, 0.0635)],
-    rotor_spins=(-1.0, 1.0, 1.0, -1.0),
-    thrust_coefficient=2.66e-7,
-    drag_coefficient=2.66e-9,
-    rotor_inertia=9e-7,
-    max_rotor_speed=4100.0,
-)
 CRAZYFLIE_TOML = """
 mass = 0.027
 inertia = [1.66e-5, 1.7e-5, 2.9e-5]
