@@ -1,4 +1,4 @@
-"""What filters know at each sample, and the motion after a start in open loop: the owner for all predictions."""
+"""The knowledge of filters at each sample, and the motion after a start in open loop: the owner for all predictions."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -49,7 +49,7 @@ def open_loop(
 
 
 def gyro_bias(model: AbstractModel, rates: Float[Numeric, "3"], row: Forcing, scalars: tuple) -> Float[Array, "3"]:
-    """What a gyro adds to these rates. It is part of the measurement, not of the motion."""
+    """The bias of a gyro at these rates. It is part of the measurement, not of the motion."""
     return jnp.stack(model.observe(State(Rates(*rates)), row, scalars)[:3]) - rates
 
 

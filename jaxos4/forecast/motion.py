@@ -25,7 +25,7 @@ PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10]
 
 
 class Tuning(NamedTuple):
-    """What tunes predictions of whole flights.
+    """The settings of predictions of whole flights.
 
     - `memory`: a recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
     - `push`: the standard deviation of an offset of the specific force, and of the force that a model lacks [m/s^2].

@@ -278,7 +278,7 @@ def quoted(text: str) -> str:
 
 
 def in_words(error: Exception) -> str:
-    """What an error of a decoder says, on one line."""
+    """The message of a decoder's error, on one line."""
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 

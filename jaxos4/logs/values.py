@@ -98,7 +98,7 @@ class Plausible(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What is implausible in a channel, by its usual range, from the quantile 0.005 to 0.995.
+    """The implausible values of a channel, by its usual range, from the quantile 0.005 to 0.995.
 
     - `fewest`: values; fewer have no usual range.
     - `spread`: a value is impossible if it lies so many times further from the median than the end of the range, and

@@ -43,7 +43,7 @@ class Stretch(NamedTuple):
 
 
 class StretchRules(NamedTuple):
-    """What counts as a usable stretch. Times in seconds, forces in multiples of gravity, unless units are given.
+    """The rules for a usable stretch. Times in seconds, forces in multiples of gravity, unless units are given.
 
     - `shortest`: a usable stretch, and the rest of a vehicle that lies on its side or back.
     - `moment`: a rotor may rest or be at its limit for this long: about its lag.

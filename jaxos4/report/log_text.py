@@ -1,4 +1,4 @@
-"""What a log contains, and what a flight of an OS4 can identify, as text for a terminal."""
+"""The content of a log, and the parameters that a flight of an OS4 can identify, as text for a terminal."""
 
 from rich.console import Console
 

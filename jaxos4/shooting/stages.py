@@ -18,7 +18,7 @@ ROUNDING = 64.0
 
 
 class Plan(NamedTuple):
-    """What each stage compares.
+    """The comparisons of each stage.
 
     - `channels`: of the stages, each once. `place`: of each stage's channels among them.
     - `sizes`: the number of states that each stage simulates.

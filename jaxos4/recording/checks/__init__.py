@@ -72,7 +72,7 @@ def self_checks(
 
 
 def findings(evidence: Evidence, checks: Sequence[Check] = CHECKS) -> tuple[Finding, ...]:
-    """What the checks find in the evidence of a log, see `self_checks`."""
+    """The findings of all checks in the evidence of a log, see `self_checks`."""
     with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
         found = [finding for check in checks if (finding := check(evidence)) is not None]
     return tuple(sorted(found, key=lambda finding: not finding.contradicted))

@@ -158,7 +158,7 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
-    """What else than the attitude is wrong. A velocity shows whether it is the time."""
+    """The channel that is wrong if it is not the attitude. A velocity shows whether it is the time."""
     if evidence.velocity is not None:
         slope, unlike = float(evidence.velocity.value[0]), evidence.limits.velocity
         if abs(slope / scale - 1) < unlike < abs(slope - 1):

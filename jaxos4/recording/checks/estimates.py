@@ -1,4 +1,4 @@
-"""What a log measures twice, with standard errors: attitude against gyro, velocity and force against the tilt."""
+"""Quantities that a log measures twice, with errors: attitude against gyro, velocity and force against the tilt."""
 
 from collections.abc import Callable, Sequence
 
