@@ -18,7 +18,7 @@ import typer
 import jaxos4
 from experiments.closed_loop.effects import ALL, EFFECTS, flights_of
 from experiments.closed_loop.run import VEHICLE
-from experiments.fits import given_airframe
+from experiments.fits import INERTIAS, given_airframe
 from experiments.monte_carlo import Row, continued, fill, print_table
 from jaxos4.errors import InputError
 from jaxos4.flight import ANGLES, RATES
@@ -27,15 +27,15 @@ from jaxos4.recording import Recording
 from jaxos4.recording.motion import rotations_to_body
 from jaxos4.results import NINETY_FIVE
 
-TRUTHS = dict(zip(("Ix", "Iy"), VEHICLE.inertia.tolist(), strict=False))
+JUDGED = "Ix", "Iy"
 SURE, FAR = 3.0, 0.12  # an answer beyond either is wrong: standard deviations, and share of the truth
 FORCE = slice(12, 15)  # of the channels
 
 
 class Fault(NamedTuple):
-    """`spoil`: makes a spoiled recording of a good one and a size. `cause`: words of the right cause; empty: none."""
+    """`spoil`: makes spoiled recordings of a good one and a size. `cause`: words of the right cause; empty: none."""
 
-    spoil: Callable[[Recording, float], Recording]
+    spoil: Callable[[Recording, float], Recording | list[Recording]]
     sizes: tuple[float, ...]
     cause: str
 
@@ -113,7 +113,26 @@ def noisy(recording: Recording, size: float) -> Recording:
 
 def shortened(recording: Recording, seconds: float) -> Recording:
     """The first seconds of a flight."""
-    rows = recording.time <= recording.time[0] + seconds
+    return some(recording, recording.time <= recording.time[0] + seconds)
+
+
+def without_rows(recording: Recording, lost: float) -> Recording:
+    """This share of the rows is missing, at random."""
+    return some(recording, np.random.default_rng(0).uniform(size=recording.time.size) >= lost)
+
+
+def two_vehicles(recording: Recording, size: float) -> list[Recording]:
+    """Two halves; the second is of a vehicle whose mass and moments of inertia are so many times smaller.
+
+    With rotor speeds that are smaller by the root, it flies the same path.
+    """
+    first = recording.time <= (recording.time[0] + recording.time[-1]) / 2
+    second = some(recording, ~first)
+    return [some(recording, first), second._replace(omega=second.omega / np.sqrt(size), name="second flight")]
+
+
+def some(recording: Recording, rows: np.ndarray) -> Recording:
+    """The recording of these rows."""
     force = None if recording.specific_force is None else recording.specific_force[rows]
     time, omega, states = (x[rows] for x in (recording.time, recording.omega, recording.states))
     return recording._replace(time=time, omega=omega, states=states, specific_force=force)
@@ -139,6 +158,8 @@ FAULTS = {
     "impossible speeds": Fault(impossible, (40.0, 19.0, 5.0), "are impossible"),
     "noisy motors": Fault(noisy, (0.3, 1.0, 3.0), ""),
     "short": Fault(shortened, (2.0, 4.0, 6.0), "s were fitted"),
+    "rows missing": Fault(without_rows, (0.1, 0.3, 0.5), "is not uniform"),
+    "two vehicles": Fault(two_vehicles, (1.1, 1.2, 1.3), "of different mass or thrust"),
     "rare motors": Fault(thinned, (5.0, 10.0, 20.0), "more rarely"),
 }
 CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL)}
@@ -159,7 +180,7 @@ def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> R
         row["result"], constants = found.result, found.rigid_body.constants
         causes = [*map(str, found.doubts), *(r for v in found.verdicts.values() for r in v.reasons)]
         causes += found.provenance.notes
-        for name, truth in TRUTHS.items():
+        for name, truth in zip(INERTIAS, VEHICLE.inertia.tolist(), strict=True):
             if name in constants:
                 value = constants[name]
                 row[name] = {"error": value.estimate / truth - 1, "std": value.std / truth}
@@ -176,7 +197,7 @@ def counts(rows: list[Row]) -> dict[str, int]:
     kinds = "answers", "identified", "unreserved", "far", "identified and wrong", "refused and right"
     found = dict.fromkeys(kinds, 0)
     for row in rows:
-        for name in TRUTHS:
+        for name in JUDGED:
             found["answers"] += 1
             if name not in row:
                 continue
