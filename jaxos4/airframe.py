@@ -38,6 +38,7 @@ class Airframe(eqx.Module):
     - `rotor_inertia`: J_R [kg m^2].
     - `gravity`: g [m/s^2].
     - `max_rotor_speed`: full-scale rotor speed [rad/s]; infinite if unknown.
+    - `sensor_rotation`: roll, pitch and yaw of the gyro and the accelerometer in the body [deg]; see `sensor_axes`.
     """
 
     mass: Float[Numeric, ""] = eqx.field(converter=as_constant)
@@ -49,6 +50,23 @@ class Airframe(eqx.Module):
     rotor_inertia: Float[Numeric, ""] = eqx.field(converter=as_constant)
     gravity: Float[Numeric, ""] = eqx.field(converter=as_constant, default=GRAVITY)
     max_rotor_speed: Float[Numeric, ""] = eqx.field(converter=as_constant, default=math.inf)
+    sensor_rotation: Float[Numeric, "3"] = eqx.field(converter=as_constant, default=(0.0, 0.0, 0.0))
+
+    @property
+    def sensor_axes(self) -> Float[Numeric, "3 3"]:
+        """The axes of the gyro and the accelerometer in the body, as columns: R_z(yaw) R_y(pitch) R_x(roll).
+
+        The matrix turns what they measure into the body's axes.
+        """
+        xp = np if isinstance(self.sensor_rotation, np.ndarray) else jnp
+        angles = xp.deg2rad(self.sensor_rotation)
+        (sx, cx), (sy, cy), (sz, cz) = zip(xp.sin(angles), xp.cos(angles), strict=True)
+        rows = (
+            (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+            (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+            (-sy, cy * sx, cy * cx),
+        )
+        return xp.stack([xp.stack(row) for row in rows])
 
     @property
     def mixer(self) -> Float[Numeric, "4 4"]:
@@ -118,8 +136,8 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
     The keys of the file, in SI units: `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, `drag_coefficient`,
     `rotor_inertia`; either `arm` (plus layout) or `rotor_positions = [[x1, y1], ...]`; optionally `rotor_spins`,
-    `gravity` and `max_rotor_speed`. `hover_speed`, at which the rotors carry the weight [rad/s], can replace
-    `thrust_coefficient`.
+    `gravity`, `max_rotor_speed` and `sensor_rotation`. `hover_speed`, at which the rotors carry the weight [rad/s], can
+    replace `thrust_coefficient`.
 
     `inertia`, `drag_coefficient` and `rotor_inertia` can be `"guess"`. With the mass m, and the rotors' distance r from
     the centre (root mean square), the guesses are: inertia m r^2 [0.3, 0.3, 0.5], drag coefficient 0.1 r times the
@@ -139,13 +157,14 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
         return airframe_from_table(table)
 
 
-_VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
+_VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,), "sensor_rotation": (3,)}
 _SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
-_REQUIRED = tuple(name for name in _SHAPES if name not in ("gravity", "max_rotor_speed"))
+_REQUIRED = tuple(name for name in _SHAPES if name not in ("gravity", "max_rotor_speed", "sensor_rotation"))
 _REPLACES = {"arm": "rotor_positions", "hover_speed": "thrust_coefficient"}
 _GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
 # The least and the largest value, if they are not those of the other constants.
 _SIZES = {"rotor_positions": (-1e3, 1e3), "rotor_spins": (-1e3, 1e3), "rotor_inertia": (0.0, 1e3)}
+_SIZES["sensor_rotation"] = (-360.0, 360.0)  # degrees
 _SIZES |= {"max_rotor_speed": (1e-15, math.inf), "hover_speed": (1e-3, 1e6)}
 
 

@@ -229,6 +229,7 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
 
 
 MODEL, OS4 = jaxos4.PublishedOS4(), jaxos4.OS4
+TURNED = eqx.tree_at(lambda a: a.sensor_rotation, OS4, np.array([0.0, 0.0, 45.0]))
 OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
 
 
@@ -249,6 +250,7 @@ OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
         (OS4, {"network": "none.net"}, "`network`: a vehicle's network is trained for its own flights"),
         (OS4, {"settings": OF_VEHICLE(holdout=0.9)}, "`holdout`: must be a share from 0 to 0.5"),
         (OS4, {"settings": OF_VEHICLE(terms=("drag",))}, "`terms`: drag needs lateral specific force"),
+        (jaxos4.PublishedOS4(TURNED), {}, "`sensor_rotation`: the rates of an OS4 flight are along the body's axes"),
         (MODEL, {"flights": 2}, "flight 2: `subject` published explains one flight"),
         (OS4, {"flights": 2}, "flight 2: given twice"),
         (OS4, {"flights": 0}, "holds no flight"),

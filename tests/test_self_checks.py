@@ -1,10 +1,13 @@
 """A log is checked against itself: each fault is named with its cause, and good flights have none."""
 
+import re
+
 import equinox as eqx
 import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
+from scipy.spatial.transform import Rotation
 
 import jaxos4
 from experiments.sample_times.run import VEHICLE as CINERAT
@@ -15,6 +18,7 @@ from jaxos4.recording import Recording, plausible, read_recording
 from jaxos4.recording.checks import CHECKS, Limits, different_vehicles, self_checks
 from jaxos4.recording.checks.estimates import Measured, attitude_turns, batched
 from jaxos4.recording.checks.response import rotor_response
+from jaxos4.recording.motion import in_body_axes
 from jaxos4.recording.stretches import cut
 
 pytestmark = pytest.mark.slow
@@ -209,6 +213,43 @@ def test_a_velocity_tells_the_gyro_from_the_time_and_its_own_axes(flights):
     (found,) = self_checks(north_east)
     assert found.name == "velocity_axes"
     assert "turned by -90 degrees" in found.size
+
+
+def given_rotation(finding):
+    """The `sensor_rotation` that a finding advises [deg]."""
+    return np.array(re.search(r"`sensor_rotation = \[(.*?)\]`", finding.remedy)[1].split(", "), dtype=float)
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 30.0), (15.0, -25.0, 40.0), (180.0, 0.0, -90.0)])
+def test_the_advised_rotation_of_the_sensors_cures_their_mounting(flights, angles):
+    """Without a rotation about z, the thrust shows two angles, and the rotors then the third."""
+    axes = Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix()
+    turned_flight, airframe = rotated(axes.T)(copied(flights[0])), CRAZYFLIE
+    for _ in range(2):
+        found = {each.name: each for each in self_checks(turned_flight, airframe)}
+        if not found:
+            break
+        advised = given_rotation(found.get("force_direction") or found["mounting"])
+        airframe = eqx.tree_at(lambda a: a.sensor_rotation, airframe, advised)
+    np.testing.assert_allclose(np.asarray(airframe.sensor_axes), axes, atol=0.06)
+    assert not self_checks(turned_flight, airframe)
+
+
+def test_a_channel_that_is_missing_stays_missing_along_its_own_axis_only(flights):
+    flight = copied(flights[0])
+    flight.states[10, RATES[0]] = np.nan
+    seen = in_body_axes(flight, eqx.tree_at(lambda a: a.sensor_rotation, CRAZYFLIE, np.array([0.0, 0.0, 90.0])))
+    np.testing.assert_array_equal(np.isnan(seen.states[10, RATES]), [False, True, False])
+    np.testing.assert_allclose(seen.states[10, RATES[2]], flight.states[10, RATES[2]])
+
+
+def test_simulated_sensors_are_mounted_as_the_airframe_says(flights):
+    """A flight along the axes of turned sensors is that of sensors which are not turned."""
+    turned_vehicle = eqx.tree_at(lambda a: a.sensor_rotation, CRAZYFLIE, np.array([10.0, 20.0, 30.0]))
+    loop = jaxos4.ClosedLoop(turned_vehicle, gust=2.0, logged="commands")
+    flight = Recording.of(fly_standard(loop, duration=20.0, seed=0), "turned.csv")
+    seen = in_body_axes(flight, turned_vehicle)
+    np.testing.assert_allclose(seen.channels, flights[0].channels, atol=1e-9)
 
 
 def test_a_turned_sensor_seems_to_lie_on_the_ground(flights):

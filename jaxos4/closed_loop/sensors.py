@@ -75,6 +75,8 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Ar
     commands = loop.logged == "commands"
     omega = logged[0] if sensors is None else _late(logged[0], sensors.clock_offset * every / dt)
     omega, motion, rates, attitude, specific = jax.tree.map(lambda x: x[::every], (omega, *logged[1:]))
+    axes = loop.airframe.sensor_axes
+    rates, specific = rates @ axes, specific @ axes  # along the axes of the sensors
     states = jnp.full((omega.shape[0], 12), jnp.nan).at[:, ANGLES].set(attitude)
     if sensors is not None:
         omega, step = omega + sensors.speed_noise * jax.random.normal(keys[0], omega.shape), sensors.speed_step

@@ -99,7 +99,9 @@ def _restore(place: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     if settings.depth > len(arrays) or largest > max(map(np.size, arrays.values())):
         raise ValueError("its layers are not those of its settings")
     with named(place):
-        airframe = airframe_from_table({f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
+        constants = {f.name: arrays.get(f"airframe.{f.name}") for f in dataclasses.fields(Airframe)}
+        # Files of earlier versions lack constants that have a default.
+        airframe = airframe_from_table({name: value for name, value in constants.items() if value is not None})
     problem = ShootingProblem(
         MODELS[header["model"]](airframe),
         Flight(arrays["time"], arrays["omega"], arrays["states"]),

@@ -12,9 +12,9 @@ from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
 from ..flight import CHANNEL_NAMES
 from ..logs import Recording
-from .checks import Finding, opposite_yaw, self_checks
+from .checks import Evidence, Finding, findings as findings_of, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
-from .stretches import cut, nothing_usable, stretches, usable
+from .stretches import cut, nothing_usable, usable
 
 FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
@@ -75,13 +75,13 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
 
     - `recording`: of a file, read with the same `airframe`, and with `full_scale=1.0`.
     """
-    found, flown, parts = stretches(recording, airframe), [], []
-    for stretch in found:
+    evidence, flown, parts = Evidence(recording, airframe), [], []
+    for stretch in evidence.every:
         if not stretch.reason:
-            flown.append(cut(recording, stretch))
+            flown.append(cut(evidence.plausible.recording, stretch))
         excited = {} if stretch.reason else excitation(flown[-1], airframe)
         parts.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
-    nothing = "" if flown else f"{nothing_usable(found)}; give the log of a flight"
+    nothing = "" if flown else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(flown, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))
     findings = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
@@ -94,7 +94,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         measured=_measured(recording),
         findings=findings,
-        checks=self_checks(recording, airframe),
+        checks=findings_of(evidence),
         notes=recording.notes if yaw is None else (*recording.notes, str(yaw)),
         parts=tuple(parts),
     )

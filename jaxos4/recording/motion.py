@@ -268,6 +268,22 @@ def _gapless(recording: Recording, columns: Int[np.ndarray, " columns"]) -> Floa
     return None if np.isnan(values).all(axis=0).any() else filled(values)
 
 
+def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
+    """The recording with rates and specific force along the body's axes, for sensors that are mounted at an angle."""
+    if airframe is None or not np.any(airframe.sensor_rotation):
+        return recording
+    axes = np.asarray(airframe.sensor_axes)
+    axes = np.where(np.abs(axes) < 1e-12, 0.0, axes)  # of right angles
+
+    def turned(measured: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
+        # A channel that was not measured is missing along the axes to which it contributes, and not along others.
+        return np.column_stack([measured[:, row != 0] @ row[row != 0] for row in axes])
+
+    states, force = recording.states.copy(), recording.specific_force
+    states[:, RATES] = turned(states[:, RATES])
+    return recording._replace(states=states, specific_force=None if force is None else turned(force))
+
+
 def rotations_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> Float[np.ndarray, "samples 3 3"]:
     """The rotations from the earth frame, the inverse of R_z(psi) R_y(theta) R_x(phi)."""
     (sx, cx), (sy, cy), (sz, cz) = ((np.sin(angle), np.cos(angle)) for angle in (phi, theta, psi))

@@ -15,6 +15,7 @@ from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
 from ...logs.values import Plausible, plausible
+from ..motion import in_body_axes
 from ..stretches import RULES, Stretch, cut, stretches
 from .estimates import Measured, Turns, attitude_turns, tilt_slopes, velocity_slopes
 from .response import Response, rotor_response
@@ -132,8 +133,9 @@ class Evidence:
 
     @functools.cached_property
     def plausible(self) -> Plausible:
-        """The recording without faulty values."""
-        return plausible(self.logged)
+        """The recording without faulty values, along the body's axes. The range of a sensor ends along its own."""
+        found = plausible(self.logged)
+        return found._replace(recording=in_body_axes(found.recording, self.airframe))
 
     @functools.cached_property
     def every(self) -> tuple[Stretch, ...]:

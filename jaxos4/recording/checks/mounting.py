@@ -4,12 +4,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ...airframe import GRAVITY
 from .estimates import BATCHES, Measured, batched
 from .evidence import INERTIAS, Evidence, Finding
-
-_TURN = "turn p, q and ax, ay of the log"
 
 
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
@@ -39,8 +38,26 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     )
     remedy = "leave the attitude out, or correct it"
     if quantities != ("attitude",):
-        remedy = f"{_TURN}: {math.degrees(angle[0]):.0f} degrees, counter-clockwise seen from above"
+        remedy = _rotation_for(evidence, _turn(2, angle[0])) + ": counter-clockwise seen from above"
     return Finding("mounting", cause, ways, remedy, quantities, True)
+
+
+def _rotation_for(evidence: Evidence, turn: Float[np.ndarray, "3 3"]) -> str:
+    """The advice to give the rotation that turns the sensors further by the matrix `turn`."""
+    axes = turn if evidence.airframe is None else turn @ np.asarray(evidence.airframe.sensor_axes)
+    roll, yaw = math.atan2(axes[2, 1], axes[2, 2]), math.atan2(axes[1, 0], axes[0, 0])
+    angles = roll, -math.asin(min(max(axes[2, 0], -1.0), 1.0)), yaw
+    degrees = ", ".join(f"{round(math.degrees(angle)) + 0}" for angle in angles)
+    return f"give `sensor_rotation = [{degrees}]` [deg] in the airframe's file"
+
+
+def _turn(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
+    """The matrix that turns a vector about x, y or z by an angle [rad]."""
+    (i, j), turn = ((axis + 1) % 3, (axis + 2) % 3), np.eye(3)
+    turn[i, i] = turn[j, j] = math.cos(angle)
+    turn[j, i] = math.sin(angle)
+    turn[i, j] = -turn[j, i]
+    return turn
 
 
 def opposite_yaw(correlation: float | None) -> Finding | None:
@@ -123,12 +140,14 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
     tilt = math.acos(min(max(mean[2] / max(size, 1e-300), -1.0), 1.0))
     if tilt < limits.tilt or size < limits.steady * sizes:
         return None
+    roll = math.atan2(mean[1], mean[2])
+    level = _turn(1, -math.atan2(mean[0], math.hypot(mean[1], mean[2]))) @ _turn(0, roll)
     along = ", ".join(f"{x:.2f}" for x in mean / size)
     return Finding(
         "force_direction",
         "the accelerometer is mounted at an angle, or has other axes: the thrust in flight is not along its z axis",
         f"{math.degrees(tilt):.0f} degrees, along {along}",
-        f"{_TURN}, or give x forward, y left, z up",
+        f"log x forward, y left, z up, or {_rotation_for(evidence, level)}: the angle about z is not known",
         ("thrust", *INERTIAS),
         True,
     )
