@@ -10,6 +10,8 @@ from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
 from jaxos4.estimators.ant_colony import Colony
+from jaxos4.estimators.levenberg_marquardt import LevenbergMarquardt
+from jaxos4.estimators.solver import solve
 from jaxos4.shooting import LocalModel, Stage, Unknowns
 
 pytestmark = pytest.mark.slow
@@ -25,6 +27,28 @@ def test_where_a_start_is_nan_the_search_begins_at_the_center():
     assert set(names(found[0])) == {"successful"}
     elsewhere = identify(jaxos4.IBSS(), *arguments, center.at[7, 2].add(0.5 * HALF[2]))
     assert not np.array_equal(elsewhere.parameters[7], found[0].parameters[7])
+
+
+SOLVERS = [jaxos4.IBSS(), LevenbergMarquardt(), jaxos4.AntColony()]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
+def test_a_search_that_is_skipped_has_no_answer(solver):
+    problem = standard_problem(channels="rates", states=noisy_states(1)[0])
+    found = solve(solver, problem, skip=True)
+    assert names(found) == "nonfinite_trajectory"
+    assert np.isinf(found.cost)
+    np.testing.assert_array_equal(found.parameters, problem.unknowns.center)
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
+def test_a_start_beyond_the_reach_is_moved_to_its_limit(solver):
+    problem = standard_problem(channels="rates", states=noisy_states(1)[0])
+    lower, upper = problem.unknowns.limits(solver.reach)
+    far = problem.unknowns.center.at[2].set(2 * upper[2])
+    found = solve(solver, problem, far)
+    assert ((found.parameters >= lower) & (found.parameters <= upper)).all()
+    assert names(found) != "nonfinite_trajectory"
 
 
 @pytest.mark.parametrize("kind", ["shooting", "innovations"])

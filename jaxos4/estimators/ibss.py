@@ -109,7 +109,7 @@ class IBSS(AbstractSolver[State]):
         That shot is the first step of the loop: a second copy of the simulation would take as long to compile as all of
         the search.
         """
-        unknowns = jnp.clip(before.unknowns, *stage.limits(self.reach))
+        unknowns = before.unknowns
         directions = Directions.none(unknowns)
         return State(
             unknowns=unknowns,

@@ -128,13 +128,15 @@ def solve(
         first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
         before = chosen(from_start, first, best)
         stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
+        # A start that was given may lie beyond the reach.
+        before = before._replace(unknowns=jnp.clip(before.unknowns, *stage.limits(solver.reach)))
         state = jax.lax.while_loop(
             lambda state: ~(skip | solver.terminate(stage, state)),
             functools.partial(solver.step, stage),
             solver.init(stage, before),
         )
         found = solver.postprocess(stage, state, before)
-        found = found._replace(done=skip | found.done)
+        found = found._replace(model=chosen(skip, before_shots(found.model), found.model), done=skip | found.done)
         is_better = (place == 0) | ~from_start | (cost_of(found.model) < cost_of(best.model))
         total = {"steps": best.steps + found.steps, "rollouts": best.rollouts + found.rollouts}
         return chosen(is_better, found, best)._replace(**total)
