@@ -1,4 +1,8 @@
-"""Runs a script of an experiment in double precision: `python -m experiments closed_loop.effects --help`."""
+"""Runs a script of an experiment in double precision: `python -m experiments closed_loop.effects --help`.
+
+With `--publish NAME`, the tables that it prints become a result file, see `published.py`. `python -m experiments
+render` writes the tables of the pages from these files.
+"""
 
 import importlib
 import sys
@@ -7,6 +11,9 @@ from pathlib import Path
 
 import jax
 import typer
+
+from experiments.monte_carlo import machine
+from experiments.published import RECORDER, render
 
 
 def scripts() -> Iterator[str]:
@@ -17,9 +24,37 @@ def scripts() -> Iterator[str]:
             yield f"{path.parent.name}.{path.stem}"
 
 
-if __name__ == "__main__":
-    name = sys.argv.pop(1) if len(sys.argv) > 1 else "none"
+def published(arguments: list[str]) -> str | None:
+    """Takes `--publish NAME` out of the arguments. `None`: it is not there."""
+    if "--publish" not in arguments:
+        return None
+    place = arguments.index("--publish")
+    name = arguments[place + 1] if place + 1 < len(arguments) else ""
+    if not name.isidentifier():
+        raise SystemExit("--publish: needs a name of letters, digits and _.")
+    del arguments[place : place + 2]
+    return name
+
+
+def run(name: str, arguments: list[str]) -> None:
+    """Runs a script with its arguments."""
     if name not in scripts():
-        raise SystemExit(f"{name}: no such script; give one of {', '.join(scripts())}.")
+        raise SystemExit(f"{name}: no such script; give one of {', '.join(scripts())}, or render.")
+    result, command = published(arguments), [name, *arguments]
     jax.config.update("jax_enable_x64", True)
-    typer.run(importlib.import_module(f"experiments.{name}").main)
+    app = typer.Typer(add_completion=False)
+    app.command()(RECORDER.watching(importlib.import_module(f"experiments.{name}").main))
+    try:
+        app(arguments, prog_name=f"python -m experiments {name}")
+    except SystemExit as end:
+        if end.code:
+            raise
+    if result is not None:
+        RECORDER.publish(result, command, machine())
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["render"]:
+        render()
+    else:
+        run(sys.argv[1] if len(sys.argv) > 1 else "none", sys.argv[2:])

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 import jaxos4
+from experiments.published import RECORDER, Table as Published, commit
 from jaxos4.results import NINETY_FIVE
 
 Row = dict[str, Any]
@@ -22,12 +24,13 @@ def continued(out: Path | None, settings: Row, rows: str) -> Row:
 
     Ends the script if the file has other settings.
     """
-    settings = settings | {"version": jaxos4.__version__, "precision": "float64"}
-    if out is None or not out.exists():
-        return {**settings, rows: []}
-    report = json.loads(out.read_text())
-    if rows not in report or {name: report.get(name) for name in settings} != settings:
-        raise SystemExit(f"{out}: has other settings; give --out another name.")
+    settings = settings | {"version": jaxos4.__version__, "precision": str(jnp.result_type(float))}
+    report = {**settings, "commit": commit(), rows: []}
+    if out is not None and out.exists():
+        report = json.loads(out.read_text())
+        if rows not in report or {name: report.get(name) for name in settings} != settings:
+            raise SystemExit(f"{out}: has other settings; give --out another name.")
+    RECORDER.commit = report.get("commit", "")
     return report
 
 
@@ -35,7 +38,7 @@ def machine() -> Row:
     """What computes: versions, device, cores and precision."""
     device = jax.devices()[0].device_kind
     versions = {"version": jaxos4.__version__, "jax": jax.__version__}
-    return versions | {"device": device, "cores": os.cpu_count(), "precision": "float64"}
+    return versions | {"device": device, "cores": os.cpu_count(), "precision": str(jnp.result_type(float))}
 
 
 def write_report(out: Path | None, report: Row) -> None:
@@ -124,8 +127,20 @@ def results_of(case: Row) -> str:
     return in_words(count_results(np.array([row["result"] for row in case["flights"]])))
 
 
-def print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], width: int = 150) -> None:
-    """Prints a table of so many columns of the terminal. Only the cells of `results` are of several lines."""
+def print_table(
+    title: str,
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    width: int = 150,
+    *,
+    tables: list[Published] = RECORDER.tables,
+) -> None:
+    """Prints a table of so many columns of the terminal. Only the cells of `results` are of several lines.
+
+    `tables`: gets the table too, to be published, see `published.py`.
+    """
+    rows = [list(row) for row in rows]
+    tables.append(Published(title, list(headings), rows))
     table = Table(title=title)
     for heading in headings:
         table.add_column(heading, no_wrap=heading != "results")

@@ -1,0 +1,41 @@
+"""Published results: the tables of the pages are those of the result files, which are of this version."""
+
+import jaxos4
+from experiments.monte_carlo import machine, print_table
+from experiments.published import FOLDER, PAGES, Recorder, read, rendered, shown
+
+MINOR = jaxos4.__version__.split(".")[:2]
+
+
+def test_every_table_of_a_page_is_that_of_its_result():
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert rendered(text) == text, f"{page}: python -m experiments render"
+
+
+def test_every_result_is_shown_is_of_this_version_and_says_how_it_was_made():
+    files = sorted(FOLDER.glob("*.json"))
+    assert {path.stem for path in files} == {name for _, name, _ in shown()}
+    for path in files:
+        found = read(path.stem)
+        assert found.version.split(".")[:2] == MINOR
+        assert all((found.command, found.commit, found.date, found.machine["cores"]))
+    assert sum(path.stat().st_size for path in files) < 2e6
+
+
+def test_what_a_script_prints_is_published_and_a_page_that_differs_is_seen(tmp_path):
+    recorder = Recorder()
+
+    def main(flights: int = 3, seed: int = 0) -> None:
+        print_table("errors", ["flights", "error"], iter([(str(flights), "0.1 +- 0.2 %")]), tables=recorder.tables)
+
+    recorder.watching(main)(flights=5, seed=1)
+    recorder.publish("small", ["small.run", "--flights", "5"], machine(), tmp_path)
+    found = read("small", tmp_path)
+    assert (found.command, found.settings) == ("small.run --flights 5", {"flights": 5, "seed": 1})
+    page = rendered("before\n<!-- result: small / errors -->\nold\n<!-- end -->\nafter\n", tmp_path)
+    assert "| 5 | 0.1 ± 0.2 % |" in page
+    assert "`python -m experiments small.run --flights 5`" in page
+    assert rendered(page, tmp_path) == page
+    changed = page.replace("0.2 %", "0.3 %")
+    assert rendered(changed, tmp_path) != changed
