@@ -4,9 +4,13 @@ Each flight: a CineRat (3-inch quadrotor, rotors with a lag of 25 ms) flies rand
 estimator gets the true airframe. Rotor speeds or commands are logged every `--dt` seconds, and the flight is fitted at
 several sample times. A sample time of 0 is the one that the rule chooses.
 
-The simulator is finer than the log: four steps in each of its samples. The controller runs every 4 ms at most.
+The simulator is finer than the controller, which runs every 4 ms, or as often as the log is written if that is more
+often: four steps in each of its runs. Its references change as often as it runs. A slower log has some of its rows: if
+references changed only where the log has a row, commands would change little in between. A command that the log holds
+for n runs of the controller is late by (n - 1) / 2 runs: the true delay of the rotors is then negative.
 """
 
+import functools
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +23,7 @@ import typer
 
 import jaxos4
 from experiments.monte_carlo import Row, covered_error, monte_carlo, print_table, results_of
+from jaxos4.recording import Recording
 from jaxos4.results import NINETY_FIVE
 
 VEHICLE = jaxos4.Airframe(
@@ -39,6 +44,7 @@ TRUTH = {
     "Iz": 8.9e-4,
     "rotor_reaction": 9e-7 / 8.9e-4,
     "rotor_delay": 0.0,
+    "rotor_lag": LAG,
     "roll_damping": 0.0,
     "yaw_damping": 0.0,
 }
@@ -48,10 +54,11 @@ UNITS = {"rotor_delay": (1e3, "ms"), "roll_damping": (1.0, "1/s"), "yaw_damping"
 def fly(logged: str, dt: float, duration: float, gust: float, noise: float, seed: int) -> jaxos4.Flight:
     """One flight. `noise`: of logged rotor speeds, as a share of the median of their changes from sample to sample."""
     every = max(round(dt / PERIOD), 1)
-    loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=0.0, gust=gust, logged=logged, log_every=every)
+    loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=0.0, gust=gust, logged=logged)
     first, second = jax.random.split(jax.random.key(seed))
-    references = jaxos4.random_references(duration=duration, dt=dt, key=first)
-    flight = jaxos4.fly_closed_loop(loop, references, dt=dt, key=second, substeps=4 * every)
+    references = jaxos4.random_references(duration=duration, dt=dt / every, key=first)
+    flight = jaxos4.fly_closed_loop(loop, references, dt=dt / every, key=second, substeps=4)
+    flight = Recording.of(flight, "flight").rows(slice(None, None, every)).flight
     if not noise:
         return flight
     omega = np.asarray(flight.omega)
@@ -75,14 +82,20 @@ def fit(flight: jaxos4.Flight, sample_time: float) -> Row:
     }
 
 
-def summary(rows: list[Row]) -> dict[str, Row]:
+def truth_of(logged: str, dt: float) -> dict[str, float]:
+    """The true values for a log with rows every `dt` seconds."""
+    held = (max(round(dt / PERIOD), 1) - 1) * PERIOD / 2 if logged == "commands" else 0.0
+    return TRUTH | {"rotor_delay": -held}
+
+
+def summary(rows: list[Row], true: dict[str, float]) -> dict[str, Row]:
     """For each quantity: mean error with its Monte-Carlo error, and coverage. Shares of the truth if that is not 0."""
     found = {}
-    for name, truth in TRUTH.items():
+    for name, truth in true.items():
         pairs = np.array([row["found"][name] for row in rows if name in row["found"]])
         if len(pairs) < 2:
             continue
-        error, scale = pairs[:, 0] - truth, truth or 1.0
+        error, scale = pairs[:, 0] - truth, (name not in UNITS and truth) or 1.0
         covered = float(np.mean(np.abs(error) <= NINETY_FIVE * pairs[:, 1]))
         found[name] = {
             "flights": len(pairs),
@@ -123,6 +136,7 @@ def main(
     def row_of(flight: jaxos4.Flight, i: int, sample_time: float) -> Row:
         return fit(flight, sample_time)
 
-    report = monte_carlo(out, settings, cases, lambda **_: flown, row_of, summary)
+    counted = functools.partial(summary, true=truth_of(logged, dt))
+    report = monte_carlo(out, settings, cases, lambda **_: flown, row_of, counted)
     headings = "ms", "", "flights", "mean error", "covered [%]", "results"
     print_table("errors by sample time", headings, table_rows(report), width=120)
