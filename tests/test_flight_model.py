@@ -114,6 +114,9 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     # The order is that of TERMS, in whatever order they were given, and within a term recording by recording.
     assert jaxos4.FlightModel(terms=("lag", "offset")).parameter_names[8:] == (*NAMES["offset"], "rotor_lag")
     two = jaxos4.FlightModel(terms=("offset",), recordings=(0, 1)).parameter_names[8:]
+    # However many stretches there are: flights of one recording share a program.
+    assert jaxos4.FlightModel(recordings=(0, 0, 0)).recordings == (0,)
+    assert jaxos4.FlightModel(recordings=(0, 0, 1, 1)).recordings == (0, 0, 1)
     assert two == tuple(f"{name}_{i}" for i in (1, 2) for name in NAMES["offset"])
 
 

@@ -16,7 +16,7 @@ from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, ByRecording, OfAirframe, Parameter
 from .os4 import CorrectedOS4
-from .rotors import Batch, Grid, measured_speeds, squared
+from .rotors import Batch, Grid, measured_speeds, of_stretches, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
 from .terms import COMMANDS, FULL_SCALE, TERMS, VELOCITY, VOLTAGE, Term, Values, clash, default_terms, required
 
@@ -52,8 +52,9 @@ class FlightModel(AbstractModel):
       need `Flight.body_velocity`, or states with a velocity. `gyro_bias` and `offset` can be distinguished only if the
       attitude is compared too.
       Leave out `motor`, `lag` and `delay` if rotor speeds were measured.
-    - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
-      own offsets and gyro biases. All other parameters are the vehicle's.
+    - `recordings`: for each stretch of the flight, the number of its recording, counted from 0; the last number holds
+      for all stretches that follow. Each recording has its own offsets and gyro biases. All other parameters are the
+      vehicle's.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
 
     `batch`: so many samples of a padded flight are computed together.
@@ -91,7 +92,11 @@ class FlightModel(AbstractModel):
         powered = [term for term in terms if VOLTAGE in TERMS[term].needs]
         if powered and battery_voltage is None:
             raise ValueError(f"`battery_voltage` must be given for the term {powered[0]}: it is the usual voltage.")
-        self.airframe, self.terms, self.recordings = airframe, tuple(terms), tuple(recordings)
+        # All flights of one recording share a program, in however many stretches they are.
+        every = list(recordings)
+        while every[-2:] == every[-1:] * 2:
+            every.pop()
+        self.airframe, self.terms, self.recordings = airframe, tuple(terms), tuple(every)
         self.battery_voltage = None if battery_voltage is None else as_float(battery_voltage)
 
     @property
@@ -129,7 +134,7 @@ class FlightModel(AbstractModel):
         ]
         known = isinstance(stretch, np.ndarray)  # what is known needs no compiled program
         numbers = np.asarray(self.recordings) if known else jnp.asarray(self.recordings)
-        return ByRecording(one, np.array(places), numbers[stretch])
+        return ByRecording(one, np.array(places), numbers[(np if known else jnp).minimum(stretch, numbers.size - 1)])
 
     @property
     def gyroscopic_factor(self) -> Scalar:
@@ -186,7 +191,7 @@ class FlightModel(AbstractModel):
         """The forcing by the rotors, and what acts beside them. `place`: the samples of its rows; by default all."""
         own, velocity = jnp.zeros(inputs.omega.shape[0], dtype=int), inputs.velocity
         if inputs.stretches is not None:
-            own = jnp.asarray(self.recordings)[inputs.stretches.number]
+            own = of_stretches(self.recordings, inputs.stretches.number)
         if place is not None:
             own, velocity = own[place], None if velocity is None else velocity[place]
         shares = tuple((own == i).astype(rotors.roll.dtype) for i in range(max(self.recordings) + 1))

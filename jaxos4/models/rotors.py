@@ -16,6 +16,11 @@ Commands = Callable[[Int[Array, "*rows"]], Float[Array, "*rows 4"]]
 """The commands [rad/s] at the samples with these numbers."""
 
 
+def of_stretches(recordings: tuple[int, ...], stretch: Int[Array, " samples"]) -> Int[Array, " samples"]:
+    """The recordings of these stretches; the last of `recordings` is that of all stretches that follow."""
+    return jnp.asarray(recordings)[jnp.minimum(stretch, len(recordings) - 1)]
+
+
 class Grid(NamedTuple):
     """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
 
@@ -36,12 +41,12 @@ class Grid(NamedTuple):
     def of(
         cls, inputs: Inputs, battery_voltage: Scalar | None, recordings: tuple[int, ...], *, are_parts: bool
     ) -> "Grid":
-        """The grid of a flight's inputs. `recordings`: of each stretch."""
+        """The grid of a flight's inputs. `recordings`: see `of_stretches`."""
         voltage, samples = inputs.voltage, inputs.omega.shape[0]
         voltage = None if voltage is None or battery_voltage is None else voltage / battery_voltage
         zeros = jnp.zeros(samples, dtype=int)
         stretch, first, last = inputs.stretches or (zeros, zeros, zeros + samples - 1)
-        recording, elapsed = jnp.asarray(recordings)[stretch], inputs.dt * jnp.arange(samples)
+        recording, elapsed = of_stretches(recordings, stretch), inputs.dt * jnp.arange(samples)
         if max(recordings) > 0:
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
         return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts)
