@@ -11,7 +11,6 @@ from jaxtyping import Array
 from .._custom_types import Numeric, as_float
 from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate
-from ..analysis.frequency_response import frequency_response
 from ..analysis.open_loop import disturbances
 from ..analysis.prediction import Predictions, Skill, predictions, skill
 from ..estimate import fit_start
@@ -52,18 +51,6 @@ def predict_held_out(case: Case, fit: Fit, held_out: ShootingProblem) -> tuple[P
         rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
     }
     return predicted, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
-
-
-def compile_ahead(case: Case) -> None:
-    """Compile what checks the fit of a vehicle at any sample time, while the fits are computed."""
-    problem, held_out = case.shooting, case.held_out
-    center = np.asarray(problem.unknowns.center)
-    frequency_response(with_room(problem, case.room), as_float(center))
-    if held_out is None:
-        return
-    _regressed(problem, case.room, center, [False] * center.size)
-    if not case.validate:
-        _disturbances(case, problem, held_out, center, LogNoise(*np.zeros((3, problem.columns.size))))
 
 
 def _disturbances(

@@ -10,7 +10,6 @@ the shortest without vibration. If all have it: the longest with an answer.
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -18,10 +17,9 @@ import numpy as np
 
 from ..estimate import REACH, Estimate
 from ..results import result_names
-from ..shooting import InnovationsProblem, for_threads
+from ..shooting import InnovationsProblem
 from .answers import AXES, overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
-from .held_out import compile_ahead
 from .prepare import Case, Progress
 from .results import Constant, SampleTime, has_answer
 
@@ -43,26 +41,19 @@ def fit_at_sample_times(
 
     If not `choose`: the first place.
 
-    The search for all parameters starts at the answer of the sample time before, if that is a minimum. Meanwhile,
-    another thread completes the fit of the sample time before: it fixes what the flights do not show.
+    The search for all parameters starts at the answer of the sample time before, if that is a minimum.
 
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
-    found, fits, beside = None, [], ThreadPoolExecutor(1)
-    try:
-        for case in reversed(cases):
-            progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            if not fits:
-                beside.submit(for_threads(compile_ahead), case)  # what fails here fails again when it is needed
-            begin = case if found is None else _starting_from(case, found)
-            found = jax.block_until_ready(begin.estimator(begin.problem))
-            if begin is not case and not has_answer(found):  # the answer for longer samples was no start
-                other = jax.block_until_ready(case.estimator(case.problem))
-                found = eqx.tree_at(lambda e: e.rollouts, other, found.rollouts + other.rollouts)
-            fits.append(beside.submit(for_threads(fit_case), case, first=found))
-        fits = [fit.result() for fit in fits][::-1]
-    finally:  # after an error, what has not begun is not computed
-        beside.shutdown(cancel_futures=True)
+    found, fits = None, []
+    for case in reversed(cases):
+        progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
+        begin = case if found is None else _starting_from(case, found)
+        found = jax.block_until_ready(begin.estimator(begin.problem))
+        if begin is not case and not has_answer(found):  # the answer for longer samples was no start
+            other = jax.block_until_ready(case.estimator(case.problem))
+            found = eqx.tree_at(lambda e: e.rollouts, other, found.rollouts + other.rollouts)
+        fits.insert(0, fit_case(case, first=found))
     answers = tuple(map(answer_of, cases, fits))
     place = shortest(answers) if choose else 0
     return place, cases[place], fits[place], answers
