@@ -7,8 +7,7 @@ import numpy as np
 from ..airframe import Airframe
 from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import decisive_horizon
-from ..models.abstract import Parameter
-from ..models.flight_model import FlightModel
+from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.checks import Finding
 from .answers import AXES, INVERSE
@@ -59,7 +58,7 @@ def few_parts(seconds: float, tolerance: Tolerance = TOLERANCE) -> Iterator[Doub
 
 
 def doubts_of(
-    model: FlightModel,
+    model: AbstractModel,
     parameters: dict[str, ParameterEstimate],
     constants: dict[str, Constant],
     skill: PredictionSkill | None,
@@ -93,7 +92,7 @@ def doubts_of(
 
 
 def contradicted(
-    model: FlightModel, found: Found, follow: Consequences = lambda name, value: {}
+    model: AbstractModel, found: Found, follow: Consequences = lambda name, value: {}
 ) -> Iterator[tuple[Parameter, Doubt]]:
     """The parameters whose values physics or the airframe forbid.
 
