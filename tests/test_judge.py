@@ -15,7 +15,7 @@ from jaxos4.identification.doubts import doubts_of, vibration
 from jaxos4.identification.results import (
     Constant,
     Disturbance,
-    HeldParameter,
+    FixedParameter,
     ParameterEstimate,
     PredictionSkill,
     RateSkill,
@@ -173,9 +173,9 @@ def test_a_disturbance_larger_than_the_control_is_named():
     weak = overwhelmed(answer)
     assert list(weak) == ["pitch"]
     assert "about pitch, the disturbance" in weak["pitch"]
-    assert not overwhelmed(answer._replace(fixed={"alpha6": HeldParameter(0.0, "1", "")}))
+    assert not overwhelmed(answer._replace(fixed={"alpha6": FixedParameter(0.0, "1", "")}))
     # Vehicles hardly yaw: if nothing is known of it, the other axes do not need it.
-    assert list(overwhelmed(answer._replace(fixed={"alpha8": HeldParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
+    assert list(overwhelmed(answer._replace(fixed={"alpha8": FixedParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.

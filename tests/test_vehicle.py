@@ -1,7 +1,6 @@
 """Vehicles in closed loop: every search of the innovations finds the same answer, with honest intervals."""
 
 import functools
-import types
 
 import equinox as eqx
 import jax
@@ -12,13 +11,15 @@ from helpers import CRAZYFLIE
 from lanes import names
 
 import jaxos4
-from jaxos4.identification import problem as problems, uncertainty
+from jaxos4.identification import uncertainty
 from jaxos4.identification.checks import check_vehicle
 from jaxos4.identification.data import Data
-from jaxos4.identification.problem import liveliest
+from jaxos4.identification.results import Provenance
 from jaxos4.identification.sample_time import sample_time_of
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import at_lowest, corrected, upper_end
+from jaxos4.networks import for_flight
+from jaxos4.networks.for_flight import liveliest
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
 
@@ -160,7 +161,7 @@ def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
     small = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
-    monkeypatch.setattr(problems, "_VEHICLE_TRAINING", small)
+    monkeypatch.setattr(for_flight, "TRAINING", for_flight.Training(vehicle=small))
     flight, airframe = (lane(part, 0) for part in flown())
     shorter = jax.tree.map(lambda leaf: leaf[:1001] if leaf.ndim else leaf, flight)
     settings = jaxos4.VehicleSettings(terms=("offset", "lag"), sample_time=0.016, holdout=0.0)
@@ -214,7 +215,9 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
 def poorly_known():
     """The data of a flight that says little about alpha8, and the answer without a profile."""
     problem, recording = first_problem(1.0)
-    data = Data(problem, problem.problem, recording, provenance=types.SimpleNamespace(fitted_seconds=60.0))
+    nothing = dict.fromkeys(("airframe", "version", "jax", "device", "precision"), "")
+    provenance = Provenance(sample_time=PERIOD, fitted_seconds=60.0, **nothing)
+    data = Data(problem, problem.problem, recording, provenance)
     return data, fitted(problem, recording)
 
 
@@ -287,9 +290,9 @@ def test_an_interval_ends_where_the_fits_that_succeeded_say(monkeypatch, shares,
     optimum = poorly_known()[1].optimum
     unknowns = optimum.likelihood.problem.unknowns
     left = fits_at_ends(monkeypatch, optimum.estimate, unknowns, shares)
-    reach, lower, _ = upper_end(optimum, unknowns.names.index("alpha8"))
+    reach, last = upper_end(optimum, unknowns.names.index("alpha8"))
     assert reach == pytest.approx(end * NINETY_FIVE)
-    assert lower is None
+    assert last.converged == (shares[-1] is not None)
     assert not list(left)
 
 

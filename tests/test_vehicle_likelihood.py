@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import sample_time
+from jaxos4.identification import sample_time, vehicle
 from jaxos4.identification.answers import vehicle_constants
-from jaxos4.identification.results import Constant, HeldParameter, SampleTime
+from jaxos4.identification.results import Constant, FixedParameter, SampleTime
 from jaxos4.identification.sample_time import moved, sample_time_of, search_sample_times, shortest
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import Profile, at_lowest, corrected
@@ -118,7 +118,7 @@ def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
 
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
-    monkeypatch.setattr(at_lowest, "__kwdefaults__", at_lowest.__kwdefaults__ | {"rules": Profile(well_known=0.0)})
+    monkeypatch.setattr(vehicle, "at_lowest", functools.partial(at_lowest, rules=Profile(well_known=0.0)))
     with compiled_programs() as programs:
         found = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))
     np.testing.assert_allclose([each.sample_time for each in found.sample_times], [0.004, 0.008, 0.016, 0.032])
@@ -177,7 +177,7 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     place = answer.problem.model.parameter_names.index("thrust_gain")
     unknown = np.asarray(answer.estimate.covariance).copy()
     unknown[place, place] = 0.45**2
-    fixed = {"thrust_gain": HeldParameter(float(answer.estimate.parameters[place]), "1", "not identifiable")}
+    fixed = {"thrust_gain": FixedParameter(float(answer.estimate.parameters[place]), "1", "not identifiable")}
     estimate = eqx.tree_at(lambda e: e.covariance, answer.estimate, jnp.asarray(unknown))
     weak = answer._replace(estimate=estimate, fixed=fixed)
     for name, row in vehicle_constants(weak).constants.items():
@@ -191,7 +191,7 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
 
 def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeypatch):
     several = [data_of(flown(), DT * length) for length in (2, 4)]
-    monkeypatch.setattr(sample_time, "start_of", lambda likelihood, found: jnp.full_like(found.parameters, 1e9))
+    monkeypatch.setattr(sample_time, "start_of", lambda likelihood, found: np.full(found.parameters.size, 1e9))
     optima = search_sample_times(several, SOLVER)
     answers = [corrected(x, data.flight, data.recording) for x, data in zip(optima, several, strict=True)]
     rows = [sample_time_of(answer) for answer in answers]

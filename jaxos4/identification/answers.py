@@ -23,7 +23,7 @@ from .results import (
     ChannelFit,
     Constant,
     Disturbance,
-    HeldParameter,
+    FixedParameter,
     ParameterEstimate,
     RigidBody,
     SampleTime,
@@ -81,7 +81,7 @@ class Answer(NamedTuple):
     rollouts: int
     evaluation: Evaluation | None = None
     optimum: Optimum | None = None
-    fixed: dict[str, HeldParameter] = {}
+    fixed: dict[str, FixedParameter] = {}
     disturbances: dict[str, Disturbance] = {}
     widened: dict[str, float] = {}
     profiled: dict[str, float] = {}

@@ -221,7 +221,7 @@ def consequences(
         return {}
     other = optimum.restricted(FilterError(tolerance=PROFILE.tolerance), {name: value})
     others = {each: names for each, names in model.quantities.items() if name not in names}
-    if str(result_names(other.estimate.result)) != "successful":
+    if not other.converged:
         return dict.fromkeys((*constants, *others))
     moved, std = other.values, deviations(answer.estimate.covariance)
     gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]

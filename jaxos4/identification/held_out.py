@@ -21,8 +21,8 @@ from .answers import Answer, channel_fits
 from .data import Data, HeldOut
 from .results import PredictionSkill, RateSkill, Validation, finite_or_none
 
-# Memory of the regression for comparison: the best on real flights.
-_MEMORY = 0.9
+REGRESSION = EquationError(memory=0.9)
+"""For comparison. This memory is the best on real flights."""
 
 
 def predict_held_out(
@@ -77,7 +77,7 @@ def _regression(problem: ShootingProblem, values: Array, fixed: Numeric) -> Arra
     linear = np.array([not each.in_forcing for each in problem.model.parameters])
     own = jnp.where(linear & ~fixed, problem.unknowns.center, values)
     unknowns = dataclasses.replace(problem.unknowns, center=own, free=linear & ~fixed)
-    return EquationError(memory=_MEMORY).solution(dataclasses.replace(problem, unknowns=unknowns))
+    return REGRESSION.solution(dataclasses.replace(problem, unknowns=unknowns))
 
 
 def validate_on(answer: Answer, held_out: HeldOut) -> Validation:

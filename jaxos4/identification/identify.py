@@ -1,4 +1,11 @@
-"""`jaxos4.identify`: from recorded flights to parameters with intervals."""
+"""`jaxos4.identify`: from recorded flights to parameters with intervals.
+
+- recordings -> `Data`, with a likelihood: `prepare_flight` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
+  case, which knows the other steps.
+- `Data` -> `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
+- `Answer` -> `Checked`: `case.check`, by checks.py with doubts.py, quantities.py and verdict.py.
+- `Checked` -> `Identification`: `describe`.
+"""
 
 import os
 import time

@@ -21,13 +21,14 @@ from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..networks.file import load_network
+from ..networks.for_flight import GivenNetwork, network_for, network_provenance
 from ..recording.checks import KINEMATIC, self_checks
 from ..results import RESULTS
 from ..shooting import ShootingProblem, padded
 from .answers import Answer, Solution
 from .checks import Checked, check_flight
 from .data import Data, HeldOut, Progress, airframe_name, silent, versions
-from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, network_for, network_provenance
+from .problem import Intervals, bracket_of, flight_problem
 from .results import COLOURED, Provenance, has_answer
 from .settings import FlightSettings, class_name, name_and_class
 

@@ -3,7 +3,7 @@
 The noise is among the unknowns of this likelihood. All searches return an `Optimum`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -12,6 +12,7 @@ from jaxtyping import ArrayLike, Float
 
 from ..estimate import AbstractEstimator, Estimate
 from ..models.abstract import Parameter
+from ..results import result_names
 from ..shooting import InnovationsProblem, Parts, Unknowns
 from ..shooting.gains import LogNoise
 from .data import Progress, silent
@@ -60,6 +61,11 @@ class Optimum(NamedTuple):
     is_lowest: bool = True
 
     @property
+    def converged(self) -> bool:
+        """Whether the search ended at a minimum."""
+        return str(result_names(self.estimate.result)) == "successful"
+
+    @property
     def values(self) -> Float[np.ndarray, " unknowns"]:
         """The parameters, then the logarithms of the noise."""
         return np.asarray(self.estimate.parameters)
@@ -96,7 +102,7 @@ class Optimum(NamedTuple):
 
     def restricted(
         self,
-        estimator: AbstractEstimator,
+        estimator: Callable[[InnovationsProblem], Estimate],
         values: Mapping[str, float],
         start: Float[np.ndarray, " unknowns"] | None = None,
     ) -> "Optimum":

@@ -23,11 +23,11 @@ from .._custom_types import as_float
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
-from ..results import NINETY_FIVE, result_names
+from ..results import NINETY_FIVE
 from ..shooting import InnovationsProblem, ShootingProblem
 from .answers import INVERSE, Answer
 from .data import Data, Progress, silent
-from .results import HeldParameter, has_answer
+from .results import FixedParameter, has_answer
 from .search import Optimum, disturbances_of, search
 
 PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
@@ -107,7 +107,7 @@ def corrected(
         bound=optimum.std,
         rollouts=optimum.rollouts,
         optimum=optimum,
-        fixed={x: HeldParameter(float(values[i]), units[i], notes[x]) for i, x in enumerate(names) if x in notes},
+        fixed={x: FixedParameter(float(values[i]), units[i], notes[x]) for i, x in enumerate(names) if x in notes},
         disturbances=disturbances_of(optimum),
         widened=of_free(jackknife),
         profiled=of_free(longer),
@@ -128,16 +128,17 @@ def at_lowest(
     """
     for left in reversed(range(rules.minima)):
         answer, factors, lower = corrected(optimum, data.flight, data.recording), {}, None
-        if str(result_names(optimum.estimate.result)) != "successful":
+        if not optimum.converged:
             return answer
         poor = optimum.std > rules.well_known * np.abs(optimum.values[: optimum.whole.count])
         for place in sorted({*INVERSE.values()} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
-            end = upper_end(optimum, place, rules)
+            reach, end = upper_end(optimum, place, rules)
             optimum = optimum._replace(rollouts=end.rollouts)
-            if (lower := end.lower) is not None:
+            if end.converged and optimum.cost - end.cost > rules.lower:
+                lower = end.values
                 break
-            factors[optimum.whole.names[place]] = max(end.reach / NINETY_FIVE, 1.0)
+            factors[optimum.whole.names[place]] = max(reach / NINETY_FIVE, 1.0)
         if lower is None:
             return corrected(optimum, data.flight, data.recording, factors)
         if not left:
@@ -153,24 +154,13 @@ def at_lowest(
     return corrected(optimum._replace(is_lowest=False), data.flight, data.recording)
 
 
-class End(NamedTuple):
-    """The upper end of an interval.
-
-    - `reach`: in standard deviations above the optimum.
-    - `lower`: unknowns at which the cost is lower than at the optimum; `None`: not found.
-    - `rollouts`: of all searches, with those of the optimum.
-    """
-
-    reach: float
-    lower: Float[np.ndarray, " unknowns"] | None
-    rollouts: int
-
-
-def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> End:
+def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> tuple[float, Optimum]:
     """Where the interval of one parameter ends by the profile.
 
     If no fit at an end succeeds, the end is that of the covariance. If a later fit fails, the end is extrapolated from
-    the fits before it.
+    the fits before it. The search for the end is over where the cost is lower than at the optimum.
+
+    **Returns:** the end in standard deviations above the optimum, and the last fit at an end.
     """
     solver, covariance = FilterError(tolerance=rules.tolerance), np.asarray(optimum.estimate.covariance)
     # How the minimum moves with this parameter, in steps of its standard deviation.
@@ -180,17 +170,15 @@ def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> End:
         unknowns, before, at = unknowns + (reach - at) * along, at, reach
         fixed = {optimum.whole.names[place]: float(unknowns[place])}
         other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
-        if str(result_names(other.estimate.result)) != "successful":
-            break
         rise, unknowns, last = other.cost - optimum.cost, other.values, root
-        if rise < -rules.lower:
-            return End(NINETY_FIVE, unknowns, other.rollouts)
+        if not other.converged or rise < -rules.lower:
+            break
         root = np.sqrt(max(2 * rise, 0.0))
         reach = at + (NINETY_FIVE - root) / max((root - last) / (at - before), rules.slope)
         reach = float(np.clip(reach, at / 2, 2 * at))
         if abs(root - NINETY_FIVE) < rules.close:
             break
-    return End(reach, None, other.rollouts)
+    return reach, other
 
 
 def _widening(

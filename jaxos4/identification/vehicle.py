@@ -19,13 +19,14 @@ from ..flight import Flight
 from ..logs import Recording
 from ..models.flight_model import FlightModel
 from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
+from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import input_innovations
 from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Data, HeldOut, Progress, airframe_name, versions
-from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
+from .problem import Intervals, bracket_of
 from .results import Provenance
 from .sample_time import sample_time_of, search_sample_times, shortest
 from .search import search
