@@ -155,11 +155,10 @@ def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias
     loop = jaxos4.ClosedLoop(CINERAT, rotor_lag=0.025, rotor_delay=0.0, gust=2.0, gyro_noise=0.05, logged="commands")
     references = jaxos4.random_references(duration=20.0, dt=0.004, key=first)
     flight = jaxos4.fly_closed_loop(loop, references, dt=0.004, key=second, substeps=4)
-    nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
     settings = jaxos4.VehicleSettings(sample_time=0.008, holdout=0.0)
-    case = prepare_vehicle(as_recordings(flight), CINERAT, settings, **nothing)[0]
-    answer = case.estimator(case.problem)
-    found = dict(zip(case.problem.unknowns.names, zip(answer.parameters, answer.std, strict=True), strict=True))
+    data = prepare_vehicle(as_recordings(flight), CINERAT, settings).data[0]
+    answer = jaxos4.FilterError(tolerance=1e-3)(data.likelihood)
+    found = dict(zip(data.likelihood.unknowns.names, zip(answer.parameters, answer.std, strict=True), strict=True))
     truth = dict(zip(("alpha3", "alpha6"), 1 / np.asarray(CINERAT.inertia)[:2], strict=True))
     for name, value in (truth | {"rotor_lag": 0.025, "rotor_delay": 0.0}).items():
         estimate, std = found[name]

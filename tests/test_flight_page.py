@@ -25,7 +25,7 @@ from synthetic_identification import (
 )
 
 from jaxos4.analysis.inertia import CenterOfMass
-from jaxos4.identification.results import Disturbance, HeldParameter, ParameterEstimate, RigidBody, Validation
+from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
 from jaxos4.identification.verdict import Verdict
 from jaxos4.report import print_identification, write_flight_page
 from jaxos4.report.identification_page import (
@@ -169,7 +169,7 @@ def test_the_inertias_of_all_sample_times_are_shown(tmp_path):
 
 def test_names_cannot_break_out_of_the_page_and_an_older_one_is_kept_if_it_cannot_be_made(tmp_path):
     path = tmp_path / "flight.html"
-    changes = {"title": EVIL, "estimator": EVIL, "held": {EVIL: HeldParameter(0.0, "1", EVIL)}}
+    changes = {"title": EVIL, "estimator": EVIL, "held": {EVIL: FixedParameter(0.0, "1", EVIL)}}
     _, shown = written(path, **changes, provenance={"command": EVIL, "network": {"of": EVIL}, "notes": [EVIL]})
     assert shown.count("alert(1)") >= 6
     path.write_text("of before")

@@ -10,18 +10,17 @@ from scipy.special import chdtri
 
 import jaxos4
 from jaxos4.airframe import OS4
-from jaxos4.identification.answers import overwhelmed
+from jaxos4.identification.answers import Answer, overwhelmed
 from jaxos4.identification.doubts import doubts_of, vibration
-from jaxos4.identification.fit import Fit
-from jaxos4.identification.jackknife import disagreement, parts_of
 from jaxos4.identification.results import (
     Constant,
     Disturbance,
-    HeldParameter,
+    FixedParameter,
     ParameterEstimate,
     PredictionSkill,
     RateSkill,
 )
+from jaxos4.identification.uncertainty import disagreement, parts_of
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import read_recording
 from jaxos4.results import RESULTS
@@ -170,13 +169,13 @@ def test_a_disturbance_larger_than_the_control_is_named():
     problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12))
     counts = map(jnp.asarray, (0.0, 1, 1))
     estimate = jaxos4.Estimate(model.alpha, jnp.eye(8), jnp.zeros(3), *counts, RESULTS.successful)
-    fit = Fit(problem, estimate, np.ones(8), 1, disturbances=gusts)
-    weak = overwhelmed(fit)
+    answer = Answer(problem, estimate, np.ones(8), 1, disturbances=gusts)
+    weak = overwhelmed(answer)
     assert list(weak) == ["pitch"]
     assert "about pitch, the disturbance" in weak["pitch"]
-    assert not overwhelmed(fit._replace(held={"alpha6": HeldParameter(0.0, "1", "")}))
+    assert not overwhelmed(answer._replace(fixed={"alpha6": FixedParameter(0.0, "1", "")}))
     # Vehicles hardly yaw: if nothing is known of it, the other axes do not need it.
-    assert list(overwhelmed(fit._replace(held={"alpha8": HeldParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
+    assert list(overwhelmed(answer._replace(fixed={"alpha8": FixedParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.

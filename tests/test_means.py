@@ -290,14 +290,13 @@ def answers(**settings):
     references = jaxos4.random_references(duration=20.0, dt=dt, key=keys[0])
     flight = jaxos4.fly_closed_loop(loop, references, dt=dt, key=keys[1])
     terms = ("offset", "damping", "delay", "reaction", "accelerometer")
-    nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
     fits = jaxos4.VehicleSettings(terms=terms, holdout=0.0)
     found = []
-    for case in prepare_vehicle(as_recordings(flight), CINERAT, fits, **nothing):
-        if round(1e3 * float(case.shooting.flight.dt)) in (8, 32):
-            answer = case.estimator(case.problem)
+    for data in prepare_vehicle(as_recordings(flight), CINERAT, fits).data:
+        if round(1e3 * float(data.flight.flight.dt)) in (8, 32):
+            answer = jaxos4.FilterError(tolerance=1e-3)(data.likelihood)
             values = zip(answer.parameters.tolist(), answer.std.tolist(), strict=True)
-            found.append(dict(zip(case.shooting.model.parameter_names, values, strict=False)))
+            found.append(dict(zip(data.flight.model.parameter_names, values, strict=False)))
     assert len(found) == 2
     return found
 

@@ -1,7 +1,6 @@
 """Vehicles in closed loop: every search of the innovations finds the same answer, with honest intervals."""
 
 import functools
-import types
 
 import equinox as eqx
 import jax
@@ -12,12 +11,15 @@ from helpers import CRAZYFLIE
 from lanes import names
 
 import jaxos4
-from jaxos4.identification import problem as problems, profile
-from jaxos4.identification.fit import fit_case, fit_innovations
-from jaxos4.identification.judge import judge
-from jaxos4.identification.prepare import Case
-from jaxos4.identification.problem import liveliest
-from jaxos4.identification.sample_time import answer_of
+from jaxos4.identification import uncertainty
+from jaxos4.identification.checks import check_vehicle
+from jaxos4.identification.data import Data
+from jaxos4.identification.results import Provenance
+from jaxos4.identification.sample_time import sample_time_of
+from jaxos4.identification.search import search
+from jaxos4.identification.uncertainty import at_lowest, corrected, upper_end
+from jaxos4.networks import for_flight
+from jaxos4.networks.for_flight import liveliest
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
 
@@ -72,6 +74,11 @@ def first_problem(damping=0.0, share=1.0):
     flight, airframe = (lane(part, 0) for part in flown(damping, share))
     problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
     return problem, np.zeros(flight.time.shape[0], int)
+
+
+def fitted(problem, recording, **options):
+    """The answer of `FilterError`, with intervals corrected by the jackknife."""
+    return corrected(search(jaxos4.FilterError(), problem, **options), problem.problem, recording)
 
 
 @functools.cache
@@ -154,7 +161,7 @@ def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
     small = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
-    monkeypatch.setattr(problems, "_VEHICLE_TRAINING", small)
+    monkeypatch.setattr(for_flight, "TRAINING", for_flight.Training(vehicle=small))
     flight, airframe = (lane(part, 0) for part in flown())
     shorter = jax.tree.map(lambda leaf: leaf[:1001] if leaf.ndim else leaf, flight)
     settings = jaxos4.VehicleSettings(terms=("offset", "lag"), sample_time=0.016, holdout=0.0)
@@ -181,64 +188,74 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
     """A flight with a roll damping; in a hover with hardly any motion."""
     problem, recording = first_problem(damping, share)
     unknowns, stages = problem.problem.unknowns, []
-    fit = fit_innovations(jaxos4.FilterError(), problem, recording, progress=stages.append)
-    assert fit.answered
+    answer = fitted(problem, recording, progress=stages.append)
+    assert answer.answered
     assert ("fitting again without what came out negative" in stages) == (kind == "negative")
-    std, half_width = np.asarray(fit.estimate.std)[: unknowns.count], np.asarray(unknowns.half_width)
+    std, half_width = np.asarray(answer.estimate.std)[: unknowns.count], np.asarray(unknowns.half_width)
     for i, name in enumerate(unknowns.names):
         if (kind, name) != ("negative", "roll_damping"):
-            assert (name in fit.held) == (std[i] > half_width[i] * 0.5**0.5), name
+            assert (name in answer.fixed) == (std[i] > half_width[i] * 0.5**0.5), name
     if kind == "negative":
         place = unknowns.names.index("roll_damping")
-        value, error = fit.negative["roll_damping"]
+        value, error = answer.negative["roll_damping"]
         assert value < -2 * error < 0
-        assert fit.estimate.parameters[place] == 0.0
+        assert answer.estimate.parameters[place] == 0.0
         # All intervals allow for what is known of it without the limit.
-        assert fit.bound[place] == pytest.approx(error)
-        _, held = fit.searched
+        assert answer.bound[place] == pytest.approx(error)
+        search_covariance = answer.optimum.estimate.covariance
         roll = unknowns.names.index("alpha3")
-        assert fit.bound[roll] > 1.001 * np.sqrt(held.covariance[roll, roll])
-    assert {"alpha1", "alpha4", "alpha7"} <= set(fit.held)
-    assert {"alpha3", "alpha6", "rotor_lag"}.isdisjoint(fit.held) == (kind != "hover")
-    assert (std >= fit.bound * (1 - 1e-9)).all()
-    assert set(fit.disturbances) == {"p", "q", "r"}
+        assert answer.bound[roll] > 1.001 * np.sqrt(search_covariance[roll, roll])
+    assert {"alpha1", "alpha4", "alpha7"} <= set(answer.fixed)
+    assert {"alpha3", "alpha6", "rotor_lag"}.isdisjoint(answer.fixed) == (kind != "hover")
+    assert (std >= answer.bound * (1 - 1e-9)).all()
+    assert set(answer.disturbances) == {"p", "q", "r"}
 
 
 @functools.cache
 def poorly_known():
-    """The problem of a flight that says little about alpha8, as a case, and its fit."""
+    """The data of a flight that says little about alpha8, and the answer without a profile."""
     problem, recording = first_problem(1.0)
-    nothing = dict.fromkeys(("model", "held_out")) | {"provenance": types.SimpleNamespace(fitted_seconds=60.0)}
-    case = Case(problem, problem.problem, jaxos4.FilterError(), "filter-error", recording=recording, **nothing)
-    return case, fit_case(case)
+    nothing = dict.fromkeys(("airframe", "version", "jax", "device", "precision"), "")
+    provenance = Provenance(sample_time=PERIOD, fitted_seconds=60.0, **nothing)
+    data = Data(problem, problem.problem, recording, provenance)
+    return data, fitted(problem, recording)
 
 
 @pytest.mark.usefixtures("optimised")
 def test_at_the_upper_end_of_a_wide_interval_the_least_cost_is_higher_by_two():
     """By 1.96^2 / 2. It is higher by 1.7 where 1.96 standard deviations of the covariance end."""
-    case, fit = poorly_known()
-    own, stages = case.problem.problem.unknowns, []
+    data, answer = poorly_known()
+    own, stages = data.likelihood.problem.unknowns, []
     place = own.names.index("alpha8")
-    wider = profile.with_profile(fit, case, progress=stages.append)
+    wider = at_lowest(answer.optimum, data, jaxos4.FilterError(), progress=stages.append)
     assert stages == ["computing intervals"]  # the other inertias are known well
-    assert wider.rollouts > fit.rollouts
-    assert wider.held == fit.held
-    value, before, after = float(fit.estimate.parameters[place]), fit.bound[place], float(wider.estimate.std[place])
+    assert wider.rollouts > answer.rollouts
+    assert wider.fixed == answer.fixed
+    value, before, after = float(answer.estimate.parameters[place]), answer.bound[place], wider.estimate.std[place]
     assert wider.profiled == {"alpha8": pytest.approx(after / before)}
-    others = np.arange(fit.estimate.std.size) != place
-    np.testing.assert_array_equal(wider.estimate.std[others], fit.estimate.std[others])
+    others = np.arange(answer.estimate.std.size) != place
+    np.testing.assert_array_equal(wider.estimate.std[others], answer.estimate.std[others])
 
     def rise(end):
-        other = jaxos4.FilterError(tolerance=1e-6)(case.problem.hold({"alpha8": np.asarray(end)}))
+        other = jaxos4.FilterError(tolerance=1e-6)(data.likelihood.hold({"alpha8": np.asarray(end)}))
         prior = ((end - float(own.center[place])) / float(own.half_width[place])) ** 2 / 2
-        return float(other.cost) + prior - float(fit.estimate.cost)
+        return float(other.cost) + prior - float(answer.estimate.cost)
 
     assert rise(value + 1.96 * after) == pytest.approx(1.92, rel=0.02)
     assert rise(value + 1.96 * before) < 1.75
-    # The factor of the jackknife multiplies that of the profile.
-    twice = eqx.tree_at(lambda e: e.covariance, fit.estimate, 4 * fit.estimate.covariance)
-    both = profile.with_profile(fit._replace(estimate=twice), case, progress=stages.append)
-    np.testing.assert_allclose(both.estimate.std, 2 * wider.estimate.std)
+
+
+@pytest.mark.usefixtures("optimised")
+def test_the_factor_of_the_jackknife_multiplies_that_of_the_profile():
+    data, answer = poorly_known()
+    place = answer.problem.unknowns.names.index("alpha8")
+    uneven = eqx.tree_at(lambda e: e.parts.gradient, answer.optimum.estimate, replace_fn=lambda x: 4 * x)
+    optimum = answer.optimum._replace(estimate=uneven)
+    one, both = (corrected(optimum, data.flight, data.recording, factors) for factors in ({}, {"alpha8": 1.3}))
+    assert one.widened != {}
+    np.testing.assert_allclose(both.estimate.std[place], 1.3 * one.estimate.std[place])
+    others = np.arange(one.estimate.std.size) != place
+    np.testing.assert_array_equal(both.estimate.std[others], one.estimate.std[others])
 
 
 # How much higher the cost is at each end, in shares of 1.96^2 / 2 (None: no fit); the end, in that of the covariance.
@@ -263,63 +280,61 @@ def fits_at_ends(monkeypatch, found, unknowns, shares):
         result = jaxos4.RESULTS.max_sweeps if share is None else jaxos4.RESULTS.successful
         return eqx.tree_at(lambda e: (e.parameters, e.cost, e.result), found, (problem.start, cost, result))
 
-    monkeypatch.setattr(profile, "FilterError", lambda tolerance: fit_at)
+    monkeypatch.setattr(uncertainty, "FilterError", lambda tolerance: fit_at)
     return shares
 
 
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize(("shares", "end"), ENDS.values(), ids=ENDS)
 def test_an_interval_ends_where_the_fits_that_succeeded_say(monkeypatch, shares, end):
-    _, fit = poorly_known()
-    problem, found = fit.searched
-    unknowns = problem.problem.unknowns
-    left = fits_at_ends(monkeypatch, found, unknowns, shares)
-    reach, lower, _ = profile.upper_end(problem, found, unknowns.names.index("alpha8"))
+    optimum = poorly_known()[1].optimum
+    unknowns = optimum.likelihood.problem.unknowns
+    left = fits_at_ends(monkeypatch, optimum.estimate, unknowns, shares)
+    reach, last = upper_end(optimum, unknowns.names.index("alpha8"))
     assert reach == pytest.approx(end * NINETY_FIVE)
-    assert lower is None
+    assert last.converged == (shares[-1] is not None)
     assert not list(left)
 
 
 @pytest.mark.usefixtures("optimised")
 def test_an_inertia_whose_interval_has_no_end_is_not_identifiable(monkeypatch):
-    case, fit = poorly_known()
-    fits_at_ends(monkeypatch, fit.searched[1], case.problem.problem.unknowns, [1 / 4] * 3)
-    widened = fit._replace(widened={"alpha3": 1.5, "alpha8": 1.5})
-    lost = profile.with_profile(widened, case, progress=lambda stage: None)
-    assert "alpha8" in lost.held
-    assert (lost.widened, lost.profiled) == ({"alpha3": 1.5}, {})
+    data, answer = poorly_known()
+    fits_at_ends(monkeypatch, answer.optimum.estimate, data.likelihood.problem.unknowns, [1 / 4] * 3)
+    lost = at_lowest(answer.optimum, data, jaxos4.FilterError())
+    assert "alpha8" in lost.fixed
+    assert "alpha8" not in {**lost.widened, **lost.profiled}
 
 
 @pytest.mark.usefixtures("optimised")
 def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch):
-    case, fit = poorly_known()
-    problem, found = fit.searched
+    data, answer = poorly_known()
+    found, solver = answer.optimum.estimate, jaxos4.FilterError()
     aside, stages = eqx.tree_at(lambda e: e.cost, found, found.cost + 3.0), []  # it ended beside the minimum
-    better = profile.with_profile(fit._replace(searched=(problem, aside)), case, progress=stages.append)
-    assert stages.count("fitting again where the cost is lower") == 1
-    assert better.rollouts > fit.rollouts
+    better = at_lowest(answer.optimum._replace(estimate=aside), data, solver, progress=stages.append)
+    assert stages.count("fitting again where the cost is lower") == better.restarts == 1
+    assert better.rollouts > answer.rollouts
     assert abs(float(better.estimate.cost - found.cost)) < 2 * jaxos4.FilterError().tolerance
-    assert (better.is_lowest, "alpha8" in better.profiled) == (True, True)
+    assert (better.optimum.is_lowest, "alpha8" in better.profiled) == (True, True)
     # The search ends where it began, although the cost is lower at an end: no minimum is found.
     stages.clear()
-    fits_at_ends(monkeypatch, found, case.problem.problem.unknowns, [-1.0] * 3)
-    lost = profile.with_profile(fit, case, progress=stages.append)
-    assert not lost.is_lowest
+    fits_at_ends(monkeypatch, found, data.likelihood.problem.unknowns, [-1.0] * 3)
+    lost = at_lowest(answer.optimum, data, solver, progress=stages.append)
+    assert not lost.optimum.is_lowest
     assert stages.count("fitting again where the cost is lower") <= 2
-    assert lost.searched[1].cost <= found.cost
-    assert judge(case, lost, [answer_of(case, lost)], progress=stages.append)["doubts"][0].result == "max_sweeps"
+    assert lost.optimum.cost <= answer.optimum.cost
+    assert check_vehicle(data, lost, [sample_time_of(lost)], stages.append).doubts[0].result == "max_sweeps"
     # A search that did not converge has no profile.
-    failed = fit._replace(estimate=eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.at_bound))
-    assert profile.with_profile(failed, case, progress=stages.append) is failed
+    failed = eqx.tree_at(lambda e: e.result, found, jaxos4.RESULTS.at_bound)
+    assert at_lowest(answer.optimum._replace(estimate=failed), data, solver).profiled == {}
 
 
 @pytest.mark.usefixtures("optimised")
 def test_a_flight_that_the_model_cannot_follow_has_no_answer():
     problem, recording = first_problem()
     wild = eqx.tree_at(lambda p: p.problem.flight.omega, problem, 1e6 * problem.flight.omega)
-    fit = fit_innovations(jaxos4.FilterError(), wild, recording)
-    assert not fit.answered
-    assert names(fit.estimate) == "nonfinite_trajectory"
+    answer = fitted(wild, recording)
+    assert not answer.answered
+    assert names(answer.estimate) == "nonfinite_trajectory"
     bracket = problem.problem.unknowns.bracket
     found = jaxos4.FilterError()(problem.within(jaxos4.Bracket(bracket.upper, bracket.lower)))
     assert names(found) == "bracket_invalid"
@@ -342,9 +357,9 @@ def test_motors_brake_as_they_drive_unless_flight_or_bracket_say_otherwise(braki
         center, half_width = (np.asarray(x).copy() for x in (own.center, own.half_width))
         center[place], half_width[place] = bracket
         problem = problem.within(jaxos4.Bracket.around(center, half_width))
-    fit = fit_innovations(jaxos4.FilterError(), problem, np.zeros(flight.time.size, int))
-    place = fit.problem.unknowns.names.index("motor_braking")
-    value = float(fit.estimate.parameters[place])
-    is_plain = "motor_braking" in fit.held and "do not contradict" in fit.held["motor_braking"].note
+    answer = fitted(problem, np.zeros(flight.time.size, int))
+    place = answer.problem.unknowns.names.index("motor_braking")
+    value = float(answer.estimate.parameters[place])
+    is_plain = "motor_braking" in answer.fixed and "do not contradict" in answer.fixed["motor_braking"].note
     assert is_plain == (braking == 1.0 and bracket is None) == (value == 1.0)
-    assert abs(value - (braking if bracket is None else bracket[0])) <= 3 * float(fit.estimate.std[place])
+    assert abs(value - (braking if bracket is None else bracket[0])) <= 3 * float(answer.estimate.std[place])

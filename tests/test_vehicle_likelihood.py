@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import profile, sample_time
+from jaxos4.identification import sample_time, vehicle
 from jaxos4.identification.answers import vehicle_constants
-from jaxos4.identification.fit import fit_case
-from jaxos4.identification.results import Constant, HeldParameter, SampleTime
-from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, shortest
+from jaxos4.identification.results import Constant, FixedParameter, SampleTime
+from jaxos4.identification.sample_time import moved, sample_time_of, search_sample_times, shortest
+from jaxos4.identification.search import search
+from jaxos4.identification.uncertainty import Profile, at_lowest, corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
@@ -52,12 +53,13 @@ def cost_of(problem, parameters, noise):
     return problem.innovations(parameters, noise).cost.sum()
 
 
-def case_of(flight, sample_time):
+SOLVER = jaxos4.FilterError(tolerance=1e-3)
+
+
+def data_of(flight, sample_time):
     """As `jaxos4.identify` prepares it, so that all fits are one program."""
     settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=sample_time, holdout=0.0)
-    nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
-    case, *_ = prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings, **nothing)
-    return case
+    return prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings).data[0]
 
 
 @eqx.filter_jit
@@ -116,7 +118,7 @@ def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
 
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
-    monkeypatch.setattr(profile, "_WELL_KNOWN", 0.0)
+    monkeypatch.setattr(vehicle, "at_lowest", functools.partial(at_lowest, rules=Profile(well_known=0.0)))
     with compiled_programs() as programs:
         found = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))
     np.testing.assert_allclose([each.sample_time for each in found.sample_times], [0.004, 0.008, 0.016, 0.032])
@@ -168,40 +170,34 @@ def test_the_noise_of_an_accelerometer_is_at_least_its_count_and_half_of_its_sec
 
 def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
-    case = case_of(flown(), 2 * DT)
-    _, case, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
-    alone = fit_case(case)  # from the first search on
-    assert {*alone.held} == {*fit.held}
-    std = np.sqrt(np.diagonal(np.asarray(fit.estimate.covariance)))
-    free = std[: len(fit.problem.unknowns.names)] > 0
-    off = np.abs(alone.estimate.parameters - fit.estimate.parameters)[: free.size][free] / std[: free.size][free]
-    assert off.max() < 0.1
-    assert set(answer.constants) == {"Ix", "Iy", "Iz"}
-    place = fit.problem.model.parameter_names.index("thrust_gain")
-    unknown = np.asarray(fit.estimate.covariance).copy()
+    data = data_of(flown(), 2 * DT)
+    (optimum,) = search_sample_times([data], SOLVER)
+    answer = corrected(optimum, data.flight, data.recording)
+    assert set(sample_time_of(answer).constants) == {"Ix", "Iy", "Iz"}
+    place = answer.problem.model.parameter_names.index("thrust_gain")
+    unknown = np.asarray(answer.estimate.covariance).copy()
     unknown[place, place] = 0.45**2
-    held = {"thrust_gain": HeldParameter(float(fit.estimate.parameters[place]), "1", "not identifiable")}
-    weak = fit._replace(estimate=eqx.tree_at(lambda e: e.covariance, fit.estimate, jnp.asarray(unknown)), held=held)
+    fixed = {"thrust_gain": FixedParameter(float(answer.estimate.parameters[place]), "1", "not identifiable")}
+    estimate = eqx.tree_at(lambda e: e.covariance, answer.estimate, jnp.asarray(unknown))
+    weak = answer._replace(estimate=estimate, fixed=fixed)
     for name, row in vehicle_constants(weak).constants.items():
-        assert row.estimate == pytest.approx(vehicle_constants(fit).constants[name].estimate)
+        assert row.estimate == pytest.approx(vehicle_constants(answer).constants[name].estimate)
         assert row.std > 0.4 * row.estimate
-    assert not answer_of(case, weak).constants
+    assert not sample_time_of(weak).constants
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
-    unclear = fit._replace(held=dict.fromkeys(fit.problem.unknowns.names, held["thrust_gain"]))
-    assert not answer_of(case, unclear).constants
+    unclear = answer._replace(fixed=dict.fromkeys(answer.problem.unknowns.names, fixed["thrust_gain"]))
+    assert not sample_time_of(unclear).constants
 
 
 def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeypatch):
-    cases = [case_of(flown(), DT * length) for length in (2, 4)]
-
-    def nowhere(case, found):
-        return case._replace(problem=case.problem.starting_from(jnp.full_like(found.parameters, 1e9)))
-
-    monkeypatch.setattr(sample_time, "_starting_from", nowhere)
-    place, _, fit, answers = fit_at_sample_times(cases, progress=lambda stage: None)
-    assert [set(answer.constants) for answer in answers] == [{"Ix", "Iy", "Iz"}] * 2
-    assert place == 0
-    assert fit.rollouts > fit_case(cases[0]).rollouts  # both searches count
+    several = [data_of(flown(), DT * length) for length in (2, 4)]
+    monkeypatch.setattr(sample_time, "start_of", lambda likelihood, found: np.full(found.parameters.size, 1e9))
+    optima = search_sample_times(several, SOLVER)
+    answers = [corrected(x, data.flight, data.recording) for x, data in zip(optima, several, strict=True)]
+    rows = [sample_time_of(answer) for answer in answers]
+    assert [set(row.constants) for row in rows] == [{"Ix", "Iy", "Iz"}] * 2
+    assert shortest(rows) == 0
+    assert optima[0].rollouts > search(SOLVER, several[0].likelihood).rollouts  # both searches count
 
 
 # The likelihood.
@@ -319,10 +315,10 @@ def test_shifted_clocks_give_the_same_inertias():
     flight, found = flown(), {}
     for shift in (-5, 0, 5):
         rows = np.clip(np.arange(SAMPLES) - shift, 0, SAMPLES - 1)
-        case = case_of(dataclasses.replace(flight, omega=np.asarray(flight.omega)[rows]), DT)
-        answer = case.estimator(case.problem)
+        data = data_of(dataclasses.replace(flight, omega=np.asarray(flight.omega)[rows]), DT)
+        answer = SOLVER(data.likelihood)
         values = zip(answer.parameters.tolist(), answer.std.tolist(), strict=True)
-        found[shift] = dict(zip(case.shooting.model.parameter_names, values, strict=False))
+        found[shift] = dict(zip(data.flight.model.parameter_names, values, strict=False))
     for shift in (-5, 5):
         for name in ("alpha3", "alpha6"):
             (value, std), (own, _) = found[shift][name], found[0][name]

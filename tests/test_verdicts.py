@@ -12,14 +12,13 @@ import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
-from jaxos4.identification.answers import vehicle_constants
-from jaxos4.identification.consequences import consequences
+from jaxos4.identification.answers import Solution, vehicle_constants
+from jaxos4.identification.checks import consequences
 from jaxos4.identification.doubts import doubts_of, doubts_of_log, few_parts
-from jaxos4.identification.fit import fit_case
 from jaxos4.identification.identify import describe
-from jaxos4.identification.judge import judge
-from jaxos4.identification.prepare import VehicleSettings
 from jaxos4.identification.results import Constant, ParameterEstimate
+from jaxos4.identification.search import search
+from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, headline, outcome, verdict_of
 from jaxos4.models.os4 import CorrectedOS4
@@ -92,26 +91,29 @@ def test_the_result_is_that_of_what_was_asked():
 def fitted():
     """A flight of the OS4 in gusts as `simulate --closed-loop` flies it by default, with longer samples."""
     flight = flown(OS4, duration=20.0, seed=5, gust=5.0, name="os4.csv")
-    given = dict.fromkeys(("estimator", "bracket", "network", "validate"))
-    (case, *_) = prepare_vehicle([flight], OS4, VehicleSettings(sample_time=0.032), **given)
-    return case, fit_case(case)
+    settings = jaxos4.VehicleSettings(sample_time=0.032)
+    case = prepare_vehicle([flight], OS4, settings)
+    data = case.data[0]
+    optimum = search(jaxos4.FilterError(tolerance=1e-3), data.likelihood)
+    return case, Solution(data, corrected(optimum, data.flight, data.recording))
 
 
 def test_a_parameter_at_another_value_moves_the_others(fitted):
     """The cost rises by as much as the parameter says. The thrust is the scale of the inertias."""
-    _, fit = fitted
-    names, values = fit.problem.unknowns.names, np.asarray(fit.estimate.parameters)
+    answer = fitted[1].answer
+    names, values = answer.problem.unknowns.names, np.asarray(answer.estimate.parameters)
     constants = {"Iy": Constant(1 / values[5], 1e-4, "kg m^2")}
-    quantities = {"motors": ["rotor_delay"], "thrust": ["thrust_gain"]}
 
     def moves(name, deviations):
         place = names.index(name)
-        return consequences(fit, constants, quantities, name, values[place] + deviations * fit.bound[place])
+        value = values[place] + deviations * answer.bound[place]
+        return consequences(answer, answer.optimum, constants, name, value)
 
     gain = names.index("thrust_gain")
     thrust = moves("thrust_gain", 3.0)
-    assert set(thrust) == {"Iy", "motors"}
-    assert thrust["Iy"].share == pytest.approx(3 * fit.bound[gain] / values[gain], rel=0.1)
+    assert {"Iy", "motors"} <= set(thrust)
+    assert "thrust" not in thrust
+    assert thrust["Iy"].share == pytest.approx(3 * answer.bound[gain] / values[gain], rel=0.1)
     assert thrust["Iy"].deviations == pytest.approx(thrust["Iy"].share / values[5] / 1e-4)
     near, far = (moves("pitch_damping", x)["Iy"].share for x in (0.0, 3.0))
     assert near < 0.005 < 0.03 < far
@@ -174,8 +176,8 @@ def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
 
 
 def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
-    case, fit = fitted
-    vehicle = describe(case, fit, judge(case, fit, progress=lambda stage: None), (), 0.0)
+    case, solution = fitted
+    vehicle = describe(case, solution, case.check(solution, lambda stage: None))
     assert vehicle.successful
     for name, truth in zip(("Ix", "Iy"), np.asarray(OS4.inertia).tolist(), strict=False):
         row = vehicle.rigid_body.constants[name]
@@ -184,7 +186,7 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
         assert "if arms and mass are right" in vehicle.verdicts[name].value
         assert abs(row.estimate - truth) < 3 * row.std
     assert vehicle.verdicts["Iz"].status == MISSING
-    known = vehicle_constants(fit._replace(held={})).constants["Iz"]
+    known = vehicle_constants(solution.answer._replace(fixed={})).constants["Iz"]
     assert known.note == "if mass and the drag coefficient 7.5e-07 are right"
     assert "fly more yaw" in vehicle.verdicts["Iz"].reasons[0]
     assert "s ahead" in vehicle.verdicts["predictions"].value

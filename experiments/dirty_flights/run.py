@@ -22,7 +22,8 @@ import typer
 import jaxos4
 from experiments.monte_carlo import Row, continued, fill, print_table, write_report
 from jaxos4.estimators import make_estimator
-from jaxos4.identification.fit import fit_innovations
+from jaxos4.identification.search import search
+from jaxos4.identification.uncertainty import corrected
 from jaxos4.logs.sampling import averages
 from jaxos4.models.flight_model import DEFAULT_TERMS
 from jaxos4.results import NINETY_FIVE
@@ -132,7 +133,7 @@ def recorded(omega: np.ndarray, seen: np.ndarray) -> jaxos4.Flight:
 
 
 def identify(airframe: jaxos4.Airframe, estimator: str, settings: Row, flight: int) -> Row:
-    """One flight: its true parameters, their estimates, and why others are held."""
+    """One flight: its true parameters, their estimates, and why others are fixed."""
     rng = np.random.default_rng([settings["seed"], flight])
     model = jaxos4.FlightModel(airframe, terms=TERMS)
     truth = truth_of(model, rng)
@@ -142,19 +143,19 @@ def identify(airframe: jaxos4.Airframe, estimator: str, settings: Row, flight: i
     sigma = np.append(3 * jaxos4.SENSOR_SIGMA, np.full(3, 0.3))
     problem = jaxos4.ShootingProblem(model, measured, sigma=sigma, channels="rates", method="rk4")
     begin = time.perf_counter()
-    one_recording = np.zeros(measured.time.shape[0], dtype=int)
-    fit = fit_innovations(make_estimator(estimator), jaxos4.InnovationsProblem(problem), one_recording)
-    seconds, values = time.perf_counter() - begin, np.asarray(fit.estimate.parameters)
-    half_width = np.asarray(fit.estimate.half_width(0.95))
-    free = {model.parameter_names[i]: i for i in fit.free}
+    optimum = search(make_estimator(estimator), jaxos4.InnovationsProblem(problem))
+    answer = corrected(optimum, problem, np.zeros(measured.time.shape[0], dtype=int))
+    seconds, values = time.perf_counter() - begin, np.asarray(answer.estimate.parameters)
+    half_width = np.asarray(answer.estimate.half_width(0.95))
+    free = {model.parameter_names[i]: i for i in answer.free}
     return {
         "fastest": float(np.abs(exact[:, :3]).max()),
-        "result": str(jaxos4.result_names(fit.estimate.result)),
+        "result": str(jaxos4.result_names(answer.estimate.result)),
         "truth": dict(zip(model.parameter_names, truth.tolist(), strict=True)),
         "estimate": {name: float(values[i]) for name, i in free.items()},
         "half_width": {name: float(half_width[i]) for name, i in free.items()},
-        "bound": {name: float(fit.bound[i]) for name, i in free.items()},
-        "held": {name: held.note for name, held in fit.held.items()},
+        "bound": {name: float(answer.bound[i]) for name, i in free.items()},
+        "held": {name: fixed.note for name, fixed in answer.fixed.items()},
         "seconds": seconds,
     }
 

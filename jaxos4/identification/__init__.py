@@ -1,6 +1,10 @@
-"""From recorded flights to an identification: prepare, fit, judge, describe."""
+"""From recorded flights to an identification: data, likelihood, search, estimate, checks."""
 
 from .assess import FlightInformation as FlightInformation, assess as assess
 from .identify import identify as identify
-from .prepare import FlightSettings as FlightSettings, VehicleSettings as VehicleSettings, settings_for as settings_for
 from .results import Identification as Identification
+from .settings import (
+    FlightSettings as FlightSettings,
+    VehicleSettings as VehicleSettings,
+    settings_for as settings_for,
+)

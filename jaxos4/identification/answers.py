@@ -1,68 +1,149 @@
-"""Parameters and moments of inertia with their intervals, and how well the model explains each channel."""
+"""`Answer`: an estimate with intervals; its parameters, moments of inertia, and residuals of channels as tables."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import equinox as eqx
-import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from .._custom_types import Parameters
 from ..analysis.diagnostics import Diagnostics
-from ..analysis.identifiability import identifiability
+from ..analysis.evaluation import Evaluation
 from ..analysis.inertia import fit_inertia
-from ..bracket import GAUSSIAN_PRIOR, is_identifiable
+from ..bracket import is_identifiable
 from ..estimate import Estimate
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.abstract import PARAMETER_NAMES
 from ..models.os4 import CorrectedOS4
 from ..models.state import CASCADE_ORDER
 from ..shooting import ShootingProblem
-from .fit import NEGATIVE_NOTE, Fit
-from .prepare import Case
-from .results import ChannelFit, Constant, ParameterEstimate, RigidBody, finite_or_none
+from .data import Data
+from .results import (
+    ChannelFit,
+    Constant,
+    Disturbance,
+    FixedParameter,
+    ParameterEstimate,
+    RigidBody,
+    SampleTime,
+    finite_or_none,
+    has_answer,
+)
+from .search import Optimum
 
 UNIT = "kg m^2"
 # The place of the alpha that is torque over this moment of inertia.
 INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
 AXES = {"p": "roll", "q": "pitch", "r": "yaw"}
-# The scale of an accelerometer, with what forward flight adds to the lift of rotors, is known to 1 %.
-_SCALE = 0.01
-# The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
-_UNKNOWN = 1e3
-# A factor of an interval from this one on is noted: it is printed with one decimal.
-_NOTED = 1.05
-# A channel with fewer measurements has no diagnostics.
-_FEWEST_SAMPLES = 2
+NEGATIVE_NOTE = "came out negative, which is impossible; at the limit"
 
 
-def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
+class Tables(NamedTuple):
+    """How answers are tabulated.
+
+    - `scale`: an accelerometer, with what forward flight adds to the lift of rotors, has a scale known to this share.
+    - `unknown`: the standard deviation of an alpha that was not estimated, in half-widths: as good as unknown.
+    - `noted`: a factor of an interval from this one on is noted: it is printed with one decimal.
+    """
+
+    scale: float = 0.01
+    unknown: float = 1e3
+    noted: float = 1.05
+
+
+TABLES = Tables()
+
+
+class Answer(NamedTuple):
+    """An estimate of the parameters, with the noise that belongs to them and with what corrected its intervals.
+
+    - `problem`: the flight and its model, with the noise levels of the sensors that were found.
+    - `estimate`: its covariance is that of the intervals.
+    - `bound`: standard deviations of the parameters if the model were right: the Cramer-Rao bound.
+    - `rollouts`: of all searches together.
+
+    Only of a flight of an OS4:
+
+    - `evaluation`: the flight simulated at the estimate; `None` without an answer.
+
+    Only of a vehicle:
+
+    - `optimum`: where the search ended.
+    - `fixed`: the parameters that are not estimated.
+    - `disturbances`: by channel.
+    - `widened`, `profiled`: by which factor the jackknife and the profile made an interval longer, by parameter.
+    """
+
+    problem: ShootingProblem
+    estimate: Estimate
+    bound: Float[np.ndarray, " parameters"]
+    rollouts: int
+    evaluation: Evaluation | None = None
+    optimum: Optimum | None = None
+    fixed: dict[str, FixedParameter] = {}
+    disturbances: dict[str, Disturbance] = {}
+    widened: dict[str, float] = {}
+    profiled: dict[str, float] = {}
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is an estimate at all."""
+        return has_answer(self.estimate)
+
+    @property
+    def negative(self) -> dict[str, tuple[float, float]]:
+        """Value and standard deviation of the parameters that came out negative, and so are 0."""
+        return {} if self.optimum is None else self.optimum.negative
+
+    @property
+    def restarts(self) -> int:
+        """How often the search of a vehicle began again where the cost is lower."""
+        return 0 if self.optimum is None else self.optimum.restarts
+
+    @property
+    def free(self) -> list[int]:
+        """The places of the parameters that are estimated."""
+        return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.fixed]
+
+
+class Solution(NamedTuple):
+    """What was fitted, and the answer.
+
+    - `data`: of a vehicle, at the chosen sample time.
+    - `sample_times`: the answers at all sample times that belong together; empty for an OS4.
+    """
+
+    data: Data
+    answer: Answer
+    sample_times: tuple[SampleTime, ...] = ()
+
+
+def parameter_table(answer: Answer, prior: float, reasons: Mapping[str, str] = {}) -> dict[str, ParameterEstimate]:
     """Estimates by parameter name, without those that are fixed.
 
     The rule of `jaxos4.bracket.is_identifiable` decides which have an estimate. The others have a note instead.
+
+    **Arguments:** `prior`: how the estimator uses the bracket. `reasons`: why a parameter is not identifiable, by name.
     """
-    estimate, unknowns = fit.estimate, fit.problem.unknowns
+    estimate, unknowns = answer.estimate, answer.problem.unknowns
     std, width = map(np.asarray, _intervals(estimate))
-    values, half_width, free = np.asarray(estimate.parameters), np.asarray(unknowns.half_width), fit.free
-    prior = GAUSSIAN_PRIOR if case.is_vehicle else case.estimator.prior
+    values, half_width = np.asarray(estimate.parameters), np.asarray(unknowns.half_width)
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
-    reasons = dict.fromkeys(unknowns.names, "not identifiable from this flight")
-    least = [0.0 if name in fit.negative else -np.inf for name in unknowns.names]
-    limits = dict.fromkeys(unknowns.names, msgspec.UNSET if case.is_vehicle else None)
-    if fit.evaluation is not None:
-        information = identifiability(fit.evaluation, unknowns.bracket)
-        notes, known = information.notes(unknowns.names), information.identifiable & information.excited
-        reasons |= {name: notes[name] for i, name in enumerate(unknowns.names) if not known[i] and name in notes}
-        limits = {name: finite_or_none(x) for name, x in zip(unknowns.names, information.noise_limit, strict=True)}
-    return {
-        (name := unknowns.names[i]): ParameterEstimate(
-            estimate=float(values[i]) if identifiable[i] else None,
+
+    def row(i: int, name: str) -> ParameterEstimate:
+        value, half, known = float(values[i]), float(width[i]), bool(identifiable[i])
+        least = 0.0 if name in answer.negative else -np.inf
+        return ParameterEstimate(
+            estimate=value if known else None,
             std=finite_or_none(std[i]),
-            bound=finite_or_none(fit.bound[i]),
-            ci95=(max(float(values[i] - width[i]), least[i]), float(values[i] + width[i])) if identifiable[i] else None,
+            bound=finite_or_none(answer.bound[i]),
+            ci95=(max(value - half, least), value + half) if known else None,
             unit=unknowns.units[i],
-            note=_note(fit, i, float(width[i])) if identifiable[i] else reasons[name],
-            noise_limit=limits[name],
+            note=_note(answer, i, half) if known else reasons.get(name, "not identifiable from this flight"),
         )
-        for i in free
-    }
+
+    return {unknowns.names[i]: row(i, unknowns.names[i]) for i in answer.free}
 
 
 @eqx.filter_jit  # one compiled program instead of one for each operation
@@ -70,34 +151,34 @@ def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
     return estimate.std, estimate.half_width(0.95)
 
 
-def _note(fit: Fit, i: int, half_width: float) -> str:
-    value, seed = float(np.asarray(fit.estimate.parameters)[i]), fit.estimate.seed
-    bracket = fit.problem.unknowns.bracket
-    if fit.problem.unknowns.names[i] in fit.negative:
+def _note(answer: Answer, i: int, half_width: float) -> str:
+    value, seed = float(np.asarray(answer.estimate.parameters)[i]), answer.estimate.seed
+    bracket, name = answer.problem.unknowns.bracket, answer.problem.unknowns.names[i]
+    if name in answer.negative:
         return NEGATIVE_NOTE
     notes = ["below noise"] if abs(value) < half_width else []
     if not np.asarray(bracket.lower)[i] <= value <= np.asarray(bracket.upper)[i]:
         notes.append("outside its bracket")
     if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
         notes.append("outside the network's interval")
-    factor = fit.profiled.get(fit.problem.unknowns.names[i], 1.0)
-    if factor >= _NOTED:
+    factor = answer.profiled.get(name, 1.0)
+    if factor >= TABLES.noted:
         notes.append(f"interval {factor:.1f} times as long, by the profile of the likelihood")
     return "; ".join(notes)
 
 
-def overwhelmed(fit: Fit) -> dict[str, str]:
+def overwhelmed(answer: Answer) -> dict[str, str]:
     """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
 
     Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then doubted for that reason.
     """
-    omega, mixer = np.asarray(fit.problem.flight.omega, dtype=float), np.asarray(fit.problem.model.airframe.mixer)
-    torques, names = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0), fit.problem.model.parameter_names
-    alpha, weak = np.abs(np.asarray(fit.estimate.parameters)), {}
-    strengths = {rate: row.strength for rate, row in fit.disturbances.items()}
+    omega, mixer = np.asarray(answer.problem.flight.omega, dtype=float), np.asarray(answer.problem.model.airframe.mixer)
+    torques, names = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0), answer.problem.model.parameter_names
+    alpha, weak = np.abs(np.asarray(answer.estimate.parameters)), {}
+    strengths = {rate: row.strength for rate, row in answer.disturbances.items()}
     for (rate, axis), place, torque in zip(AXES.items(), INVERSE.values(), torques, strict=True):
         control = alpha[place] * torque
-        if names[place] in fit.held:
+        if names[place] in answer.fixed:
             weak |= {axis: "the flights say less about alpha8 than its bracket"} if axis == "yaw" else {}
         elif strengths.get(rate, 0.0) > control:
             weak[axis] = (
@@ -107,9 +188,9 @@ def overwhelmed(fit: Fit) -> dict[str, str]:
     return weak
 
 
-def rigid_body(fit: Fit) -> RigidBody:
+def rigid_body(answer: Answer) -> RigidBody:
     """The moments of inertia of an OS4 that explain the estimate best; none if they are not identifiable."""
-    model, estimate = fit.problem.model, fit.estimate
+    model, estimate = answer.problem.model, answer.estimate
     rigid = fit_inertia(model, estimate.parameters, estimate.covariance)
     values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
     if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
@@ -119,10 +200,10 @@ def rigid_body(fit: Fit) -> RigidBody:
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
 
-def vehicle_constants(fit: Fit) -> RigidBody:
+def vehicle_constants(answer: Answer) -> RigidBody:
     """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated."""
-    model, free, values = fit.problem.model, fit.free, np.asarray(fit.estimate.parameters)
-    known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), fit.problem.unknowns
+    model, free, values = answer.problem.model, answer.free, np.asarray(answer.estimate.parameters)
+    known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), answer.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
     gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
     for gain in gains:
@@ -131,10 +212,10 @@ def vehicle_constants(fit: Fit) -> RigidBody:
             alpha[row] /= values[gain]
             slopes[row, row], slopes[row, gain] = 1 / values[gain], -alpha[row] / values[gain]
     slopes[~known] = 0.0
-    unknown = np.where(known, 0.0, (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
-    covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(unknown)
+    unknown = np.where(known, 0.0, (TABLES.unknown * np.asarray(bracket.half_width)[:8]) ** 2)
+    covariance = slopes @ np.asarray(answer.estimate.covariance) @ slopes.T + np.diag(unknown)
     # What no likelihood sees makes all moments of inertia wrong by one factor.
-    scale = _SCALE * bool(gains)
+    scale = TABLES.scale * bool(gains)
     shared = scale * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
     covariance += shared[:, None] * shared
     constants, thrust = {}, "mass" if gains else "thrust_coefficient"
@@ -168,5 +249,5 @@ def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str
             input_p=float(diagnostics.input_p[i]),
         )
         for i, column in enumerate(CASCADE_ORDER[: problem.size])
-        if diagnostics.count[i] > _FEWEST_SAMPLES
+        if diagnostics.count[i] > 2
     }

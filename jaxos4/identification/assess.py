@@ -12,9 +12,9 @@ from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
-from .fit import fit_flight
+from .os4 import fit_flight
 from .problem import Intervals, bracket_of, flight_problem
-from .results import finite_or_none, has_answer
+from .results import finite_or_none
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):
@@ -82,13 +82,13 @@ def assess(
     where = bracket_of(bracket, model)
     settings = {"channels": channels, "initial_state": initial_state, "window": window}
     problem = flight_problem(recording, model, where, **settings)
-    fit = fit_flight(IBSS(), problem, progress=progress)
-    known = identifiability(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
+    answer = fit_flight(IBSS(), problem, progress=progress)
+    known = identifiability(answer.evaluation or evaluate(answer.problem, answer.estimate.parameters), where)
     notes = known.notes(model.parameter_names)
     return FlightInformation(
         flight=recording.name,
-        fitted=has_answer(fit.estimate),
-        sigma=dict(zip(STATE_NAMES, fit.problem.sigma.tolist(), strict=True)),
+        fitted=answer.answered,
+        sigma=dict(zip(STATE_NAMES, answer.problem.sigma.tolist(), strict=True)),
         parameters={
             name: ParameterInformation(
                 bound=finite_or_none(known.std[i]),

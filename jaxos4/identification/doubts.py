@@ -1,14 +1,14 @@
 """Doubts about an estimate of a vehicle: each has a cause, a remedy, and the quantities that it would move."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ..airframe import Airframe
 from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import decisive_horizon
-from ..models.abstract import Parameter
-from ..models.flight_model import FlightModel
+from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.checks import Finding
 from .answers import AXES, INVERSE
@@ -16,23 +16,35 @@ from .results import Constant, Disturbance, ParameterEstimate, PredictionSkill, 
 from .sample_time import moved
 from .verdict import PREDICTIONS, TOLERANCE, Doubt, Move, Tolerance
 
-# All mass at the rotors would make the squared radius of gyration that of the rotors; a heavy centre, this share of it.
-_HEAVIEST, _LIGHTEST = 1.5, 0.01
-# Aerodynamic moments may look like a gyroscopic coupling of this size (alpha1, alpha4, alpha7).
-_COUPLING = 0.25
-# Innovations that correlate more than this bias filter error more than its intervals say. Longer samples [s] than the
-# second figure would hide the motion with the vibration.
-_VIBRATION, _LONGEST_SAMPLE = 0.4, 0.008
-# Value and standard deviation of each parameter that has an estimate.
 Found = dict[str, tuple[float, float]]
-# Standard errors below 0 of a skill at the shortest horizon from which on the inertia is not identified.
-_HOPELESS = 2.0
-_LONGEST_DELAY = 0.04  # [s], of rotors; more is an error of clocks
-
-
+"""Value and standard deviation of each parameter that has an estimate."""
 Moves = dict[str, Move | None]
 Consequences = Callable[[str, float], Mapping[str, Move | None]]
 """How far quantities move if a parameter has another value; see `consequences`."""
+
+
+class Plausible(NamedTuple):
+    """What a vehicle can be.
+
+    - `heaviest`, `lightest`: the squared radius of gyration, as a share of that of all mass at the rotors; the second
+      is that of a heavy centre.
+    - `coupling`: aerodynamic moments may look like a gyroscopic coupling (alpha1, alpha4, alpha7) of this size.
+    - `vibration`: innovations that correlate more bias filter error more than its intervals say.
+    - `longest_sample`: longer ones [s] would hide the motion with the vibration.
+    - `hopeless`: standard errors below 0 of a skill at the shortest horizon from which on an inertia is not identified.
+    - `longest_delay`: of rotors [s]; more is an error of clocks.
+    """
+
+    heaviest: float = 1.5
+    lightest: float = 0.01
+    coupling: float = 0.25
+    vibration: float = 0.4
+    longest_sample: float = 0.008
+    hopeless: float = 2.0
+    longest_delay: float = 0.04
+
+
+PLAUSIBLE = Plausible()
 _ALL: Moves = dict.fromkeys(INVERSE)
 _TORQUES: Moves = dict.fromkeys((*INVERSE, "thrust"))
 
@@ -59,7 +71,7 @@ def few_parts(seconds: float, tolerance: Tolerance = TOLERANCE) -> Iterator[Doub
 
 
 def doubts_of(
-    model: FlightModel,
+    model: AbstractModel,
     parameters: dict[str, ParameterEstimate],
     constants: dict[str, Constant],
     skill: PredictionSkill | None,
@@ -93,7 +105,7 @@ def doubts_of(
 
 
 def contradicted(
-    model: FlightModel, found: Found, follow: Consequences = lambda name, value: {}
+    model: AbstractModel, found: Found, follow: Consequences = lambda name, value: {}
 ) -> Iterator[tuple[Parameter, Doubt]]:
     """The parameters whose values physics or the airframe forbid.
 
@@ -115,7 +127,7 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
     reach = np.square(np.asarray(airframe.rotor_positions)).sum(axis=1).max()
     limit = float(airframe.mass) * reach
     for name, row in constants.items():
-        largest, least = _HEAVIEST * limit * (2 if name == "Iz" else 1), _LIGHTEST * limit
+        largest, least = PLAUSIBLE.heaviest * limit * (2 if name == "Iz" else 1), PLAUSIBLE.lightest * limit
         beyond = row.estimate - TOLERANCE.sure * row.std > largest
         if beyond or row.estimate + TOLERANCE.sure * row.std < least:
             limit_passed = f"more than the {largest:.2g}" if beyond else f"less than the {least:.2g}"
@@ -150,11 +162,11 @@ def vibration(
     **Arguments:** `sample_time`: of the fitted data [s]. `moves`: of the moments of inertia to another sample time.
     """
     longer = f"average to longer samples by `sample_time` {2 * sample_time:g}, or " * (
-        2 * sample_time <= _LONGEST_SAMPLE
+        2 * sample_time <= PLAUSIBLE.longest_sample
     )
     for rate, inertia in zip(AXES, INVERSE, strict=True):
         row = disturbances.get(rate)
-        if row is not None and abs(row.correlation) > _VIBRATION:
+        if row is not None and abs(row.correlation) > PLAUSIBLE.vibration:
             yield _implausible(
                 f"the noise of {rate} is not white (innovations correlate by {row.correlation:.2g}): the gyro vibrates",
                 f"{longer}damp the vibration, or log faster",
@@ -221,7 +233,7 @@ def _turns(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator
         if f"alpha{i + 1}" in found:
             alpha[i] = found[f"alpha{i + 1}"][0]
             variance[i] = stds[f"alpha{i + 1}"] ** 2
-    variance[[0, 3, 6]] += _COUPLING**2
+    variance[[0, 3, 6]] += PLAUSIBLE.coupling**2
     variance[[1, 4]] = np.inf  # they need the inertia of the rotors too
     p_value, without_yaw = (_p_value(model, alpha, variance, unknown) for unknown in ([], [7]))
     if p_value < TOLERANCE.consistent:
@@ -250,12 +262,12 @@ def _unseen(found: Found, log_step: float, follow: Consequences) -> Iterator[Dou
             {**follow("rotor_lag", log_step), "motors": None},
         )
     delay, error = found.get("rotor_delay", (0.0, 0.0))
-    if abs(delay) - TOLERANCE.sure * error > _LONGEST_DELAY:
+    if abs(delay) - TOLERANCE.sure * error > PLAUSIBLE.longest_delay:
         how = "late" if delay < 0 else "early"
         yield _implausible(
             f"rotor_delay = {delay:.2g} s: motors are recorded {1e3 * abs(delay):.0f} ms {how}, more than any rotor",
             "check the time stamps of motors and gyro",
-            {**follow("rotor_delay", float(np.copysign(_LONGEST_DELAY, delay))), "motors": None},
+            {**follow("rotor_delay", float(np.copysign(PLAUSIBLE.longest_delay, delay))), "motors": None},
         )
 
 
@@ -276,7 +288,9 @@ def _skill(skill: PredictionSkill | None, still: Sequence[str]) -> Iterator[Doub
     # Far ahead, what nobody can foresee is larger than what the rotors do. That says nothing of the inertia.
     first = {rate: (getattr(skill, rate).skill[0], getattr(skill, rate).std[0] or 0.0) for rate in poor}
     near = [rate for rate, (value, _) in first.items() if value is None or value <= 0]
-    hopeless = [rate for rate, (value, std) in first.items() if value is not None and value + _HOPELESS * std < 0]
+    hopeless = [
+        rate for rate, (value, std) in first.items() if value is not None and value + PLAUSIBLE.hopeless * std < 0
+    ]
     if poor:
         moves: Moves = dict.fromkeys([PREDICTIONS])
         moves |= {inertia: None for inertia, rate in zip(INVERSE, AXES, strict=True) if rate in hopeless}

@@ -1,9 +1,15 @@
-"""`jaxos4.identify`: from recorded flights to parameters with intervals."""
+"""`jaxos4.identify`: from recorded flights to parameters with intervals.
+
+- recordings -> `Data`, with a likelihood: `prepare_flight` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
+  case, which knows the other steps.
+- `Data` -> `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
+- `Answer` -> `Checked`: `case.check`, by checks.py with doubts.py, quantities.py and verdict.py.
+- `Checked` -> `Identification`: `describe`.
+"""
 
 import os
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,15 +21,14 @@ from ..flight import CHANNEL_NAMES
 from ..logs import Source, as_recording, as_recordings
 from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
-from .answers import channel_fits
-from .fit import Fit, fit_case
-from .judge import judge
-from .prepare import Case, FlightSettings, VehicleSettings, own_settings, prepare_flight
+from .answers import Solution
+from .checks import Checked
+from .data import silent
+from .os4 import FlightCase, prepare_flight
 from .problem import Intervals
-from .profile import with_profile
-from .results import Identification, SampleTime, finite_or_none
-from .sample_time import answer_of, fit_at_sample_times
-from .vehicle import DEFAULT, prepare_vehicle, with_estimator
+from .results import Identification, finite_or_none
+from .settings import FlightSettings, VehicleSettings, own_settings
+from .vehicle import VehicleCase, prepare_vehicle
 
 
 def identify(
@@ -36,7 +41,7 @@ def identify(
     network: TrainedNetwork | str | os.PathLike[str] | None = None,
     validate: Source | None = None,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda stage: None,
+    progress: Callable[[str], None] = silent,
 ) -> Identification:
     """Identify an OS4 model from one flight, or a real vehicle from one or several recordings.
 
@@ -63,75 +68,55 @@ def identify(
 
     **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
     """
-    own = subject if isinstance(subject, Airframe) else getattr(subject, "airframe", None)
-    recordings = as_recordings(flights, airframe=own)
+    given = subject if isinstance(subject, Airframe) else getattr(subject, "airframe", None)
+    recordings = as_recordings(flights, airframe=given)
     if not recordings:
         raise InputError("`flights`: holds no flight; give one.")
-    other = None if validate is None else as_recording(validate, "validation flight", own)
+    other = None if validate is None else as_recording(validate, "validation flight", given)
     begin = time.perf_counter()
-    common = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other}
-    sample_times: tuple[SampleTime, ...] = ()
+    options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
     if isinstance(subject, Airframe):
-        wanted = own_settings(VehicleSettings, settings)
-        cases = prepare_vehicle(recordings, subject, wanted, **common)
-        choose, method = wanted.sample_time is None, estimator or DEFAULT
-        case, fit, sample_times = _fit_vehicle(cases, method, choose=choose, seed=seed, progress=progress)
+        case = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **options)
     else:
-        asked = own_settings(FlightSettings, settings)
-        case = prepare_flight(recordings, subject, asked, seed=seed, progress=progress, **common)
-        fit = fit_case(case, progress=progress)
-    judged = judge(case, fit, sample_times, progress=progress)
-    return describe(case, fit, judged, sample_times, time.perf_counter() - begin)
-
-
-def _fit_vehicle(
-    cases: Sequence[Case],
-    estimator: str | AbstractEstimator,
-    *,
-    choose: bool,
-    seed: int,
-    progress: Callable[[str], None],
-) -> tuple[Case, Fit, tuple[SampleTime, ...]]:
-    """The case at the chosen sample time and its fit. `FilterError` is fitted with several sample times."""
-    place, case, fit, sample_times = 0, cases[0], None, ()
-    is_default = isinstance(estimator, str) and estimator == DEFAULT
-    if is_default or len(cases) > 1:
-        place, case, fit, sample_times = fit_at_sample_times(cases, choose=choose, progress=progress)
-    if fit is None or not is_default:
-        case = with_estimator(case, estimator, seed=seed, progress=progress)
-        fit = fit_case(case, progress=progress)
-    before, fit = fit, with_profile(fit, case, progress=progress)
-    # The row of the chosen sample time shows the final answer.
-    answer = answer_of(case, fit)
-    if fit.searched is not before.searched:  # the other rows have the minimum that was left
-        return case, fit, (answer,)
-    return case, fit, (*sample_times[:place], answer, *sample_times[place + 1 :])
+        flight_settings = own_settings(FlightSettings, settings)
+        case = prepare_flight(recordings, subject, flight_settings, progress=progress, **options)
+    solution = case.solve(progress)
+    checked = case.check(solution, progress)
+    return describe(case, solution, checked, time.perf_counter() - begin)
 
 
 def describe(
-    case: Case, fit: Fit, judged: dict[str, Any], sample_times: tuple[SampleTime, ...], seconds: float
+    case: FlightCase | VehicleCase, solution: Solution, checked: Checked, seconds: float = 0.0
 ) -> Identification:
-    """Everything about an answer, in the fields that pages and files show. `judged`: see `judge`."""
-    free = fit.free
-    covariance, sigma = np.asarray(fit.estimate.covariance)[np.ix_(free, free)], np.asarray(fit.problem.sigma)
-    notes = [*case.provenance.notes, *judged.pop("notes", ())]
+    """Everything about an answer, in the fields that pages and files show. `seconds`: the time that it took [s]."""
+    (data, answer, sample_times), free = solution, solution.answer.free
+    covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
+    sigma = np.asarray(answer.problem.sigma)
     return Identification(
         estimator=case.name,
         model=case.model,
-        rollouts=fit.rollouts,
-        cost=finite_or_none(fit.estimate.cost),
+        result=checked.result,
+        rollouts=answer.rollouts,
+        cost=finite_or_none(answer.estimate.cost),
         seconds=seconds,
-        provenance=msgspec.structs.replace(case.provenance, notes=notes),
+        parameters=checked.parameters,
+        rigid_body=checked.rigid_body,
+        verdicts=checked.verdicts,
+        doubts=checked.doubts,
+        provenance=msgspec.structs.replace(data.provenance, notes=[*data.provenance.notes, *checked.notes]),
         covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
-        airframe=fit.problem.model.airframe,
-        estimate=fit.estimate,
-        problem=fit.problem,
+        airframe=answer.problem.model.airframe,
+        estimate=answer.estimate,
+        problem=answer.problem,
         is_vehicle=case.is_vehicle,
-        fit={} if fit.diagnostics is None else channel_fits(fit.problem, fit.diagnostics),
-        held=fit.held,
-        noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in fit.problem.columns},
-        disturbances=fit.disturbances,
-        widened=fit.widened,
+        fit=checked.fit,
+        validation=checked.validation,
+        held=answer.fixed,
+        noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in answer.problem.columns},
+        disturbances=answer.disturbances,
+        widened=answer.widened,
         sample_times=sample_times if len(sample_times) > 1 else (),
-        **judged,
+        skill=checked.skill,
+        predictions=checked.predictions,
+        response=checked.response,
     )

@@ -1,8 +1,7 @@
-"""From a recorded flight and a model to the problem that estimators solve, and networks that are trained for it."""
+"""From a recorded flight and a model to the problem that estimators solve."""
 
 import dataclasses
 import math
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +17,7 @@ from ..logs import Recording
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
+from ..networks.for_flight import seen_channels
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem, Unknowns
 
@@ -25,13 +25,6 @@ from ..shooting import ShootingProblem, Unknowns
 Intervals = Bracket | Mapping[str, Any] | None
 # The states that each choice of channels adds to the one before, in cascade order.
 _ADDED = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
-GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
-
-# Steps of training for a network that only gives a search its start.
-_SEED_STEPS = 2000
-# A vehicle's network sees so many windows of the flight, however long it is.
-_VEHICLE_WINDOWS, _VEHICLE_TRAINING = 24, NetworkEstimator(steps=250, batch=64, noise=(1.0, 1.0), held_out=2000)
-_FLYABLE = 0.5  # the share of a vehicle's bracket in which nearly all simulated flights can be flown
 
 
 def bracket_of(bracket: Intervals, model: AbstractModel) -> Bracket:
@@ -149,48 +142,6 @@ def train_network(
     """
     where = bracket_of(bracket, model)
     problem = flight_problem(recording, model, where, channels=channels, initial_state=initial_state)
-    settings = dataclasses.replace(settings, channels=channels or _seen_channels(problem))
+    settings = dataclasses.replace(settings, channels=channels or seen_channels(problem))
     with named(recording.name):
         return settings.fit(problem, where, key=jax.random.key(seed))
-
-
-def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
-    """Train a network for one flight, named `name`: briefly if shooting follows (`shoots`)."""
-    steps = _SEED_STEPS if shoots else NetworkEstimator.steps
-    settings = NetworkEstimator(channels=_seen_channels(problem), steps=steps)
-    with named(name):
-        return settings.fit(problem, bracket, key=jax.random.key(seed))
-
-
-def liveliest(problem: ShootingProblem) -> ShootingProblem:
-    """The part of a vehicle's flight that a network sees: the windows in a row with the largest rates."""
-    windows = min(_VEHICLE_WINDOWS, problem.windows)
-    samples = problem.flight.time.shape[0] // problem.windows
-    motion = np.nansum(np.square(problem.recorded()), axis=1).reshape(problem.windows, samples).sum(axis=1)
-    first = samples * int(np.convolve(motion, np.ones(windows), "valid").argmax())
-    part = slice(first, first + samples * windows)
-    flight = jax.tree.map(lambda leaf: leaf[part] if leaf.ndim else leaf, problem.flight)
-    return dataclasses.replace(problem, flight=flight, windows=windows)
-
-
-def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> TrainedNetwork:
-    """Train a network for a part of a vehicle's flight in windows, at the noise levels of the problem."""
-    unknowns = problem.unknowns
-    bracket = Bracket.around(unknowns.center, _FLYABLE * unknowns.half_width)
-    with named(name):
-        return _VEHICLE_TRAINING.fit(problem, bracket, key=jax.random.key(seed))
-
-
-def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:
-    """Where a network is from and how it was trained, for JSON."""
-    bracket = network.bracket
-    return {
-        "file": None if given is None or isinstance(given, TrainedNetwork) else os.fspath(given),
-        "settings": {f.name: getattr(network.settings, f.name) for f in dataclasses.fields(network.settings)},
-        "bracket": {"lower": bracket.lower.tolist(), "upper": bracket.upper.tolist()},
-    }
-
-
-def _seen_channels(problem: ShootingProblem) -> str:
-    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
-    return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"

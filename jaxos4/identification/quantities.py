@@ -4,12 +4,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..models.flight_model import FlightModel
 from ..recording.checks import Finding
 from ..results import NINETY_FIVE
-from .answers import AXES, INVERSE
-from .fit import PRIOR_NOTE, Fit
+from .answers import AXES, INVERSE, Answer
 from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
+from .uncertainty import PRIOR_NOTE
 from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Doubt, Quantity
 
 # Notes about a parameter that are reservations, and how they read there.
@@ -18,8 +17,7 @@ _BELOW_ONE = ("alpha1", "alpha4", "alpha7")
 
 
 def vehicle_quantities(
-    model: FlightModel,
-    fit: Fit,
+    answer: Answer,
     table: dict[str, ParameterEstimate],
     constants: dict[str, Constant],
     skill: PredictionSkill | None,
@@ -29,8 +27,8 @@ def vehicle_quantities(
 
     **Arguments:** `table` and `constants` of the answer, and the `skill` about all axes but those that stand `still`.
     """
-    own, found = fit.problem.unknowns, {}
-    shares = dict(zip(own.names, np.square(fit.bound / np.asarray(own.half_width)).tolist(), strict=True))
+    model, own, found = answer.problem.model, answer.problem.unknowns, {}
+    shares = dict(zip(own.names, np.square(answer.bound / np.asarray(own.half_width)).tolist(), strict=True))
     for (name, place), axis in zip(INVERSE.items(), AXES.values(), strict=True):
         row, alpha = constants.get(name), model.parameter_names[place]
         if row is None:
@@ -40,7 +38,7 @@ def vehicle_quantities(
                 _interval(row), NINETY_FIVE * row.std / row.estimate, "", _notes({alpha: table[alpha]}, shares)
             )
     for quantity, names in model.quantities.items():
-        unseen = [name for name in names if name in fit.held and fit.held[name].note == PRIOR_NOTE]
+        unseen = [name for name in names if name in answer.fixed and answer.fixed[name].note == PRIOR_NOTE]
         which = f"the flights say less about {', '.join(unseen)} than the bracket; fly with more motion"
         rows = {name: table[name] for name in names if name in table}
         reservations = ((which,) if unseen else ()) + _notes(rows, shares)

@@ -12,7 +12,7 @@ from ..estimate import Estimate
 from ..results import result_names
 from ..shooting import ShootingProblem
 from .tables import dataframe, dataset, series
-from .verdict import Doubt, Verdict
+from .verdict import TOLERANCE, Doubt, Verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -80,9 +80,6 @@ class RigidBody(msgspec.Struct, frozen=True):
         return msgspec.to_builtins(self.constants) | {k: v for k, v in tests.items() if v is not None}
 
 
-# Motors that act earlier than they are recorded by more than this are recorded late [s].
-_LATE = 0.005
-
 COLOURED = 0.3
 """Residuals are coloured if neighbours correlate by more than this: intervals then allow for it."""
 
@@ -109,7 +106,7 @@ class Validation(msgspec.Struct, frozen=True):
     fit: dict[str, ChannelFit] | None
 
 
-class HeldParameter(msgspec.Struct, frozen=True):
+class FixedParameter(msgspec.Struct, frozen=True):
     """A parameter that was not estimated: the value used for it, and why."""
 
     value: float
@@ -253,7 +250,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     is_vehicle: bool
     fit: dict[str, ChannelFit] = {}
     validation: Validation | None = None
-    held: dict[str, HeldParameter] = {}
+    held: dict[str, FixedParameter] = {}
     noise: dict[str, float] = {}
     disturbances: dict[str, Disturbance] = {}
     widened: dict[str, float] = {}
@@ -286,7 +283,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def motor_clock(self) -> str:
         """How late motors are recorded, if `rotor_delay` is clearly negative; else empty."""
         delay = self.parameters.get("rotor_delay")
-        if delay is None or delay.estimate is None or delay.estimate > -_LATE:
+        if delay is None or delay.estimate is None or delay.estimate > -TOLERANCE.late:
             return ""
         return f"motors are recorded {-1e3 * delay.estimate:.0f} ms late"
 
@@ -332,7 +329,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
         **Raises:** `InputError` if pandas is not installed.
         """
-        return dataframe(self)
+        return dataframe(self.rigid_body.constants, self.parameters, self.held)
 
     def to_dataset(self) -> "xr.Dataset":
         """Parameters, covariance, predictions and response as an xarray Dataset.
@@ -341,7 +338,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
         **Raises:** `InputError` if xarray is not installed.
         """
-        return dataset(self)
+        about = {"estimator": self.estimator, "model": self.model, "result": self.result}
+        parts, step = (self.parameters, self.covariance, self.predictions, self.response), self.provenance.sample_time
+        return dataset(*parts, sample_time=step, **about)
 
 
 APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", "predictions", "response"}

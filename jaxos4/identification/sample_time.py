@@ -10,110 +10,106 @@ the shortest without vibration. If all have it: the longest with an answer.
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import numpy as np
+from jaxtyping import Float
 
-from ..estimate import REACH, Estimate
+from ..estimate import REACH, AbstractEstimator, Estimate
 from ..results import result_names
-from ..shooting import InnovationsProblem, for_threads
-from .answers import AXES, overwhelmed, vehicle_constants
-from .fit import Fit, fit_case
-from .held_out import compile_ahead
-from .prepare import Case, Progress
-from .results import Constant, SampleTime, has_answer
-
-# The limit of a correlation of white innovations: the first number plus so many standard errors. The largest of 24
-# correlations (3 rates, 8 lags) is compared.
-WHITE, _CHANCE = 0.06, 3.0
-# Two answers agree within so many standard deviations and this share, which allows for errors of discretisation.
-AGREE, _DISCRETE = 2.0, 0.03
-# Intervals that are longer by this factor than those of samples twice as long agree with anything.
-_WIDER = 1.5
-# The share of the way to its limit at which an unknown counts as being there.
-_NEAR = 0.95
+from ..shooting import InnovationsProblem
+from .answers import AXES, Answer, overwhelmed, vehicle_constants
+from .data import Data, Progress, silent
+from .results import Constant, SampleTime
+from .search import Optimum, search
 
 
-def fit_at_sample_times(
-    cases: Sequence[Case], *, choose: bool = True, progress: Progress
-) -> tuple[int, Case, Fit, tuple[SampleTime, ...]]:
-    """The place of the case that the rule chooses, the case, its fit, and the answers of all.
+class SampleTimeRule(NamedTuple):
+    """When an answer does not depend on the sample time.
 
-    If not `choose`: the first place.
-
-    The search for all parameters starts at the answer of the sample time before, if that is a minimum. Meanwhile,
-    another thread completes the fit of the sample time before: it fixes what the flights do not show.
-
-    **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
+    - `white`, `chance`: the limit of a correlation of white innovations: the first, plus so many standard errors. The
+      largest of 24 correlations (3 rates, 8 lags) is compared.
+    - `agree`, `discrete`: two answers agree within so many standard deviations and this share, which allows for errors
+      of discretisation.
+    - `wider`: intervals that are longer by this factor than those of samples twice as long agree with anything.
+    - `near`: an unknown that is this share of the way to its limit, or further, is no start for another search.
     """
-    found, fits, beside = None, [], ThreadPoolExecutor(1)
-    try:
-        for case in reversed(cases):
-            progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            if not fits:
-                beside.submit(for_threads(compile_ahead), case)  # what fails here fails again when it is needed
-            begin = case if found is None else _starting_from(case, found)
-            found = jax.block_until_ready(begin.estimator(begin.problem))
-            if begin is not case and not has_answer(found):  # the answer for longer samples was no start
-                other = jax.block_until_ready(case.estimator(case.problem))
-                found = eqx.tree_at(lambda e: e.rollouts, other, found.rollouts + other.rollouts)
-            fits.append(beside.submit(for_threads(fit_case), case, first=found))
-        fits = [fit.result() for fit in fits][::-1]
-    finally:  # after an error, what has not begun is not computed
-        beside.shutdown(cancel_futures=True)
-    answers = tuple(map(answer_of, cases, fits))
-    place = shortest(answers) if choose else 0
-    return place, cases[place], fits[place], answers
+
+    white: float = 0.06
+    chance: float = 3.0
+    agree: float = 2.0
+    discrete: float = 0.03
+    wider: float = 1.5
+    near: float = 0.95
 
 
-def _starting_from(case: Case, found: Estimate) -> Case:
-    """The case, whose search starts at the estimate of all parameters for longer samples, if that is a minimum."""
-    if str(result_names(found.result)) != "successful" or not isinstance(case.problem, InnovationsProblem):
-        return case
-    own, start = case.problem.problem.unknowns, np.asarray(found.parameters)
+RULE = SampleTimeRule()
+
+
+def search_sample_times(
+    several: Sequence[Data[InnovationsProblem]], estimator: AbstractEstimator, *, progress: Progress = silent
+) -> list[Optimum]:
+    """The optimum at each sample time.
+
+    The search for all parameters starts at the answer of the sample time before, if that is a minimum.
+
+    **Arguments:** `several`: one flight at several sample times, each twice the one before.
+    """
+    optimum, optima = None, []
+    for data in reversed(several):
+        progress(f"fitting samples of {1e3 * float(data.flight.flight.dt):.3g} ms")
+        start = None if optimum is None else start_of(data.likelihood, optimum.first)
+        optimum = search(estimator, data.likelihood, start=start)
+        optima.insert(0, optimum)
+    return optima
+
+
+def start_of(
+    likelihood: InnovationsProblem, found: Estimate, rule: SampleTimeRule = RULE
+) -> Float[np.ndarray, " unknowns"] | None:
+    """The start of a search, by the estimate for longer samples; `None` if that is no minimum."""
+    own, start = likelihood.problem.unknowns, np.asarray(found.parameters)
     off = np.abs(start[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
-    if not (off < _NEAR * REACH).all():  # the answer may be another minimum
-        return case
-    return case._replace(problem=case.problem.starting_from(start))
+    # Near a limit, the answer may be another minimum.
+    is_minimum = str(result_names(found.result)) == "successful" and (off < rule.near * REACH).all()
+    return start if is_minimum else None
 
 
-def shortest(answers: Sequence[SampleTime]) -> int:
-    """The place of the sample time that the rule chooses. `answers`: the shortest sample time first."""
-    answered = [i for i, answer in enumerate(answers) if answer.constants] or [0]
-    limits = [WHITE + _CHANCE / math.sqrt(max(answer.samples, 1)) for answer in answers]
-    clean = [i for i in answered if abs(answers[i].correlation) <= limits[i]] or answered[-1:]
-    steady = (i for i in clean[:-1] if not moved(answers[i], answers[i + 1]) and not _vague(answers[i], answers[i + 1]))
+def shortest(rows: Sequence[SampleTime], rule: SampleTimeRule = RULE) -> int:
+    """The place of the sample time that the rule chooses. `rows`: the shortest sample time first."""
+    answered = [i for i, row in enumerate(rows) if row.constants] or [0]
+    limits = [rule.white + rule.chance / math.sqrt(max(row.samples, 1)) for row in rows]
+    clean = [i for i in answered if abs(rows[i].correlation) <= limits[i]] or answered[-1:]
+    steady = (i for i in clean[:-1] if not moved(rows[i], rows[i + 1], rule) and not _vague(rows[i], rows[i + 1], rule))
     return next(steady, clean[0])
 
 
-def _vague(answer: SampleTime, other: SampleTime) -> bool:
+def _vague(row: SampleTime, other: SampleTime, rule: SampleTimeRule) -> bool:
     """Whether another sample time knows Ix or Iy clearly better."""
-    both = [name for name in ("Ix", "Iy") if name in answer.constants and name in other.constants]
-    return any(answer.constants[name].std > _WIDER * other.constants[name].std for name in both)
+    both = [name for name in ("Ix", "Iy") if name in row.constants and name in other.constants]
+    return any(row.constants[name].std > rule.wider * other.constants[name].std for name in both)
 
 
-def moved(answer: SampleTime, other: SampleTime) -> list[str]:
+def moved(row: SampleTime, other: SampleTime, rule: SampleTimeRule = RULE) -> list[str]:
     """The moments of inertia that another sample time contradicts."""
 
     def differs(one: Constant, two: Constant) -> bool:
-        return abs(one.estimate - two.estimate) > AGREE * max(one.std, two.std) + _DISCRETE * one.estimate
+        return abs(one.estimate - two.estimate) > rule.agree * max(one.std, two.std) + rule.discrete * one.estimate
 
-    both = [name for name in answer.constants if name in other.constants]
-    return [name for name in both if differs(answer.constants[name], other.constants[name])]
+    both = [name for name in row.constants if name in other.constants]
+    return [name for name in both if differs(row.constants[name], other.constants[name])]
 
 
-def answer_of(case: Case, fit: Fit) -> SampleTime:
+def sample_time_of(answer: Answer) -> SampleTime:
     """The answer of one sample time. Without a thrust there is no scale of torques, and so no answer."""
-    scales = [each.name for each in fit.problem.model.parameters if each.scales_torque]
-    answered = fit.answered and not any(name in fit.held for name in scales)
-    constants = vehicle_constants(fit).constants if answered else {}
-    if answered and "yaw" in overwhelmed(fit):
+    scales = [each.name for each in answer.problem.model.parameters if each.scales_torque]
+    answered = answer.answered and not any(name in answer.fixed for name in scales)
+    constants = vehicle_constants(answer).constants if answered else {}
+    if answered and "yaw" in overwhelmed(answer):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
-    correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
-    largest, samples = max(correlations, key=abs, default=1.0), 0
-    if fit.answered and fit.estimate.parts is not None:
+    rates = [row.correlation for name, row in answer.disturbances.items() if name in AXES] if answer.answered else []
+    largest, samples = max(rates, key=abs, default=1.0), 0
+    if answer.answered and answer.estimate.parts is not None:
         # The sum of the squares of the innovations of a body rate, which have a mean of 1.
-        samples = round(float(np.asarray(fit.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))
-    return SampleTime(float(case.shooting.flight.dt), constants, largest, samples)
+        samples = round(float(np.asarray(answer.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))
+    return SampleTime(float(answer.problem.flight.dt), constants, largest, samples)

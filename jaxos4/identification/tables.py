@@ -1,19 +1,20 @@
 """A result in other forms: arrays as plain lists, a pandas DataFrame, an xarray Dataset."""
 
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .._version import __version__
+from ..analysis.frequency_response import FrequencyResponse
+from ..analysis.prediction import Predictions
 from ..errors import InputError
 from ..results import NINETY_FIVE
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-
-    from .results import Identification
 
 _COLUMNS = ("kind", "unit", "estimate", "std", "low", "high", "bound", "note")
 _NONE = (None, None)
@@ -30,24 +31,32 @@ def series(value: Any) -> Any:
     return found.tolist()
 
 
-def dataframe(found: "Identification") -> "pd.DataFrame":
-    """See `Identification.to_dataframe`."""
+def dataframe(constants: Mapping[str, Any], parameters: Mapping[str, Any], fixed: Mapping[str, Any]) -> "pd.DataFrame":
+    """See `Identification.to_dataframe`. All rows by name: `Constant`, `ParameterEstimate`, `FixedParameter`."""
     rows: dict[str, tuple[Any, ...]] = {}
-    for name, row in found.rigid_body.constants.items():
+    for name, row in constants.items():
         half = NINETY_FIVE * row.std
         ends = row.estimate - half, row.estimate + half
         rows[name] = ("constant", row.unit, row.estimate, row.std, *ends, None, row.note or "")
-    for name, row in found.parameters.items():
+    for name, row in parameters.items():
         rows[name] = ("parameter", row.unit, row.estimate, row.std, *(row.ci95 or _NONE), row.bound, row.note)
-    for name, row in found.held.items():
+    for name, row in fixed.items():
         rows[name] = ("held", row.unit, row.value, 0.0, *_NONE, None, row.note)
     table = _imported("pandas").DataFrame.from_dict(rows, orient="index", columns=_COLUMNS)
     return table.astype(dict.fromkeys(_COLUMNS[2:7], float)).rename_axis("name")
 
 
-def dataset(found: "Identification") -> "xr.Dataset":
-    """See `Identification.to_dataset`."""
-    names, rows = list(found.parameters), list(found.parameters.values())
+def dataset(
+    parameters: Mapping[str, Any],
+    covariance: Sequence[Sequence[float]] | None,
+    predictions: Predictions | None,
+    response: FrequencyResponse | None,
+    *,
+    sample_time: float,
+    **about: str,
+) -> "xr.Dataset":
+    """See `Identification.to_dataset`. `sample_time`: of the predictions [s]. `about`: attributes."""
+    names, rows = list(parameters), list(parameters.values())
     ends = np.array([row.ci95 or _NONE for row in rows], dtype=float).reshape(-1, 2)
     columns = {
         "estimate": np.array([row.estimate for row in rows], dtype=float),
@@ -57,28 +66,27 @@ def dataset(found: "Identification") -> "xr.Dataset":
     }
     variables: dict[str, Any] = {name: ("parameter", column) for name, column in columns.items()}
     coordinates: dict[str, Any] = {"parameter": names, "unit": ("parameter", [row.unit for row in rows])}
-    if found.covariance is not None:
-        variables["covariance"] = (("parameter", "other"), np.array(found.covariance).reshape(2 * [len(names)]))
+    if covariance is not None:
+        variables["covariance"] = (("parameter", "other"), np.array(covariance).reshape(2 * [len(names)]))
         coordinates["other"] = names
-    if (ahead := found.predictions) is not None:
+    if predictions is not None:
         both = ("start", "horizon", "rate")
-        for name, rates in (("predicted", ahead.predicted), ("measured", ahead.measured)):
+        for name, rates in (("predicted", predictions.predicted), ("measured", predictions.measured)):
             variables[name] = (both, rates, {"units": "rad/s"})
-        variables["initial"] = (("start", "rate"), ahead.initial, {"units": "rad/s"})
+        variables["initial"] = (("start", "rate"), predictions.initial, {"units": "rad/s"})
         coordinates |= {
-            "start": ("start", ahead.start * found.provenance.sample_time, {"units": "s"}),
-            "horizon": ("horizon", ahead.horizons, {"units": "s"}),
+            "start": ("start", predictions.start * sample_time, {"units": "s"}),
+            "horizon": ("horizon", predictions.horizons, {"units": "s"}),
             "rate": list("pqr"),
         }
-    if (response := found.response) is not None:
+    if response is not None:
         for name in ("gain", "phase", "coherence", "half_width"):
             variables[name] = (("axis", "frequency"), np.stack([getattr(axis, name) for axis in response]))
         coordinates |= {
             "axis": list(response._fields),
             "frequency": ("frequency", response.roll.frequency, {"units": "Hz"}),
         }
-    about = {"estimator": found.estimator, "model": found.model, "result": found.result, "version": __version__}
-    return _imported("xarray").Dataset(variables, coords=coordinates, attrs=about)
+    return _imported("xarray").Dataset(variables, coords=coordinates, attrs=about | {"version": __version__})
 
 
 def _imported(package: str) -> Any:

@@ -1,9 +1,9 @@
-"""From recordings of a vehicle to the problem that an estimator solves, and the measurements that test the answer."""
+"""Recordings of a vehicle: its data at several sample times, and its parameters with the disturbances."""
 
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
@@ -19,22 +19,86 @@ from ..flight import Flight
 from ..logs import Recording
 from ..models.flight_model import FlightModel
 from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
+from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import input_innovations
-from .prepare import Case, Progress, VehicleSettings, airframe_name, name_and_class, versions
-from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
+from .answers import Solution
+from .checks import Checked, check_vehicle
+from .data import Data, HeldOut, Progress, airframe_name, versions
+from .problem import Intervals, bracket_of
 from .results import Provenance
+from .sample_time import sample_time_of, search_sample_times, shortest
+from .search import search
+from .settings import VehicleSettings, name_and_class
+from .uncertainty import at_lowest, corrected
 
-# The scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
-_FIRST_SIGMA = 0.5
-# Segments of a flight. They are filtered in parallel, and their disagreement shows errors of the model.
-_SEGMENTS = 16
-_FEW_RECORDINGS = 4  # from twice this number of recordings on, there are more segments
-_SHORTEST_SEGMENT = 1.25  # no segment is shorter than this [s]
-# The estimator of a vehicle, which flies in closed loop. With this tolerance it stops within 0.05 standard deviations
-# of the minimum.
-DEFAULT, _TOLERANCE = "filter-error", 1e-3
+DEFAULT = "filter-error"
+"""The estimator of a vehicle, which flies in closed loop."""
+
+
+class Likelihoods(NamedTuple):
+    """How the likelihood of a vehicle is made.
+
+    - `segments`: the parts of a flight, which are filtered in parallel. Their disagreement shows errors of the model.
+      There are more from twice `recordings` recordings on. None is shorter than `seconds` [s].
+    - `tolerance`: of `FilterError`: it stops within 0.05 standard deviations of the minimum.
+    - `sigma`: the scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
+    """
+
+    segments: int = 16
+    recordings: int = 4
+    seconds: float = 1.25
+    tolerance: float = 1e-3
+    sigma: float = 0.5
+
+
+LIKELIHOODS = Likelihoods()
+
+
+@dataclasses.dataclass(frozen=True)
+class VehicleCase:
+    """Recordings of a vehicle, and how it is identified.
+
+    - `data`: at several sample times, the shortest first, with the likelihood of innovations.
+    - `estimator`, `name`: what searches it. `seed`: for training a network.
+    - `choose`: whether the sample time is chosen; otherwise it is the first.
+    """
+
+    is_vehicle: ClassVar[bool] = True
+    model: ClassVar[str] = "flight"
+
+    data: tuple[Data[InnovationsProblem], ...]
+    estimator: str | AbstractEstimator
+    name: str
+    choose: bool
+    seed: int
+
+    def solve(self, progress: Progress) -> Solution:
+        """The parameters and the disturbances at the chosen sample time.
+
+        `FilterError` searches at all sample times, and another estimator then at the chosen one.
+        """
+        solver, is_default = FilterError(tolerance=LIKELIHOODS.tolerance), self.estimator == DEFAULT
+        compared = self.data if is_default or len(self.data) > 1 else ()
+        optima = search_sample_times(compared, solver, progress=progress)
+        answers = [corrected(x, data.flight, data.recording) for x, data in zip(optima, compared, strict=True)]
+        rows = [sample_time_of(answer) for answer in answers]
+        place = shortest(rows) if self.choose and rows else 0
+        data = self.data[place]
+        if is_default:
+            optimum = optima[place]
+        else:
+            data, solver = with_estimator(data, self.estimator, seed=self.seed, progress=progress)
+            optimum = search(solver, data.likelihood, progress=progress)
+        answer = at_lowest(optimum, data, solver, progress=progress)
+        rows[place : place + 1] = [sample_time_of(answer)]
+        # After a restart, the other sample times have the minimum that was left.
+        return Solution(data, answer, (rows[place],) if answer.restarts else tuple(rows))
+
+    def check(self, solution: Solution, progress: Progress) -> Checked:
+        """What the answer says of each quantity, and what speaks against it."""
+        return check_vehicle(*solution, progress)
 
 
 def prepare_vehicle(
@@ -42,13 +106,15 @@ def prepare_vehicle(
     airframe: Airframe,
     settings: VehicleSettings,
     *,
-    estimator: str | AbstractEstimator | None,
-    bracket: Intervals,
-    network: GivenNetwork,
-    validate: Recording | None,
-) -> list[Case]:
-    """Recordings of a vehicle at several sample times, the shortest first. Arguments as of `identify`."""
-    name, kind = name_and_class(DEFAULT if estimator is None else estimator)
+    estimator: str | AbstractEstimator | None = None,
+    bracket: Intervals = None,
+    network: GivenNetwork = None,
+    validate: Recording | None = None,
+    seed: int = 0,
+) -> VehicleCase:
+    """Recordings of a vehicle at several sample times. Arguments as of `identify`."""
+    estimator = DEFAULT if estimator is None else estimator
+    name, kind = name_and_class(estimator)
     if not kind.in_closed_loop:
         fitting = ", ".join(each for each, other in ESTIMATORS.items() if other.in_closed_loop)
         raise InputError(
@@ -63,23 +129,23 @@ def prepare_vehicle(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
     # All sample times share one program, with room for the shortest.
-    return [
-        _case(recordings, airframe, settings, each, prepared[0], name, bracket=bracket, validate=validate)
+    data = [
+        _data(recordings, airframe, settings, each, prepared[0], bracket=bracket, validate=validate)
         for each in prepared
     ]
+    return VehicleCase(tuple(data), estimator, name, settings.sample_time is None, seed)
 
 
-def _case(
+def _data(
     recordings: Sequence[Recording],
     airframe: Airframe,
     settings: VehicleSettings,
     prepared: Prepared,
     room: Prepared,
-    name: str,
     *,
     bracket: Intervals,
     validate: Recording | None,
-) -> Case:
+) -> Data[InnovationsProblem]:
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
     if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
@@ -108,35 +174,43 @@ def _case(
         notes=list(notes),
         **versions(shooting),
     )
-    recording = np.asarray(prepared.recordings)[number]
-    problem = _innovations(shooting, prepared, room)
-    return Case(
-        problem, shooting, FilterError(tolerance=_TOLERANCE), name, "flight", held_out, recording, provenance,
-        validate.name if validate else "", prepared.doubts, prepared.log_step,
-    )  # fmt: skip
+    return Data(
+        likelihood=_innovations(shooting, prepared, room),
+        flight=shooting,
+        recording=np.asarray(prepared.recordings)[number],
+        provenance=provenance,
+        held_out=held_out,
+        findings=prepared.doubts,
+        log_step=prepared.log_step,
+    )
 
 
-def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int, progress: Progress) -> Case:
-    """The case, to be searched by an estimator; a network is trained for it if the estimator needs one."""
+def with_estimator(
+    data: Data[InnovationsProblem], estimator: str | AbstractEstimator, *, seed: int, progress: Progress
+) -> tuple[Data[InnovationsProblem], AbstractEstimator]:
+    """The estimator, with a network that is trained for the data if it needs one; the data, with a note on that."""
     if not isinstance(estimator, str):
-        return case._replace(estimator=estimator)
+        return data, estimator
     if not ESTIMATORS[estimator].needs_network:
-        return case._replace(estimator=make_estimator(estimator))
+        return data, make_estimator(estimator)
     progress("training a network for these flights")
-    begin, seen = time.perf_counter(), liveliest(case.shooting)
-    name, method = str((case.provenance.flights or ["flight"])[0]), IBSS()
+    begin, seen = time.perf_counter(), liveliest(data.flight)
+    name, method = str((data.provenance.flights or ["flight"])[0]), IBSS()
     try:
         method = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)
         what = f"its network was trained for these flights in {time.perf_counter() - begin:.0f} s"
     except TrainingError as error:
         what = f"no network for these flights ({error}); IBSS searched the whole bracket"
-    notes = [*case.provenance.notes, f"{estimator}: {what}"]
-    return case._replace(estimator=method, provenance=msgspec.structs.replace(case.provenance, notes=notes))
+    notes = [*data.provenance.notes, f"{estimator}: {what}"]
+    provenance = msgspec.structs.replace(data.provenance, notes=notes)
+    return dataclasses.replace(data, provenance=provenance), method
 
 
 def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingProblem:
     """The problem of a vehicle's flight: its rates, and what its model says of specific force."""
-    return ShootingProblem(model, flight, sigma=np.full(12, _FIRST_SIGMA), channels="rates", method="rk4", **settings)
+    return ShootingProblem(
+        model, flight, sigma=np.full(12, LIKELIHOODS.sigma), channels="rates", method="rk4", **settings
+    )
 
 
 def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) -> InnovationsProblem:
@@ -144,8 +218,8 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) 
     recordings = max(prepared.recordings) + 1
     # Segments are as many for all sample times, and last a while at the longest.
     seconds = float(room.fitted.dt) * room.fitted.time.shape[0]
-    most = _SEGMENTS * max(recordings // _FEW_RECORDINGS, 1)
-    segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 2 * recordings if recordings > 1 else 1, most))
+    most = LIKELIHOODS.segments * max(recordings // LIKELIHOODS.recordings, 1)
+    segments = int(np.clip(seconds / LIKELIHOODS.seconds, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     capacity = capacity_of(room.fitted.time.shape[0])
     padded, inputs = with_room(shooting, capacity), _input_innovations(shooting, capacity)
@@ -170,21 +244,21 @@ def _held_out(
     prepared: Prepared,
     fitted: ShootingProblem,
     model: FlightModel,
-) -> tuple[ShootingProblem | None, float, tuple[str, ...]]:
-    """The flight that is predicted and not fitted, if there is one; how long it lasts [s]; the notes about all data."""
+) -> tuple[HeldOut | None, float, tuple[str, ...]]:
+    """What is predicted and not fitted, if there is anything; how long it lasts [s]; the notes about all data."""
     name, notes, seconds = recordings[0].name, prepared.notes, prepared.seconds[1]
     remedy = "give `holdout` 0 or `validate`"
     if validate is not None:
         other = _prepare_other(recordings, validate, prepared, model)
         own = dataclasses.replace(model, recordings=other.recordings)
-        held_out, seconds = _problem(own, other.fitted), other.seconds[0]
+        held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name), other.seconds[0]
         name, remedy, notes = validate.name, "give another flight", notes + other.notes
     elif prepared.tested is not None:
-        held_out = dataclasses.replace(fitted, flight=prepared.tested)
+        held_out = HeldOut(dataclasses.replace(fitted, flight=prepared.tested))
     else:
         return None, 0.0, (*notes, "nothing was held out, so no prediction checks the fit")
     try:
-        starts(held_out.flight)
+        starts(held_out.problem.flight)
     except ValueError:
         raise InputError(
             f"{name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."

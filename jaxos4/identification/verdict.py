@@ -61,6 +61,7 @@ class Tolerance(msgspec.Struct, frozen=True):
     - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
       of it, these are not identified. Segments last 1.25 s, and the jackknife compares at least four parts.
     - `prior`: the share of the information about a parameter that its bracket may give without a reservation.
+    - `late`: motors that act earlier than they are recorded by more than this are recorded late [s].
     - `sure`, `consistent`: what exceeds chance: so many standard deviations, or a probability below the second.
     """
 
@@ -70,6 +71,7 @@ class Tolerance(msgspec.Struct, frozen=True):
     unknown: float = 0.4
     seconds: float = 10.0
     prior: float = 0.25
+    late: float = 0.005
     sure: float = 3.0
     consistent: float = 1e-3
 

@@ -128,6 +128,11 @@ class AbstractModel(eqx.Module):
         """The model of one recording, if several in a row have parameters of their own. `stretch`: see `Flight`."""
 
     @property
+    @abc.abstractmethod
+    def quantities(self) -> dict[str, list[str]]:
+        """The physical quantities beside moments of inertia, each with the names of its parameters."""
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """The name of each parameter."""
         return tuple(parameter.name for parameter in self.parameters)

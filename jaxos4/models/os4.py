@@ -55,6 +55,11 @@ class AbstractOS4(AbstractModel):
         del stretch
 
     @property
+    def quantities(self) -> dict[str, list[str]]:
+        """None: alpha_1..8 follow from moments of inertia."""
+        return {}
+
+    @property
     def force_axes(self) -> tuple[int, ...]:
         """None: the OS4 has no accelerometer."""
         return ()

@@ -8,7 +8,7 @@ from jaxos4 import AxisResponse, FrequencyResponse, Predictions
 from jaxos4.identification.results import (
     ChannelFit,
     Constant,
-    HeldParameter,
+    FixedParameter,
     Identification,
     ParameterEstimate,
     PredictionSkill,
@@ -74,7 +74,7 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN},
         "rigid_body": RigidBody(NOTED, 0.21, True),
         "verdicts": VERDICTS,
-        "held": {"alpha1": HeldParameter(-0.8125, "1", "not identifiable")},
+        "held": {"alpha1": FixedParameter(-0.8125, "1", "not identifiable")},
         "noise": {"p": 0.41},
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
         "predictions": synthetic_predictions(),

@@ -1,0 +1,74 @@
+"""`Data`: what is known of flights before a search."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from .._version import __version__
+from ..airframe import PRESETS, Airframe
+from ..recording.checks import Finding
+from ..shooting import InnovationsProblem, ShootingProblem
+from .results import Provenance
+
+Progress = Callable[[str], None]
+L = TypeVar("L", ShootingProblem, InnovationsProblem)
+
+
+def silent(stage: str) -> None:
+    """Tells nobody about a stage."""
+
+
+class HeldOut(NamedTuple):
+    """Measurements that are not fitted.
+
+    - `problem`: the flight and its model.
+    - `recording`: the name of the other recording that it is; empty: it is a part of the fitted ones.
+    """
+
+    problem: ShootingProblem
+    recording: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Data(Generic[L]):
+    """Flights as they are fitted, the measurements that test the answer, and what is known of both.
+
+    - `likelihood`: with its bracket; that of a vehicle is padded.
+    - `flight`: the flight and its model.
+    - `recording`: the number of the recording of each sample.
+    - `provenance`: data, settings and versions.
+    - `held_out`: what is not fitted, if there is anything.
+    - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
+    """
+
+    likelihood: L
+    flight: ShootingProblem
+    recording: Int[np.ndarray, " samples"]
+    provenance: Provenance
+    held_out: HeldOut | None = None
+    findings: tuple[Finding, ...] = ()
+    log_step: float = 0.0
+
+    @property
+    def room(self) -> int:
+        """The number of samples of a padded flight: checks at all sample times share their programs."""
+        return self.likelihood.flight.time.shape[0]
+
+
+def versions(problem: ShootingProblem) -> dict[str, Any]:
+    """Versions, device and precision."""
+    return {
+        "version": __version__,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "precision": str(problem.flight.time.dtype),
+    }
+
+
+def airframe_name(airframe: Airframe) -> str:
+    """The name of a preset, or "custom"."""
+    return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")

@@ -1,0 +1,200 @@
+"""The search of a vehicle's likelihood: of all parameters, then without those that the flights do not show.
+
+The noise is among the unknowns of this likelihood. All searches return an `Optimum`.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from ..estimate import AbstractEstimator, Estimate
+from ..models.abstract import Parameter
+from ..results import result_names
+from ..shooting import InnovationsProblem, Parts, Unknowns
+from ..shooting.gains import LogNoise
+from .data import Progress, silent
+from .results import Disturbance, has_answer
+
+
+class Pretests(NamedTuple):
+    """When a parameter is fixed and all others are searched again.
+
+    - `negative`: a parameter that must not be negative is fixed at 0 if it is so by this many standard deviations.
+    - `rise`: parameters near their plain values are fixed there unless that raises the cost, prior included, by more:
+      near it, a cost with kinks is not quadratic, and standard deviations are too small.
+    - `near`: a plain value that is further off than so many standard deviations is never tried.
+    """
+
+    negative: float = 2.0
+    rise: float = 5.0
+    near: float = 12.0
+
+
+PRETESTS = Pretests()
+
+
+class Optimum(NamedTuple):
+    """Where a search of innovations ended.
+
+    - `likelihood`: with what is fixed. `estimate`: of all its unknowns, with the covariance of the search.
+    - `first`: the estimate before any parameter was fixed. `whole`: the parameters at that time.
+    - `rollouts`: of all searches together.
+    - `plain`: the parameters that are fixed at their plain values.
+    - `negative`: value and standard deviation of those that came out negative, and are fixed at 0.
+    - `freed`: the covariance that these would add if they were free.
+    - `restarts`: how often a search began again where the cost is lower. `is_lowest`: false if the cost is known to be
+      lower elsewhere.
+    """
+
+    likelihood: InnovationsProblem
+    estimate: Estimate
+    first: Estimate
+    whole: Unknowns
+    rollouts: int
+    plain: tuple[str, ...] = ()
+    negative: dict[str, tuple[float, float]] = {}
+    freed: Float[ArrayLike, "..."] = 0.0
+    restarts: int = 0
+    is_lowest: bool = True
+
+    @property
+    def converged(self) -> bool:
+        """Whether the search ended at a minimum."""
+        return str(result_names(self.estimate.result)) == "successful"
+
+    @property
+    def values(self) -> Float[np.ndarray, " unknowns"]:
+        """The parameters, then the logarithms of the noise."""
+        return np.asarray(self.estimate.parameters)
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "unknowns unknowns"]:
+        """Of all unknowns, if the model is right and the cost quadratic. It allows for what came out negative."""
+        return np.asarray(self.estimate.covariance) + np.asarray(self.freed)
+
+    @property
+    def std(self) -> Float[np.ndarray, " parameters"]:
+        """Standard deviations of the parameters, by `covariance`."""
+        return deviations(self.covariance)[: self.whole.count]
+
+    @property
+    def cost(self) -> float:
+        """The cost with that of all brackets, which are Gaussian priors, also of parameters that are fixed."""
+        own = self.likelihood.problem.unknowns
+        fixed = ~np.asarray(own.free)
+        off = (np.asarray(own.center) - np.asarray(self.whole.center)) / np.asarray(self.whole.half_width)
+        return float(self.estimate.cost) + float(np.square(off[fixed]).sum()) / 2
+
+    @property
+    def noise(self) -> LogNoise:
+        """The noise of each channel."""
+        return self.likelihood.noise(self.values)
+
+    @property
+    def parts(self) -> Parts:
+        """The likelihood of each segment, at the estimate."""
+        if self.estimate.parts is None:
+            raise ValueError("`estimator` must return the `parts` of the likelihood.")
+        return self.estimate.parts
+
+    def restricted(
+        self,
+        estimator: Callable[[InnovationsProblem], Estimate],
+        values: Mapping[str, float],
+        start: Float[np.ndarray, " unknowns"] | None = None,
+    ) -> "Optimum":
+        """All others searched again with some parameters fixed. `start`: of the search; by default this optimum."""
+        fixed = self.likelihood.fix({name: np.asarray(value) for name, value in values.items()})
+        likelihood = fixed.starting_from(self.values if start is None else start)
+        found = jax.block_until_ready(estimator(likelihood))
+        return self._replace(likelihood=likelihood, estimate=found, rollouts=self.rollouts + int(found.rollouts))
+
+
+def search(
+    estimator: AbstractEstimator,
+    likelihood: InnovationsProblem,
+    *,
+    start: Float[np.ndarray, " unknowns"] | None = None,
+    progress: Progress = silent,
+    rules: Pretests = PRETESTS,
+) -> Optimum:
+    """The optimum without the parameters that came out negative, or near their plain values.
+
+    **Arguments:** `start`: of the search; by default that of the likelihood, also if there is no answer from `start`.
+    """
+    first, spent = None, 0
+    if start is not None:
+        first = jax.block_until_ready(estimator(likelihood.starting_from(start)))
+        spent = int(first.rollouts)
+    if first is None or not has_answer(first):
+        first = jax.block_until_ready(estimator(likelihood))
+        spent += int(first.rollouts)
+    optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
+    optimum = optimum._replace(likelihood=likelihood.passing(optimum.parts.passed))
+    optimum = _without_negative(estimator, optimum, progress, rules)
+    return _at_plain_values(estimator, optimum, progress, rules)
+
+
+def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress, rules: Pretests) -> Optimum:
+    """The parameters that are negative, though physics forbids it, fixed at 0."""
+    negative = {
+        row.name: (value, std) for row, value, std in _rows(before) if row.nonnegative and value < -rules.negative * std
+    }
+    if not negative:
+        return before
+    progress("fitting again without what came out negative")
+    places = [before.whole.names.index(name) for name in negative]
+    covariance = np.asarray(before.estimate.covariance)
+    freed = covariance[:, places] @ np.linalg.pinv(covariance[np.ix_(places, places)]) @ covariance[places]
+    after = before.restricted(estimator, dict.fromkeys(negative, 0.0))
+    return after._replace(negative=negative, freed=freed)
+
+
+def _at_plain_values(estimator: AbstractEstimator, before: Optimum, progress: Progress, rules: Pretests) -> Optimum:
+    """The parameters near their plain values fixed there, unless that clearly raises the cost."""
+    plain = {
+        row.name: row.plain
+        for row, value, std in _rows(before)
+        if row.plain is not None and std > 0 and abs(value - row.plain) < rules.near * std
+    }
+    if not plain:
+        return before
+    progress("fitting again without what the flights hardly show")
+    after = before.restricted(estimator, plain)
+    if has_answer(after.estimate) and after.cost - before.cost < rules.rise:
+        return after._replace(plain=tuple(plain))
+    return before._replace(rollouts=after.rollouts)
+
+
+def _rows(optimum: Optimum) -> list[tuple[Parameter, float, float]]:
+    """Each parameter with its value and its standard deviation in the search; empty without an answer."""
+    if not has_answer(optimum.estimate):
+        return []
+    std = deviations(optimum.estimate.covariance)
+    return list(zip(optimum.likelihood.model.parameters, optimum.values.tolist(), std.tolist(), strict=False))
+
+
+def deviations(covariance: Float[ArrayLike, "unknowns unknowns"]) -> Float[np.ndarray, " unknowns"]:
+    """Standard deviations."""
+    return np.sqrt(np.maximum(np.diagonal(np.asarray(covariance)), 0.0))
+
+
+def disturbances_of(optimum: Optimum) -> dict[str, Disturbance]:
+    """What acts on each channel besides the model."""
+    strength, time_constant, sensor = (np.exp(leaf) for leaf in optimum.noise)
+    products = np.asarray(optimum.parts.products).sum(axis=0)
+    correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)
+    largest = np.take_along_axis(correlation, np.abs(correlation).argmax(axis=1)[:, None], axis=1)[:, 0]
+    return {
+        name: Disturbance(
+            strength=float(strength[i]),
+            unit="rad/s^2" if i < 3 else "m/s^2",
+            time_constant=float(time_constant[i]),
+            sensor=float(sensor[i]),
+            correlation=float(largest[i]),
+        )
+        for i, name in enumerate(optimum.likelihood.channels)
+    }

@@ -1,0 +1,247 @@
+"""The correction of a vehicle's intervals: for a wrong model, and for a cost that is not quadratic.
+
+The covariance of a search assumes that the model is right and the cost quadratic. Standard deviations are multiplied by
+two factors, each of which is at least 1:
+
+- **jackknife**: if parts of the flights give different answers, the model lacks something.
+- **profile**: under a controller, an alpha can be exchanged for strength and time constant of the disturbance. So the
+  cost is flat above an alpha that came out too small. The profile needs no covariance: a 95 % interval ends where the
+  least cost is higher by 1.96^2/2, with all other unknowns fitted again. Only the upper end of poorly known moments of
+  inertia is looked for, because the upper side is longer.
+
+A likelihood can have several maxima. If the cost is lower at an end than at the optimum, the search starts there again.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._custom_types import as_float
+from ..bracket import GAUSSIAN_PRIOR, is_identifiable
+from ..estimate import AbstractEstimator
+from ..estimators import FilterError
+from ..results import NINETY_FIVE
+from ..shooting import InnovationsProblem, ShootingProblem
+from .answers import INVERSE, Answer
+from .data import Data, Progress, silent
+from .results import FixedParameter, has_answer
+from .search import Optimum, disturbances_of, search
+
+PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
+_PLAIN_NOTE = "at the usual value, which these flights do not contradict"
+
+
+class Jackknife(NamedTuple):
+    """How parts of flights are compared.
+
+    - `most`, `fewest`: the most parts, and the fewest that can show a disagreement.
+    - `chance`: the probability that parts of a flight that the model explains are taken to disagree.
+    """
+
+    most: int = 20
+    fewest: int = 4
+    chance: float = 0.05
+
+
+class Profile(NamedTuple):
+    """How the upper end of an interval is looked for.
+
+    - `well_known`: a standard deviation of at most this share: the cost is nearly quadratic in the interval.
+    - `fits`: the most fits for one end. `close`: they end once the root of twice the rise of the cost is this close to
+      1.96. `slope`: the root grows by 1 in each standard deviation if the cost is quadratic, and by this at least.
+    - `tolerance`: of each fit, which needs one or two steps. A cost that is too large by it moves an end by 1 %.
+    - `lower`: an end whose cost is lower by more shows that the optimum is not the minimum.
+    - `minima`: the most minima whose ends are looked at.
+    """
+
+    well_known: float = 0.1
+    fits: int = 3
+    close: float = 0.1
+    slope: float = 0.1
+    tolerance: float = 0.04
+    lower: float = 0.1
+    minima: int = 3
+
+
+JACKKNIFE, PROFILE = Jackknife(), Profile()
+
+
+def corrected(
+    optimum: Optimum,
+    flight: ShootingProblem,
+    recording: Int[np.ndarray, " samples"],
+    profile: Mapping[str, float] = {},
+) -> Answer:
+    """The answer of a search: its intervals corrected, and without the parameters that are not identifiable.
+
+    A parameter about which the flights say less than the bracket is not estimated.
+
+    **Arguments:**
+
+    - `flight`: the flight and its model. `recording`: the number of the recording of each sample.
+    - `profile`: the factors of the profile, by parameter.
+    """
+    names, units, values = optimum.whole.names, optimum.whole.units, optimum.values
+    notes, jackknife, longer = dict.fromkeys(optimum.plain, _PLAIN_NOTE), np.ones(values.size), np.ones(values.size)
+    if has_answer(optimum.estimate):
+        free = np.flatnonzero(~np.isin(names, [*optimum.plain, *optimum.negative]))
+        jackknife[free] = _widening(optimum, free, recording)
+        longer[: len(names)] = [profile.get(name, 1.0) for name in names]
+        std = (jackknife * longer)[: len(names)] * optimum.std
+        known = np.asarray(is_identifiable(std, np.asarray(optimum.whole.half_width), GAUSSIAN_PRIOR))
+        notes = {name: PRIOR_NOTE for name, is_known in zip(names, known, strict=True) if not is_known} | notes
+
+    def of_free(factor: Float[np.ndarray, " unknowns"]) -> dict[str, float]:
+        return {name: float(x) for name, x in zip(names, factor, strict=False) if x > 1 and name not in notes}
+
+    covariance = as_float(optimum.covariance * np.outer(jackknife * longer, jackknife * longer))
+    sigma = np.array(flight.sigma)
+    sigma[flight.columns] = np.exp(optimum.noise.sensor)
+    sigma = as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0))
+    return Answer(
+        problem=eqx.tree_at(lambda p: p.sigma, flight, sigma),
+        estimate=eqx.tree_at(lambda e: e.covariance, optimum.estimate, covariance),
+        bound=optimum.std,
+        rollouts=optimum.rollouts,
+        optimum=optimum,
+        fixed={x: FixedParameter(float(values[i]), units[i], notes[x]) for i, x in enumerate(names) if x in notes},
+        disturbances=disturbances_of(optimum),
+        widened=of_free(jackknife),
+        profiled=of_free(longer),
+    )
+
+
+def at_lowest(
+    optimum: Optimum,
+    data: Data[InnovationsProblem],
+    estimator: AbstractEstimator,
+    *,
+    progress: Progress = silent,
+    rules: Profile = PROFILE,
+) -> Answer:
+    """The answer at the lowest minimum that was found, its intervals corrected by the profile too.
+
+    A search that did not converge has no profile.
+    """
+    for left in reversed(range(rules.minima)):
+        answer, factors, lower = corrected(optimum, data.flight, data.recording), {}, None
+        if not optimum.converged:
+            return answer
+        poor = optimum.std > rules.well_known * np.abs(optimum.values[: optimum.whole.count])
+        for place in sorted({*INVERSE.values()} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
+            progress("computing intervals")
+            reach, end = upper_end(optimum, place, rules)
+            optimum = optimum._replace(rollouts=end.rollouts)
+            if end.converged and optimum.cost - end.cost > rules.lower:
+                lower = end.values
+                break
+            factors[optimum.whole.names[place]] = max(reach / NINETY_FIVE, 1.0)
+        if lower is None:
+            return corrected(optimum, data.flight, data.recording, factors)
+        if not left:
+            break
+        progress("fitting again where the cost is lower")
+        same = data.likelihood.passing(optimum.likelihood.passed)  # costs compare in the same likelihood only
+        other = search(estimator, same, start=lower, progress=progress)
+        rollouts, is_lower = optimum.rollouts + other.rollouts, has_answer(other.estimate) and other.cost < optimum.cost
+        optimum = other._replace(restarts=optimum.restarts + 1) if is_lower else optimum
+        optimum = optimum._replace(rollouts=rollouts)
+        if not is_lower:
+            break
+    return corrected(optimum._replace(is_lowest=False), data.flight, data.recording)
+
+
+def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> tuple[float, Optimum]:
+    """Where the interval of one parameter ends by the profile.
+
+    If no fit at an end succeeds, the end is that of the covariance. If a later fit fails, the end is extrapolated from
+    the fits before it. The search for the end is over where the cost is lower than at the optimum.
+
+    **Returns:** the end in standard deviations above the optimum, and the last fit at an end.
+    """
+    solver, covariance = FilterError(tolerance=rules.tolerance), np.asarray(optimum.estimate.covariance)
+    # How the minimum moves with this parameter, in steps of its standard deviation.
+    along = covariance[:, place] / np.sqrt(covariance[place, place])
+    unknowns, at, root, reach, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
+    for _ in range(rules.fits):
+        unknowns, before, at = unknowns + (reach - at) * along, at, reach
+        fixed = {optimum.whole.names[place]: float(unknowns[place])}
+        other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
+        rise, unknowns, last = other.cost - optimum.cost, other.values, root
+        if not other.converged or rise < -rules.lower:
+            break
+        root = np.sqrt(max(2 * rise, 0.0))
+        reach = at + (NINETY_FIVE - root) / max((root - last) / (at - before), rules.slope)
+        reach = float(np.clip(reach, at / 2, 2 * at))
+        if abs(root - NINETY_FIVE) < rules.close:
+            break
+    return reach, other
+
+
+def _widening(
+    optimum: Optimum, free: Int[np.ndarray, " free"], recording: Int[np.ndarray, " samples"]
+) -> Float[np.ndarray, " free"]:
+    """The factors of the jackknife for the parameters in the places `free`. `recording`: of each sample."""
+    index, owned = map(np.asarray, optimum.likelihood.cut[:2])
+    middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
+    parts = optimum.parts
+    # In a segment of padding nothing was measured.
+    used = np.asarray(parts.information).any(axis=(1, 2))
+    number = recording[np.minimum(middle, recording.size - 1)][used]
+    gradient = np.asarray(parts.gradient)[used][:, free]
+    information = np.asarray(parts.information)[used][:, free[:, None], free]
+    prior = np.diag(1 / np.square(np.asarray(optimum.whole.half_width)[free]))
+    ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
+    return np.max([np.ones(free.size), *ways], axis=0)
+
+
+def parts_of(
+    lanes: int, recording: Int[np.ndarray, " lanes"], rules: Jackknife = JACKKNIFE
+) -> list[Int[np.ndarray, " lanes"]]:
+    """The ways to divide lanes into parts: into blocks of neighbours, and into recordings if there are enough."""
+    ways = [np.arange(lanes) * min(lanes, rules.most) // lanes, recording]
+    return [way for way in ways if np.unique(way).size >= rules.fewest]
+
+
+def disagreement(
+    gradient: Float[np.ndarray, "lanes unknowns"],
+    information: Float[np.ndarray, "lanes unknowns unknowns"],
+    prior: Float[np.ndarray, "unknowns unknowns"],
+    part: Int[np.ndarray, " lanes"],
+    rules: Jackknife = JACKKNIFE,
+) -> Float[np.ndarray, " unknowns"]:
+    """By how much parts disagree: the jackknife's standard error over the likelihood's; at least 1.
+
+    The standard errors of a likelihood assume that the model is right. If it is not, parts of a flight give different
+    answers. The jackknife leaves out one part at a time; each answer follows from one Gauss-Newton step, because the
+    search has computed the gradient and the information of each part. 1 if the disagreement could be chance: it happens
+    by chance to one parameter in twenty.
+
+    **Arguments:**
+
+    - `gradient`, `information`: of the negative log-likelihood of each lane, at the estimate from all lanes.
+    - `prior`: the information of the prior.
+    - `part`: the number of the part of each lane.
+
+    Reference: Efron and Tibshirani 1993, An Introduction to the Bootstrap, ch. 11.
+    """
+    from scipy.special import chdtri  # slow to import
+
+    numbers = np.unique(part)
+    whole = information.sum(axis=0) + prior
+    scale = np.sqrt(np.diagonal(whole))
+    moved = []
+    for number in numbers:
+        left_out = part == number
+        rest = (whole - information[left_out].sum(axis=0)) / np.outer(scale, scale)
+        slope = gradient[left_out].sum(axis=0) / scale
+        moved.append(np.linalg.lstsq(rest, slope, rcond=1e-12)[0] / scale)
+    moved = np.stack(moved)
+    variance = (numbers.size - 1) / numbers.size * np.square(moved - moved.mean(axis=0)).sum(axis=0)
+    likelihood = np.diagonal(np.linalg.inv(whole / np.outer(scale, scale))) / scale**2
+    ratio = variance / likelihood
+    freedom = numbers.size - 1
+    return np.sqrt(np.where(ratio > chdtri(freedom, rules.chance) / freedom, np.maximum(ratio, 1.0), 1.0))
