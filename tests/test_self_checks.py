@@ -107,6 +107,11 @@ def thinned(every):
     return lambda flight: flight._replace(omega=flight.omega[np.arange(flight.time.size) // every * every])
 
 
+def every(rows):
+    """A slower log of the speeds at instants."""
+    return lambda flight: flight._replace(commanded=False, held=False).rows(slice(None, None, rows))
+
+
 def impossible(flight):
     flight.omega[[1000, 3000], 2] = 60 * flight.omega.mean(), 19 * flight.omega.mean()
     return flight
@@ -141,6 +146,7 @@ FAULTS = {
     "along the earth": (along_the_earth, ["axes of the earth"], {"thrust"}, True),
     "in g": (in_g, ["units of g"], {"thrust"}, True),
     "impossible speeds": (impossible, ["impossible"], {"thrust"}, False),
+    "every row of speeds, 16 ms apart": (every(4), ["speeds were logged so rarely"], INERTIAS | {"damping"}, False),
     "thinned": (thinned(10), ["more rarely"], {"damping"}, True),
     "short": (lambda flight: flight.rows(slice(500)), ["short"], INERTIAS, False),
     "rows missing": (rows_missing, ["not uniform"], INERTIAS, True),

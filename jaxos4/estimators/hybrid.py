@@ -141,6 +141,7 @@ def _confirms(near: Estimate, seed: Seed, measurements: Scalar) -> Bool[Array, "
     far = jnp.abs(near.parameters[: seed.parameters.shape[0]] - seed.parameters) > _MISSED * seed.half_width
     # A parameter that is not identifiable near the seed is not identifiable elsewhere either.
     ended = (near.result == RESULTS.successful) | (near.result == RESULTS.unidentifiable)
-    # Without measurements, the noise is an unknown, and no cost is too large.
+    # Where the noise is an unknown, no measurements are counted, and the cost does not show that the rest is noise.
     explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2 * measurements)
+    explained = explained & (measurements > 0)
     return ended & ~far.any() & explained

@@ -79,6 +79,21 @@ def clipped_values(evidence: Evidence) -> Finding | None:
     )
 
 
+def rare_speeds(evidence: Evidence) -> Finding | None:
+    """Rotor speeds at instants so far apart that what rotors do in between matters."""
+    logged = evidence.logged
+    if logged.commanded or logged.held or logged.dt <= evidence.limits.instants:
+        return None
+    return Finding(
+        "rare_speeds",
+        "rotor speeds were logged so rarely that what rotors did in between is not known",
+        f"every {1e3 * logged.dt:.0f} ms",
+        "log rotor speeds at 100 Hz or more, or their means",
+        (*INERTIAS, "damping"),
+        False,
+    )
+
+
 def rare_motors(evidence: Evidence) -> Finding | None:
     """Rotor speeds or commands that keep their value for longer than rotors take to answer."""
     if evidence.motor_step <= evidence.limits.held:
