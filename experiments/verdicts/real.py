@@ -1,0 +1,90 @@
+"""Verdicts of Ix and Iy on real flights, each identified alone by the defaults; and whether repeated flights agree.
+
+The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.
+"""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxos4
+from experiments.monte_carlo import Row, continued, fill, print_table
+from experiments.public_flights.run import FITTED, PREDICTED
+from experiments.sample_times.run import VEHICLE as CINERAT
+from experiments.shared import flight_files
+from jaxos4.errors import InputError
+from jaxos4.recording import read_recording
+from jaxos4.results import NINETY_FIVE
+
+CRAZYFLIE = jaxos4.load_airframe("crazyflie")
+FLIGHTS = {f"arpl_crazyflie_{name}.csv": CRAZYFLIE for name in ("rollpitch", "yaw_a", "yaw_b", "hover")}
+FLIGHTS |= {f"nanobench/{name}.csv": CRAZYFLIE for name in sorted((*FITTED, *PREDICTED))}
+FLIGHTS |= {"cinerat/cinerat_281.csv": CINERAT}
+JUDGED = "Ix", "Iy"
+
+
+def judged(path: Path, airframe: jaxos4.Airframe) -> Row:
+    """Result, value, 95 % half-width, verdict and reasons of each quantity."""
+    try:
+        found = jaxos4.identify(read_recording(path, airframe=airframe), airframe)
+    except InputError as error:
+        return {"result": "refused", "why": str(error)}
+    row: Row = {"result": found.result}
+    for name in JUDGED:
+        if name in found.rigid_body.constants:
+            value, verdict = found.rigid_body.constants[name], found.verdicts[name]
+            row[name] = {"estimate": value.estimate, "half_width": NINETY_FIVE * value.std}
+            row[name] |= {"status": verdict.status, "reasons": list(verdict.reasons)}
+    return row
+
+
+def vehicle_of(row: Row) -> str:
+    """The vehicle that flew: that of the file's folder, or of the first words of its name."""
+    return row["flight"].split("/")[0] if "/" in row["flight"] else "arpl_crazyflie"
+
+
+def cells(rows: list[Row]) -> Iterator[tuple[str, ...]]:
+    """One line for each flight and quantity."""
+    for row in rows:
+        for name in JUDGED:
+            if name in row:
+                one = row[name]
+                value = f"{1e5 * one['estimate']:.3g} +- {1e5 * one['half_width']:.2g}"
+                yield row["flight"], name, value, one["status"], "; ".join(one["reasons"])
+        if "why" in row:
+            yield row["flight"], "", "", "refused", row["why"]
+
+
+def pairs(rows: list[Row]) -> Iterator[tuple[str, ...]]:
+    """Pairs of identified flights of one vehicle: how many differences lie inside their 95 %, and the largest."""
+    for vehicle in dict.fromkeys(map(vehicle_of, rows)):
+        for name in JUDGED:
+            known = [row[name] for row in rows if vehicle_of(row) == vehicle and name in row]
+            known = [one for one in known if one["status"].startswith("identified")]
+            apart = [
+                abs(a["estimate"] - b["estimate"]) / np.hypot(a["half_width"], b["half_width"])
+                for a, b in itertools.combinations(known, 2)
+            ]
+            if apart:
+                inside = sum(each <= 1 for each in apart)
+                yield vehicle, name, str(len(known)), f"{inside} of {len(apart)}", f"{NINETY_FIVE * max(apart):.2f}"
+
+
+def main(
+    flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
+    names: Annotated[list[str], typer.Option(help="Their files.")] = tuple(FLIGHTS),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+) -> None:
+    """Judge real flights one by one, and compare those of one vehicle."""
+    report = continued(out, {}, "rows")
+    paths = dict(zip(names, flight_files(flights, names), strict=True))
+    trials = ({"flight": name} for name in names)
+    fill(out, report, report["rows"], trials, lambda flight: judged(paths[flight], FLIGHTS[flight]))
+    headings = "flight", "", "1e-5 kg m^2, 95 %", "verdict", "reasons"
+    print_table("verdicts of real flights", headings, cells(report["rows"]), width=200)
+    headings = "vehicle", "", "identified", "differences inside their 95 %", "largest [std]"
+    print_table("repeated flights of one vehicle", headings, pairs(report["rows"]))
