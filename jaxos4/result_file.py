@@ -10,15 +10,19 @@ import numpy as np
 
 from ._files import read_json
 from .airframe import airframe_from_table
+from .analysis.diagnostics import Correlations
 from .analysis.frequency_response import AxisResponse, FrequencyResponse
 from .analysis.prediction import Predictions
+from .analysis.traces import Traces
 from .errors import InputError, named, shortened
 from .identification.results import APART, Constant, Identification, RigidBody
+from .models.state import CHANNELS
 from .results import NAMES
 
 _NAME = re.compile(r"[\w.() -]{1,80}")
 _REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
+_MOST_LOGS = 100_000
 _EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
 
 _FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
@@ -35,6 +39,8 @@ _File = msgspec.defstruct(
         ("airframe", dict[str, Any] | None),
         ("predictions", dict[str, Any] | None, None),
         ("response", dict[str, dict[str, Any]] | None, None),
+        ("traces", dict[str, Any] | None, None),
+        ("correlations", dict[str, Any] | None, None),
     ],
     kw_only=True,
 )
@@ -67,6 +73,8 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
             "is_vehicle": fields["model"] == "flight",
             "predictions": _predictions(fields["predictions"]),
             "response": _response(fields["response"]),
+            "traces": _traces(fields["traces"]),
+            "correlations": _correlations(fields["correlations"]),
         }
         found = Identification(**fields)
         if problem := next(_problems(found, tests), None):
@@ -124,19 +132,46 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
 
 def _arrays(kind: type, table: dict[str, Any], place: str) -> dict[str, Any]:
     """The arrays of a named tuple by name, checked against the shapes in its annotations; a missing number is NaN."""
-    arrays, sizes = {}, {"3": 3}
+    arrays, sizes = {}, {"3": 3, "4": 4}
     for name, hint in get_type_hints(kind).items():
         try:
             array = np.array(table[name], dtype=float)
         except (KeyError, TypeError, ValueError):
             raise InputError(f"`{place}.{name}`: is not an array of numbers; {_AGAIN}") from None
         names = getattr(hint, "dim_str", "").split()
+        if array.shape == (0,) and len(names) == 2:
+            array = np.zeros((0, sizes.get(names[1], 0)))  # a list of no rows does not say how long they are
         if array.ndim != len(names) or any(
             sizes.setdefault(each, size) != size for each, size in zip(names, array.shape, strict=True)
         ):
             raise InputError(f"`{place}.{name}`: has another shape than the arrays beside it; {_AGAIN}")
         arrays[name] = array if names else float(array)
     return arrays
+
+
+def _traces(table: dict[str, Any] | None) -> Traces | None:
+    if table is None:
+        return None
+    arrays = _arrays(Traces, table, "traces")
+    channels, simulated = arrays["measured"].shape[1], arrays["predicted"].shape[1]
+    if not np.isfinite(np.concatenate([arrays["time"], arrays["start_time"]])).all():
+        raise InputError(f"`traces`: a time is missing; {_AGAIN}")
+    if channels not in CHANNELS.values() or simulated not in (0, channels) or arrays["time"].size < 2:
+        raise InputError(f"`traces`: has channels that no model has; {_AGAIN}")
+    for name in ("log", "start_log"):
+        log = arrays[name] = np.nan_to_num(arrays[name], nan=-1.0).astype(int)
+        if (log < 0).any() or (log > _MOST_LOGS).any():
+            raise InputError(f"`traces.{name}`: is not the number of a log; {_AGAIN}")
+    return Traces(**arrays)
+
+
+def _correlations(table: dict[str, Any] | None) -> Correlations | None:
+    if table is None:
+        return None
+    arrays = _arrays(Correlations, table, "correlations")
+    if arrays["own"].shape[0] not in CHANNELS.values() or not arrays["with_torque"].shape[2]:
+        raise InputError(f"`correlations`: has channels that no model has; {_AGAIN}")
+    return Correlations(**arrays)
 
 
 def _predictions(table: dict[str, Any] | None) -> Predictions | None:
@@ -150,12 +185,21 @@ def _predictions(table: dict[str, Any] | None) -> Predictions | None:
     return Predictions(**arrays | {"start": start.astype(int)})
 
 
+def _symmetric(rows: Any) -> Any:
+    """The matrix of which these are the rows up to the diagonal; anything else as it is."""
+    if not isinstance(rows, list) or [isinstance(row, list) and len(row) for row in rows] != [*range(1, len(rows) + 1)]:
+        return rows
+    return [[rows[max(i, j)][min(i, j)] for j in range(len(rows))] for i in range(len(rows))]
+
+
 def _response(table: dict[str, dict[str, Any]] | None) -> FrequencyResponse | None:
     if table is None:
         return None
     axes = {}
     for name in FrequencyResponse._fields:
-        arrays = axes[name] = _arrays(AxisResponse, table.get(name, {}), f"response.{name}")
+        given = dict(table.get(name, {}))
+        given["covariance"] = _symmetric(given.get("covariance"))
+        arrays = axes[name] = _arrays(AxisResponse, given, f"response.{name}")
         frequency = arrays["frequency"]
         unusable = (arrays["gain"] <= 0) | (np.diagonal(arrays["covariance"]) < 0)
         if not (frequency > 0).all() or not (np.diff(frequency) > 0).all() or unusable.any():

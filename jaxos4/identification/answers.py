@@ -41,6 +41,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
     estimate, unknowns = fit.estimate, fit.problem.unknowns
     std, width = map(np.asarray, _intervals(estimate))
     values, half_width, free = np.asarray(estimate.parameters), np.asarray(unknowns.half_width), fit.free
+    lower, upper = np.asarray(unknowns.bracket.lower), np.asarray(unknowns.bracket.upper)
     prior = GAUSSIAN_PRIOR if case.is_vehicle else case.estimator.prior
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
     reasons = dict.fromkeys(unknowns.names, "not identifiable from this flight")
@@ -60,6 +61,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
             unit=unknowns.units[i],
             note=_note(fit, i, float(width[i])) if identifiable[i] else reasons[name],
             noise_limit=limits[name],
+            bracket=(float(lower[i]), float(upper[i])) if np.isfinite([lower[i], upper[i]]).all() else None,
         )
         for i in free
     }

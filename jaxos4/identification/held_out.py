@@ -9,13 +9,15 @@ import numpy as np
 from jaxtyping import Array
 
 from .._custom_types import Numeric, as_float
-from ..analysis.diagnostics import residual_diagnostics
+from ..analysis.diagnostics import Correlations, residual_correlations, residual_diagnostics
 from ..analysis.evaluation import evaluate
 from ..analysis.frequency_response import frequency_response
-from ..analysis.open_loop import disturbances
+from ..analysis.open_loop import Traced, traced
 from ..analysis.prediction import Predictions, Skill, predictions, skill
+from ..analysis.traces import Traces, position_of
 from ..estimate import fit_start
 from ..estimators import EquationError
+from ..flight import RATES
 from ..shooting import ShootingProblem, padded, with_room
 from ..shooting.gains import LogNoise
 from .answers import channel_fits
@@ -70,12 +72,52 @@ def _disturbances(
     case: Case, fitted: ShootingProblem, held_out: ShootingProblem, parameters: np.ndarray, noise: LogNoise
 ) -> np.ndarray:
     """The disturbances of the vehicle, from all measurements: those that were fitted and those that were not."""
-    if not case.validate:
-        own, others = np.asarray(held_out.flight.states), np.asarray(fitted.flight.states)
-        both = as_float(np.where(np.isnan(own), others, own))
-        held_out = eqx.tree_at(lambda p: p.flight.states, held_out, both)
-    samples = held_out.flight.time.shape[0]
-    return disturbances(with_room(held_out, max(samples, case.room)), as_float(parameters), noise)[:samples]
+    return _traced(case, held_out if case.validate else _together(fitted, held_out), parameters, noise).disturbance
+
+
+def _together(fitted: ShootingProblem, held_out: ShootingProblem) -> ShootingProblem:
+    """The problem with all measurements: those that were fitted, and those that were held out."""
+    own, others = np.asarray(held_out.flight.states), np.asarray(fitted.flight.states)
+    return eqx.tree_at(lambda p: p.flight.states, held_out, as_float(np.where(np.isnan(own), others, own)))
+
+
+def _traced(case: Case, problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise) -> Traced:
+    samples = problem.flight.time.shape[0]
+    found = traced(with_room(problem, max(samples, case.room)), as_float(parameters), noise)
+    return Traced(*(each[:samples] for each in found))
+
+
+def vehicle_traces(case: Case, fit: Fit, predicted: Predictions | None) -> tuple[Traces, Correlations]:
+    """The signals of the fitted flights, and the correlations of the innovations.
+
+    `predicted`: the predictions that the result keeps.
+    """
+    problem = fit.problem if case.held_out is None or case.validate else _together(fit.problem, case.held_out)
+    values = np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count]
+    noise = LogNoise(*np.zeros((3, 3))) if fit.noise is None else fit.noise
+    found, flight = _traced(case, problem, values, noise), fit.problem.flight
+    states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
+    start = np.zeros(0, int) if predicted is None else predicted.start
+    log, time = case.clock
+    start_log, start_time = (each[start] for each in (case.tested_clock if case.validate else case.clock))
+    traces = Traces(
+        time=time,
+        log=log,
+        rotors=omega,
+        measured=states[:, RATES],
+        predicted=states[:, :0],
+        disturbance=found.disturbance,
+        position=position_of(states),
+        start_time=start_time,
+        start_log=start_log,
+    )
+    torques = omega**2 @ np.asarray(fit.problem.model.airframe.mixer)[:3].T
+    crossed = residual_correlations(found.innovation, torques)
+    if fit.searched is not None and (parts := fit.searched[1].parts) is not None:
+        # Of the innovations of the likelihood itself, which is exact for means.
+        products = np.asarray(parts.products).sum(axis=0)[:3]
+        crossed = crossed._replace(own=products[:, 1:] / np.maximum(products[:, :1], 1.0))
+    return traces.thinned(), crossed
 
 
 def _regressed(problem: ShootingProblem, room: int, values: np.ndarray, held: Sequence[bool]) -> np.ndarray:

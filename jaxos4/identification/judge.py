@@ -8,8 +8,10 @@ import msgspec
 import numpy as np
 
 from .._custom_types import as_float
+from ..analysis.diagnostics import residual_correlations
 from ..analysis.frequency_response import frequency_response
 from ..analysis.prediction import Predictions
+from ..analysis.traces import flight_traces
 from ..models.flight_model import FlightModel
 from ..recording.motion import EXCITED
 from ..results import meaning, result_names
@@ -27,7 +29,7 @@ from .doubts import (
     vibration,
 )
 from .fit import Fit
-from .held_out import predict_held_out, validate_on
+from .held_out import predict_held_out, validate_on, vehicle_traces
 from .prepare import Case, Progress
 from .quantities import doubts_of_flight, flight_quantities, vehicle_quantities
 from .results import RigidBody, SampleTime
@@ -63,7 +65,11 @@ def _judge_flight(case: Case, fit: Fit) -> dict[str, Any]:
     quantities = flight_quantities(table, body)
     doubts = [*doubts_of_flight(table, body, case.doubts)]
     judged = _verdicts(fit, quantities, doubts, is_vehicle=False)
-    return {"parameters": table, "rigid_body": body, "validation": other, **judged}
+    shown = {}
+    if (found := fit.evaluation) is not None and found.feasible:
+        errors = np.where(np.isnan(found.measured), np.nan, found.errors)[:, : found.problem.size]
+        shown = {"traces": flight_traces(found), "correlations": residual_correlations(errors, found.torques)}
+    return {"parameters": table, "rigid_body": body, "validation": other, **judged, **shown}
 
 
 def _judge_vehicle(case: Case, fit: Fit, sample_times: Sequence[SampleTime], progress: Progress) -> dict[str, Any]:
@@ -106,13 +112,17 @@ def _judge_vehicle(case: Case, fit: Fit, sample_times: Sequence[SampleTime], pro
         *(moved_by_sample_time(*pair, body.constants) if pair else ()),
     ]
     quantities = vehicle_quantities(model, fit, table, body.constants, skill, still)
+    predicted = None if predicted is None else predicted.thinned(_MOST_STARTS)
+    traces, correlations = vehicle_traces(case, fit, predicted)
     values = as_float(np.asarray(fit.estimate.parameters)[: own.count])
     return {
         "parameters": table,
         "rigid_body": body,
         "notes": notes,
         "skill": skill,
-        "predictions": None if predicted is None else predicted.thinned(_MOST_STARTS),
+        "predictions": predicted,
+        "traces": traces,
+        "correlations": correlations,
         "response": frequency_response(with_room(fit.problem, case.room), values),
         **_verdicts(fit, quantities, doubts, is_vehicle=True),
     }

@@ -91,6 +91,10 @@ def own_settings(kind: type[S], settings: Settings | None) -> S:
     return kind() if settings is None else settings
 
 
+Clock = tuple[np.ndarray, np.ndarray]
+NO_CLOCK: Clock = np.zeros(0, int), np.zeros(0)
+
+
 class Case(NamedTuple):
     """Everything that a fit needs, and the measurements that test it.
 
@@ -102,6 +106,8 @@ class Case(NamedTuple):
     - `provenance`: data, settings and versions.
     - `validate`: the name of the other recording that `held_out` is; empty: it is a part of the fitted ones.
     - `doubts`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
+    - `clock`: of each sample of a vehicle, the number of its log, and its time in this log [s]. `tested_clock`: the
+      same for `held_out`, if that is another recording.
     """
 
     problem: ShootingProblem | InnovationsProblem
@@ -115,6 +121,8 @@ class Case(NamedTuple):
     validate: str = ""
     doubts: tuple[Finding, ...] = ()
     log_step: float = 0.0
+    clock: Clock = NO_CLOCK
+    tested_clock: Clock = NO_CLOCK
 
     @property
     def is_vehicle(self) -> bool:

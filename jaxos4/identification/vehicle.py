@@ -22,7 +22,7 @@ from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, def
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import input_innovations
-from .prepare import Case, Progress, VehicleSettings, airframe_name, name_and_class, versions
+from .prepare import NO_CLOCK, Case, Clock, Progress, VehicleSettings, airframe_name, name_and_class, versions
 from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
 from .results import Provenance
 
@@ -92,7 +92,7 @@ def _case(
         raise InputError(
             f"{recordings[0].name}: {measured} measurements for {unknowns.count} unknowns; give a longer flight."
         )
-    held_out, tested_seconds, notes = _held_out(recordings, validate, prepared, shooting, model)
+    held_out, tested_seconds, notes, tested_clock = _held_out(recordings, validate, prepared, shooting, model)
     stretch = prepared.fitted.stretch
     number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
     powered = any(VOLTAGE in TERMS[term].needs for term in terms)
@@ -112,7 +112,7 @@ def _case(
     problem = _innovations(shooting, prepared, room)
     return Case(
         problem, shooting, FilterError(tolerance=_TOLERANCE), name, "flight", held_out, recording, provenance,
-        validate.name if validate else "", prepared.doubts, prepared.log_step,
+        validate.name if validate else "", prepared.doubts, prepared.log_step, (recording, prepared.time), tested_clock,
     )  # fmt: skip
 
 
@@ -170,26 +170,30 @@ def _held_out(
     prepared: Prepared,
     fitted: ShootingProblem,
     model: FlightModel,
-) -> tuple[ShootingProblem | None, float, tuple[str, ...]]:
-    """The flight that is predicted and not fitted, if there is one; how long it lasts [s]; the notes about all data."""
+) -> tuple[ShootingProblem | None, float, tuple[str, ...], Clock]:
+    """The flight that is predicted and not fitted, if there is one; how long it lasts [s]; the notes about all data.
+
+    **Returns:** also the clock of that flight, if it is another recording.
+    """
     name, notes, seconds = recordings[0].name, prepared.notes, prepared.seconds[1]
-    remedy = "give `holdout` 0 or `validate`"
+    remedy, clock = "give `holdout` 0 or `validate`", NO_CLOCK
     if validate is not None:
         other = _prepare_other(recordings, validate, prepared, model)
         own = dataclasses.replace(model, recordings=other.recordings)
         held_out, seconds = _problem(own, other.fitted), other.seconds[0]
         name, remedy, notes = validate.name, "give another flight", notes + other.notes
+        clock = np.full(other.time.size, len(recordings)), other.time
     elif prepared.tested is not None:
         held_out = dataclasses.replace(fitted, flight=prepared.tested)
     else:
-        return None, 0.0, (*notes, "nothing was held out, so no prediction checks the fit")
+        return None, 0.0, (*notes, "nothing was held out, so no prediction checks the fit"), clock
     try:
         starts(held_out.flight)
     except ValueError:
         raise InputError(
             f"{name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
         ) from None
-    return held_out, seconds, notes
+    return held_out, seconds, notes, clock
 
 
 def _prepare_other(

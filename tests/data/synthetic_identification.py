@@ -5,6 +5,7 @@ import numpy as np
 from helpers import CRAZYFLIE
 
 from jaxos4 import AxisResponse, FrequencyResponse, Predictions
+from jaxos4.analysis.traces import Traces
 from jaxos4.identification.results import (
     ChannelFit,
     Constant,
@@ -107,3 +108,10 @@ def synthetic_predictions(starts=160) -> Predictions:
     measured[3, 1, 0] = np.nan
     predicted = np.sin(3 * time) + 0.3 * horizons[:, None] * np.cos(40 * time)
     return Predictions(start, horizons, np.sin(3 * time[:, 0]), predicted, measured)
+
+
+def synthetic_traces(time, log, measured) -> Traces:
+    """Traces of rotors at one speed, with a disturbance and no position."""
+    rotors, none = np.full((time.size, 4), 200.0), np.zeros((time.size, 0))
+    gusts = np.stack([np.sin(time), np.cos(time), time], axis=1)
+    return Traces(time, log, rotors, measured, none, gusts, none, time[:0], log[:0])
