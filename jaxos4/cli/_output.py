@@ -21,7 +21,19 @@ from ..errors import InputError, printable
 
 _ARGUMENTS = (
     *("angle", "bandwidth", "bracket", "channels", "criterion", "distance", "dt", "duration", "estimator", "fastest"),
-    *("gust", "holdout", "horizon", "initial_state", "network", "rate", "sample_time", "samples", "seed", "slew"),
+    *(
+        "gust",
+        "holdout",
+        "horizon",
+        "inertia_z",
+        "initial_state",
+        "network",
+        "rate",
+        "sample_time",
+        "samples",
+        "seed",
+        "slew",
+    ),
     *("slowest", "spacing", "terms", "validate", "velocity", "window"),
 )
 OPTIONS = {
