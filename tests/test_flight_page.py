@@ -18,9 +18,9 @@ from rich.console import Console
 from synthetic_identification import (
     COLOURED,
     CONSTANTS,
-    KNOWN,
     SAMPLE_TIMES,
     WHITE,
+    behind_an_estimate,
     identified_flight,
     identified_vehicle,
     synthetic_response,
@@ -28,7 +28,6 @@ from synthetic_identification import (
 )
 
 from jaxos4 import Predictions, read_result
-from jaxos4.analysis.diagnostics import residual_correlations
 from jaxos4.analysis.inertia import CenterOfMass
 from jaxos4.identification.results import Disturbance, HeldParameter, ParameterEstimate, RigidBody, Validation
 from jaxos4.identification.verdict import Verdict
@@ -132,19 +131,11 @@ def test_fitted_and_held_out_parts_are_on_one_axis_of_all_logs():
 
 
 def test_what_stands_behind_an_estimate_is_drawn(tmp_path):
-    time = 0.01 * np.arange(400)
-    flown = synthetic_traces(time, np.zeros(400, int), np.ones((400, 12)))
-    path = np.stack([np.sin(time), np.cos(time), time], axis=1)
-    traces = flown._replace(predicted=0.9 * flown.measured, disturbance=flown.measured[:, :0], position=path)
-    rng = np.random.default_rng(0)
-    torques, noise = rng.normal(size=(400, 3)), rng.normal(size=(400, 12))
-    noise[5:, 1] = 0.5 * torques[:-5, 2]  # q follows the yaw torque
-    correlations = residual_correlations(noise, torques)
+    behind = behind_an_estimate()
+    correlations = behind["correlations"]
     assert (np.abs(correlations.own) < correlations.bound[:, None]).mean() == pytest.approx(0.95, abs=0.03)
     assert correlations.with_torque[1, 2].argmax() == 25 + 5
-    rows = {name: msgspec.structs.replace(KNOWN, bracket=(5e4, 6e4)) for name in ("alpha3", "alpha6")}
-    covariance = [[4.0, -1.9], [-1.9, 1.0]]
-    found = identified_flight(traces=traces, correlations=correlations, parameters=rows, covariance=covariance)
+    found = identified_flight(**behind)
     write_flight_page(tmp_path / "flight.html", found)
     text = (tmp_path / "flight.html").read_text(encoding="utf-8")
     stands_alone(text)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import CRAZYFLIE
 from sign_flights import flown
-from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle
+from synthetic_identification import SAMPLE_TIMES, behind_an_estimate, identified_flight, identified_vehicle
 from synthetic_study import ESTIMATORS, synthetic_study
 
 from jaxos4 import PublishedOS4, compare_results
@@ -95,7 +95,7 @@ def addresses(tmp_path_factory):
     for name, found in {
         "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
         "without predictions": identified_vehicle(predictions=None),
-        "os4": identified_flight(),
+        "os4": identified_flight(**behind_an_estimate()),
     }.items():
         files[name] = folder / f"{name}.html"
         write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")

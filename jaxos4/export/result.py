@@ -124,7 +124,11 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
         )
         if inertia_z is not None:
             used = float(found.vehicle.inertia[2])
-            limit = "" if math.isclose(used, inertia_z, rel_tol=1e-6) else f": a rigid body with these Ix and Iy allows {used:.4g}"
+            limit = (
+                ""
+                if math.isclose(used, inertia_z, rel_tol=1e-6)
+                else f": a rigid body with these Ix and Iy allows {used:.4g}"
+            )
             own = tuple(note for note in found.notes if not note.startswith("Iz: "))
             found = found._replace(notes=(*own, f"Iz: a guess, {inertia_z:.4g} kg m^2 was given{limit}"))
         if why := found.vehicle.impossible:

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from .._files import check_writable, write_file
 from ..airframe import Airframe
 from ..errors import InputError, printable
-from ..flight import ANGLES, POSITION, RATES, VELOCITY
-from ..logs import Recording, Source, as_recording
+from ..flight import ANGLES, POSITION, RATES, VELOCITY, Flight
+from ..logs import Recording, Source, as_recording, read_recording
 from ..logs.sampling import filled
 from ..logs.table import counted
 from ..recording.inspection import Inspection, inspect_log
@@ -76,7 +76,8 @@ def write_log_page(
     **Raises:** `OSError` if the page cannot be written; `InputError` if the log cannot be read.
     """
     check_writable(path)
-    recording = as_recording(log, airframe=airframe)
+    given = isinstance(log, Recording | Flight)
+    recording = as_recording(log) if given else read_recording(log, airframe, full_scale=1.0)
     found = inspect_log(recording, airframe) if found is None else found
     full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     flown = usable(recording, airframe)

@@ -5,6 +5,7 @@ import numpy as np
 from helpers import CRAZYFLIE
 
 from jaxos4 import AxisResponse, FrequencyResponse, Predictions
+from jaxos4.analysis.diagnostics import residual_correlations
 from jaxos4.analysis.traces import Traces
 from jaxos4.identification.results import (
     ChannelFit,
@@ -115,3 +116,17 @@ def synthetic_traces(time, log, measured) -> Traces:
     rotors, none = np.full((time.size, 4), 200.0), np.zeros((time.size, 0))
     gusts = np.stack([np.sin(time), np.cos(time), time], axis=1)
     return Traces(time, log, rotors, measured, none, gusts, none, time[:0], log[:0])
+
+
+def behind_an_estimate() -> dict:
+    """What stands behind an estimate of twelve channels: traces, correlations of residuals, brackets, a covariance."""
+    time, rng = 0.01 * np.arange(400), np.random.default_rng(0)
+    flown = synthetic_traces(time, np.zeros(400, int), np.sin(time[:, None] * np.arange(1, 13)))
+    path = np.stack([np.sin(time), np.cos(time), time], axis=1)
+    predicted = flown.measured + 0.01 * rng.normal(size=(400, 12))
+    traces = flown._replace(predicted=predicted, disturbance=flown.measured[:, :0], position=path)
+    torques, noise = rng.normal(size=(400, 3)), rng.normal(size=(400, 12))
+    noise[5:, 1] = 0.5 * torques[:-5, 2]  # q follows the yaw torque
+    rows = {name: msgspec.structs.replace(KNOWN, bracket=(5e4, 6e4)) for name in ("alpha3", "alpha6")}
+    behind = {"traces": traces, "correlations": residual_correlations(noise, torques), "parameters": rows}
+    return behind | {"covariance": [[4.0, -1.9], [-1.9, 1.0]]}
