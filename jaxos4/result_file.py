@@ -22,7 +22,6 @@ from .results import NAMES
 _NAME = re.compile(r"[\w.() -]{1,80}")
 _REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
-_MOST_LOGS = 100_000
 _EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
 
 _FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
@@ -124,6 +123,11 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
     fits = [*found.fit.values(), *(() if found.validation is None else (found.validation.fit or {}).values())]
     if any(each.level < 0 for each in fits):
         yield "`level`: is negative"
+    if (traces := found.traces) is not None:
+        if found.predictions is not None and found.predictions.start.size != traces.start_time.size:
+            yield "`traces`: has not one time for each start of the predictions"
+        if max(traces.log.max(), traces.start_log.max(initial=0)) > len(found.logs):  # one more: that of `validate`
+            yield "`traces`: is of a log that has no name"
     if (skill := found.skill) is not None:
         table = [each for rate in (skill.p, skill.q, skill.r) for each in msgspec.structs.astuple(rate)]
         if any(len(column) != len(skill.horizons) for column in table):
@@ -154,13 +158,14 @@ def _traces(table: dict[str, Any] | None) -> Traces | None:
         return None
     arrays = _arrays(Traces, table, "traces")
     channels, simulated = arrays["measured"].shape[1], arrays["predicted"].shape[1]
-    if not np.isfinite(np.concatenate([arrays["time"], arrays["start_time"]])).all():
+    spatial = {arrays[name].shape[1] for name in ("position", "disturbance")}
+    if not np.isfinite(np.concatenate([arrays["time"], arrays["start_time"]])).all() or arrays["time"].size < 2:
         raise InputError(f"`traces`: a time is missing; {_AGAIN}")
-    if channels not in CHANNELS.values() or simulated not in (0, channels) or arrays["time"].size < 2:
+    if channels not in CHANNELS.values() or simulated not in (0, channels) or spatial - {0, 3}:
         raise InputError(f"`traces`: has channels that no model has; {_AGAIN}")
     for name in ("log", "start_log"):
         log = arrays[name] = np.nan_to_num(arrays[name], nan=-1.0).astype(int)
-        if (log < 0).any() or (log > _MOST_LOGS).any():
+        if (log < 0).any():
             raise InputError(f"`traces.{name}`: is not the number of a log; {_AGAIN}")
     return Traces(**arrays)
 
@@ -169,7 +174,7 @@ def _correlations(table: dict[str, Any] | None) -> Correlations | None:
     if table is None:
         return None
     arrays = _arrays(Correlations, table, "correlations")
-    if arrays["own"].shape[0] not in CHANNELS.values() or not arrays["with_torque"].shape[2]:
+    if arrays["own"].shape[0] not in CHANNELS.values() or arrays["with_torque"].shape[2] % 2 == 0:
         raise InputError(f"`correlations`: has channels that no model has; {_AGAIN}")
     return Correlations(**arrays)
 
@@ -185,21 +190,12 @@ def _predictions(table: dict[str, Any] | None) -> Predictions | None:
     return Predictions(**arrays | {"start": start.astype(int)})
 
 
-def _symmetric(rows: Any) -> Any:
-    """The matrix of which these are the rows up to the diagonal; anything else as it is."""
-    if not isinstance(rows, list) or [isinstance(row, list) and len(row) for row in rows] != [*range(1, len(rows) + 1)]:
-        return rows
-    return [[rows[max(i, j)][min(i, j)] for j in range(len(rows))] for i in range(len(rows))]
-
-
 def _response(table: dict[str, dict[str, Any]] | None) -> FrequencyResponse | None:
     if table is None:
         return None
     axes = {}
     for name in FrequencyResponse._fields:
-        given = dict(table.get(name, {}))
-        given["covariance"] = _symmetric(given.get("covariance"))
-        arrays = axes[name] = _arrays(AxisResponse, given, f"response.{name}")
+        arrays = axes[name] = _arrays(AxisResponse, table.get(name, {}), f"response.{name}")
         frequency = arrays["frequency"]
         unusable = (arrays["gain"] <= 0) | (np.diagonal(arrays["covariance"]) < 0)
         if not (frequency > 0).all() or not (np.diff(frequency) > 0).all() or unusable.any():

@@ -25,6 +25,7 @@ from synthetic_identification import (
     identified_vehicle,
     synthetic_response,
     synthetic_traces,
+    vehicle_traces,
 )
 
 from jaxos4 import Predictions, read_result
@@ -75,7 +76,7 @@ def test_the_page_says_what_was_found(tmp_path):
         *("0.248 0.73 ± 0.14 0.41 0.400 0.800", "known to less than half of the model"),
         *("jaxos4 estimate flight.csv --model flight --report flight.html", "t is not uniform", "sample time 0.004"),
     )
-    absent = {"predictions": None, "skill": None, "response": None, "rigid_body": RigidBody()}
+    absent = {"traces": None, "predictions": None, "skill": None, "response": None, "rigid_body": RigidBody()}
     text, shown = written(tmp_path / "flight.html", **absent)
     assert not any(said in shown for said in ("Measured, predicted", "Skill", "Frequency response"))
     assert len(text) < 100_000
@@ -88,7 +89,8 @@ def unpacked(line):
 
 
 def test_the_signals_are_the_predictions_with_a_band_of_95_percent():
-    found = identified_vehicle()
+    unfitted = vehicle_traces()._replace(measured=np.full((400, 3), np.nan))
+    found = identified_vehicle(traces=unfitted)
     predicted, look = found.predictions, styles(["ibss"])["ibss"]
     drawn = json.loads(identified_signals(found, look))
     assert [view["name"] for view in drawn["views"]] == ["0.1 s ahead", "0.248 s ahead", "0.5 s ahead"]
@@ -97,7 +99,7 @@ def test_the_signals_are_the_predictions_with_a_band_of_95_percent():
     measured = np.where(np.arange(3)[:, None] > 0, np.nan, predicted.measured)
     short = msgspec.structs.replace(found, predictions=predicted._replace(measured=measured))
     assert json.loads(identified_signals(short, look))["shown"] == 0
-    # Of a file of an older version, which has no traces: the line breaks between two stretches.
+    # The line breaks between two stretches.
     view, half = drawn["views"][1], prediction_band(predicted)
     time = np.frombuffer(base64.b64decode(view["time"]), "<f4")
     assert (np.diff(time) > 0).all()

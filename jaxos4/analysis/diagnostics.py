@@ -116,9 +116,7 @@ def residual_correlations(
     measured = np.isfinite(errors)
     errors = np.where(measured, errors, 0.0)
     own, pairs = (x[:, lags + 1 :] for x in _correlations(errors, errors, measured, measured, lags))
-    driving = np.arange(torques.shape[0]) < torques.shape[0] - 1
-    moves = np.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
-    crossed = [_with_torque(errors, measured, own, torque, driving, lags) for torque in moves.T]
+    crossed = [_with_torque(errors, measured, own, torque, lags) for torque in _moves(torques).T]
     known = np.maximum(measured.sum(axis=0), 1)
     return Correlations(
         own,
@@ -128,16 +126,17 @@ def residual_correlations(
     )
 
 
+def _moves(torques: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
+    """The torques less their means. The last row of rotor speeds drives nothing."""
+    return np.append(torques[:-1] - torques[:-1].mean(axis=0), np.zeros((1, 3)), axis=0)
+
+
 def _with_torque(
-    errors: np.ndarray,
-    measured: np.ndarray,
-    autocorrelation: np.ndarray,
-    torque: np.ndarray,
-    driving: np.ndarray,
-    lags: int,
+    errors: np.ndarray, measured: np.ndarray, autocorrelation: np.ndarray, torque: np.ndarray, lags: int
 ) -> tuple[Float[np.ndarray, "size both"], Float[np.ndarray, "size both"]]:
     """The correlation with a torque at each lag, and its standard deviation if there is no dependence."""
-    column, drives, taper = torque[:, None], driving[:, None], 1 - np.arange(1, lags + 1) / (lags + 1)
+    column, taper = torque[:, None], 1 - np.arange(1, lags + 1) / (lags + 1)
+    drives = np.arange(len(column))[:, None] < len(column) - 1
     correlation, pairs = _correlations(errors, column, measured, drives, lags)
     own = _correlations(column, column, drives, drives, lags)[0][0, lags + 1 :]
     # Variance of the correlation of two coloured series, relative to white ones; at least 1.
@@ -156,13 +155,11 @@ def _dependence(
     """The largest correlation with each torque, and the p-value of residuals that depend on no torque."""
     from scipy.special import ndtr
 
-    # The last row of rotor speeds drives nothing.
-    driving = np.arange(torques.shape[0]) < torques.shape[0] - 1
-    moves = np.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
+    moves = _moves(torques)
     torques = np.where(np.abs(moves).max(axis=0) > rounding * np.abs(torques[:-1]).max(axis=0), moves, 0.0)
     found, worst = [], []
     for torque in torques.T:
-        correlation, error = _with_torque(errors, measured, autocorrelation, torque, driving, lags)
+        correlation, error = _with_torque(errors, measured, autocorrelation, torque, lags)
         deviations = np.abs(correlation) / error
         at = np.argmax(deviations, axis=1)[:, None]
         found.append(np.take_along_axis(correlation, at, axis=1)[:, 0])

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from ..flight import POSITION
 from ..models.state import CASCADE_ORDER
 from .evaluation import Evaluation
+from .frequency_response import significant
 
 
 class Traces(NamedTuple):
@@ -32,27 +33,12 @@ class Traces(NamedTuple):
     start_log: Int[np.ndarray, " starts"]
 
     def thinned(self, most: int = 1200, *, digits: int = 5) -> "Traces":
-        """At most `most` samples: means of as many samples, if there is a disturbance, else every so many samples.
-
-        Each column keeps `digits` digits of its largest value.
-        """
+        """Every so many samples, `most` at most. Channels and rotors have so many significant `digits`."""
         every = -(-self.time.size // most)
-        first, averages = np.arange(0, self.time.size, every), self.disturbance.shape[1] > 0
-
-        def fewer(name: str) -> np.ndarray:
-            values = getattr(self, name)
-            if name.startswith("start"):
-                return values.round(digits) if name == "start_time" else values
-            if averages and name in ("rotors", "measured", "disturbance"):
-                known = np.isfinite(values)
-                count = np.add.reduceat(known.astype(float), first)
-                sums = np.add.reduceat(np.where(known, values, 0.0), first)
-                values = np.divide(sums, count, out=np.full(sums.shape, np.nan), where=count > 0)
-            else:
-                values = values[first]
-            return values.round(digits) if name == "time" else values if values.ndim < 2 else _rounded(values, digits)
-
-        return Traces(**{name: fewer(name) for name in self._fields})
+        fewer = {name: values[::every] for name, values in self._asdict().items() if not name.startswith("start")}
+        fewer |= {name: significant(values, digits) for name, values in fewer.items() if values.ndim == 2}
+        times = {"time": self.time[::every].round(digits), "start_time": self.start_time.round(digits)}
+        return self._replace(**fewer | times)
 
 
 def flight_traces(found: Evaluation) -> Traces:
@@ -70,10 +56,3 @@ def position_of(states: Float[np.ndarray, "samples 12"]) -> Float[np.ndarray, "s
     """The measured positions, or nothing if there are none."""
     position = states[:, POSITION]
     return position if np.isfinite(position).all(axis=1).any() else position[:, :0]
-
-
-def _rounded(values: Float[np.ndarray, "samples columns"], digits: int) -> Float[np.ndarray, "samples columns"]:
-    largest = np.abs(np.where(np.isfinite(values), values, 0.0)).max(axis=0, initial=0.0)
-    places = digits - np.ceil(np.log10(np.where(largest > 0, largest, 1.0))).astype(int)
-    columns = [column.round(int(place)) for column, place in zip(values.T, places, strict=True)]
-    return np.stack(columns, axis=1) if columns else values

@@ -42,7 +42,9 @@ def predict_held_out(case: Case, fit: Fit, held_out: ShootingProblem) -> tuple[P
             fitted = dict(zip(fit.problem.unknowns.names, values.tolist(), strict=True))
             each = {n: [fitted[own] for own in fitted if own.rpartition("_")[0] == n] for n in held_out.unknowns.names}
             parameters = np.array([fitted[n] if n in fitted else np.mean(each[n]) for n in each])
-        known = None if noise is None else _disturbances(case, fit.problem, held_out, parameters, noise)
+        seen, known = _together(case, fit.problem, held_out), None
+        if noise is not None:
+            known = _traced(case, seen, parameters, noise).disturbance
         predicted = predictions(held_out, as_float(parameters), disturbance=known, noise=noise)
         return predicted, skill(predicted)
 
@@ -65,18 +67,13 @@ def compile_ahead(case: Case) -> None:
         return
     _regressed(problem, case.room, center, [False] * center.size)
     if not case.validate:
-        _disturbances(case, problem, held_out, center, LogNoise(*np.zeros((3, problem.columns.size))))
+        _traced(case, problem, center, LogNoise(*np.zeros((3, problem.columns.size))))
 
 
-def _disturbances(
-    case: Case, fitted: ShootingProblem, held_out: ShootingProblem, parameters: np.ndarray, noise: LogNoise
-) -> np.ndarray:
-    """The disturbances of the vehicle, from all measurements: those that were fitted and those that were not."""
-    return _traced(case, held_out if case.validate else _together(fitted, held_out), parameters, noise).disturbance
-
-
-def _together(fitted: ShootingProblem, held_out: ShootingProblem) -> ShootingProblem:
-    """The problem with all measurements: those that were fitted, and those that were held out."""
+def _together(case: Case, fitted: ShootingProblem, held_out: ShootingProblem) -> ShootingProblem:
+    """The problem with all measurements: those that were fitted, and those that were held out of the same flight."""
+    if case.validate:
+        return held_out
     own, others = np.asarray(held_out.flight.states), np.asarray(fitted.flight.states)
     return eqx.tree_at(lambda p: p.flight.states, held_out, as_float(np.where(np.isnan(own), others, own)))
 
@@ -92,25 +89,17 @@ def vehicle_traces(case: Case, fit: Fit, predicted: Predictions | None) -> tuple
 
     `predicted`: the predictions that the result keeps.
     """
-    problem = fit.problem if case.held_out is None or case.validate else _together(fit.problem, case.held_out)
+    problem = fit.problem if case.held_out is None or case.validate else _together(case, fit.problem, case.held_out)
     values = np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count]
     noise = LogNoise(*np.zeros((3, 3))) if fit.noise is None else fit.noise
     found, flight = _traced(case, problem, values, noise), fit.problem.flight
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
+    position = position_of(np.asarray(problem.flight.states, float))
     start = np.zeros(0, int) if predicted is None else predicted.start
     log, time = case.clock
     start_log, start_time = (each[start] for each in (case.tested_clock if case.validate else case.clock))
-    traces = Traces(
-        time=time,
-        log=log,
-        rotors=omega,
-        measured=states[:, RATES],
-        predicted=states[:, :0],
-        disturbance=found.disturbance,
-        position=position_of(states),
-        start_time=start_time,
-        start_log=start_log,
-    )
+    signals = omega, states[:, RATES], states[:, :0], found.disturbance, position
+    traces = Traces(time, log, *signals, start_time, start_log)
     torques = omega**2 @ np.asarray(fit.problem.model.airframe.mixer)[:3].T
     crossed = residual_correlations(found.innovation, torques)
     if fit.searched is not None and (parts := fit.searched[1].parts) is not None:

@@ -20,17 +20,11 @@ _NONE = (None, None)
 
 
 def series(value: Any) -> Any:
-    """A named tuple of arrays as dictionaries and lists; `None` for what is not finite.
-
-    A covariance is symmetric: each row ends at its diagonal.
-    """
+    """A named tuple of arrays as dictionaries and lists; `None` for what is not finite."""
     if value is None:
         return None
     if hasattr(value, "_asdict"):
-        table = {name: series(each) for name, each in value._asdict().items()}
-        if "covariance" in table:
-            table["covariance"] = [row[: i + 1] for i, row in enumerate(table["covariance"])]
-        return table
+        return {name: series(each) for name, each in value._asdict().items()}
     found = np.asarray(value).astype(object)
     found[~np.isfinite(value)] = None
     return found.tolist()

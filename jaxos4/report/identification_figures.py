@@ -1,5 +1,8 @@
 """Figures of what stands behind an estimate: priors, correlations of parameters and of residuals, and the path."""
 
+import itertools
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup, escape
@@ -71,16 +74,43 @@ def residual_figure(found: Correlations) -> Figure:
     return figure
 
 
-def path_in_space(traces: Traces, look: Style) -> Figure:
-    """The measured path in space; of an OS4, the predicted one too."""
-    figure = Figure(figsize=(5.0, 4.4))
-    panel = figure.add_subplot(projection="3d")
-    panel.plot(*traces.position.T, color=INK, linewidth=1.0, linestyle=BOUND_DASHES[1])
+def path_in_space(traces: Traces, look: Style, *, turn: float = -60.0, height: float = 28.0) -> Figure:
+    """The measured path in its box, with its shadow on the floor; of an OS4, the predicted one too.
+
+    `turn`, `height`: from where the box is seen [degrees].
+    """
+    turned, up = np.radians([turn, height])
+    right = np.array([-np.sin(turned), np.cos(turned), 0.0])
+    above = np.array([-np.cos(turned) * np.sin(up), -np.sin(turned) * np.sin(up), np.cos(up)])
+    paths = [traces.position]
     if traces.predicted.shape[1] == len(CASCADE_ORDER):
-        panel.plot(*traces.predicted[:, [6, 8, 10]].T, color=look.color, linewidth=1.4)
-    panel.plot(*traces.position[:1].T, "o", color=INK, markersize=4)
-    panel.set_title("path [m], from the dot")
-    panel.set(xlabel="x", ylabel="y", zlabel="z")
+        paths.append(traces.predicted[:, [6, 8, 10]])
+    every = np.concatenate(paths)
+    low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
+    room = np.maximum(0.05 * np.max(high - low) - (high - low) / 2, 0.0) + 1e-3
+    low, high = low - room, high + room
+    corners = np.where(list(np.ndindex(2, 2, 2)), high, low)
+    figure, (panel,) = grid(1, columns=1, width=4.4, height=3.6)
+
+    def draw(points: Float[np.ndarray, "_points 3"], **how: Any) -> None:
+        panel.plot(points @ right, points @ above, **how)
+
+    for i, j in itertools.combinations(range(8), 2):
+        if np.count_nonzero(corners[i] != corners[j]) == 1:
+            draw(corners[[i, j]], color=FAINT, linewidth=0.6)
+    draw(np.column_stack([paths[0][:, :2], np.full(len(paths[0]), low[2])]), color=FAINT, linewidth=0.8)
+    draw(paths[0], color=INK, linewidth=1.0, linestyle=BOUND_DASHES[1])
+    for path in paths[1:]:
+        draw(path, color=look.color, linewidth=1.4)
+    draw(paths[0][:1], color=INK, marker="o", markersize=4)
+    for axis, ends in enumerate(([0, 4], [4, 6], [0, 1])):  # the edges in front, and the left one
+        middle = corners[ends].mean(axis=0)
+        text, align = f"{'xyz'[axis]} {low[axis]:.3g} to {high[axis]:.3g} m", ("right", "left", "right")[axis]
+        panel.text(
+            middle @ right, middle @ above, f" {text} ", ha=align, va="center" if axis == 2 else "top", fontsize=8
+        )
+    panel.set_aspect("equal")
+    panel.set_axis_off()
     return figure
 
 

@@ -56,7 +56,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
             figures["priors"] = figure
         if found.correlations is not None:
             figures["residuals"] = residual_figure(found.correlations)
-        if found.traces is not None and found.traces.position.shape[1]:
+        if found.traces is not None and np.isfinite(found.traces.position).any():
             figures["path"] = path_in_space(found.traces, look)
         for figure in figures.values():
             # The page shows each panel by itself. To fit all labels exactly would take a third of the time.

@@ -29,8 +29,6 @@ def identified_signals(found: Identification, look: Style) -> str:
     A vehicle has a view for each horizon of its predictions, an OS4 one for each group of channels.
     """
     traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
-    if traces is None and ahead is not None:  # a file of an older version
-        traces = _of_predictions(ahead, found.provenance.sample_time)
     if traces is None:
         return ""
     validate, shown, shaded = found.provenance.validate or "", 0, []
@@ -48,7 +46,7 @@ def identified_signals(found: Identification, look: Style) -> str:
         shaded = spans(time, known)
     else:
         views = [View("rates", time, [_panel(i, traces.measured[:, i], None, look) for i in range(3)])]
-    names = [printable(Path(name).name) for name in (*found.logs, *filter(None, [validate]))]
+    names = [printable(Path(name).name) for name in (*found.logs, validate)]
     common = View("", time, _common(traces))
     return signals(axis, [common] * bool(common.panels), views, shown=shown, shaded=shaded, names=names)
 
@@ -104,10 +102,3 @@ def prediction_band(ahead: Predictions) -> Float[np.ndarray, "horizons 3"]:
     """Half the width of the band that holds 95 % of the errors, by horizon and rate [rad/s]."""
     errors = np.abs(ahead.predicted - ahead.measured)
     return np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), BAND, axis=0)
-
-
-def _of_predictions(ahead: Predictions, sample_time: float) -> Traces:
-    """Traces with the starts of the predictions, and nothing besides."""
-    count, time = ahead.start.size, ahead.start * sample_time
-    unknown, log, none = np.full((count, 4), np.nan), np.zeros(count, int), np.zeros((count, 0))
-    return Traces(time, log, unknown, unknown[:, :3], none, none, none, time, log)

@@ -94,9 +94,7 @@ def write_log_page(
         format=recording.facts.format.label if recording.facts.format else "recording",
         verdict=verdict(found),
         signals=logged(recording, found, rules),
-        coarse=2e3 * recording.dt * -(-recording.time.size // rules.samples)
-        if recording.time.size > rules.samples
-        else 0,
+        block=2e3 * recording.dt * max(-(-recording.time.size // rules.samples), 1),
         fitted=words(fitted(recording, airframe)),
         measured=[
             (name, unit_of(name, recording.commanded and full == 1), one) for name, one in found.measured.items()
@@ -216,7 +214,7 @@ def spectra(flown: Sequence[Recording], band: tuple[float, float] | None, rules:
     found = {title: density for title, density in found.items() if np.isfinite(density).any()}
     if not found:
         return None
-    figure, panels = grid(len(found), columns=2, height=2.6)
+    figure, panels = grid(len(found), columns=2, width=4.5 * len(found), height=2.6)
     for panel, (title, density) in zip(panels, found.items(), strict=True):
         for column, look, dash in zip(density.T, map(style, range(3)), (0, 2, 1), strict=True):
             panel.plot(frequency, column, color=look.color, linestyle=BOUND_DASHES[dash])

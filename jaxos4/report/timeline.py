@@ -118,11 +118,10 @@ def signals(
 
     - `common`: views below the chosen one of `views`. `shown`: the number of the first that is chosen.
     - `shaded`: from when to when the background is grey, on the axis.
-    - `names`: of the logs.
+    - `names`: of the logs, shown if there are several.
     """
-    pieces = [
-        [*(float(x) for x in row[:3]), names[int(row[3])] if len(names) > 1 else ""] for row in zip(*axis, strict=True)
-    ]
+    several = np.ptp(axis.log) > 0
+    pieces = [[*(float(x) for x in row[:3]), names[int(row[3])] if several else ""] for row in zip(*axis, strict=True)]
     return json.dumps(
         {
             "pieces": pieces,

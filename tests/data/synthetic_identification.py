@@ -80,6 +80,7 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         "noise": {"p": 0.41},
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
         "predictions": synthetic_predictions(),
+        "traces": vehicle_traces(),
         "response": synthetic_response(),
         "provenance": Provenance(**VERSIONS | settings | (provenance or {})),
     }
@@ -130,3 +131,12 @@ def behind_an_estimate() -> dict:
     rows = {name: msgspec.structs.replace(KNOWN, bracket=(5e4, 6e4)) for name in ("alpha3", "alpha6")}
     behind = {"traces": traces, "correlations": residual_correlations(noise, torques), "parameters": rows}
     return behind | {"covariance": [[4.0, -1.9], [-1.9, 1.0]]}
+
+
+def vehicle_traces(start=None) -> Traces:
+    """Those of `synthetic_predictions` with these starts: the first seconds of the flight were fitted."""
+    start = synthetic_predictions().start if start is None else start
+    time = 0.025 * np.arange(400)
+    measured = np.where(time[:, None] < 3.5, np.sin(3 * time[:, None]), np.nan) * np.ones(3)
+    found = synthetic_traces(time, np.zeros(400, int), measured)
+    return found._replace(start_time=0.004 * start, start_log=np.zeros(start.size, int)).thinned()
