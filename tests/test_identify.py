@@ -144,17 +144,18 @@ COMMON = (
     *("constants", "airframe", "verdicts", "doubts"),
 )
 SETTINGS = ("airframe", "sample_time", "notes", "version", "jax", "device", "precision")
+ARRAYS = ("traces", "correlations", "predictions", "response")
 # The keys of the JSON, of its provenance, and of a parameter, by the kind of identification.
 KEYS = {
     "flight": (
-        {*COMMON, "fit", "validation"},
+        {*COMMON, "fit", "validation", "traces", "correlations"},
         {*SETTINGS, "flight", "channels", "initial_state", "windows", "samples"},
-        {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit"},
+        {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit", "bracket"},
     ),
     "vehicle": (
-        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times", "predictions", "response"},
+        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times", *ARRAYS},
         {*SETTINGS, "flights", "validate", "terms", "fitted_seconds", "tested_seconds"},
-        {"estimate", "std", "bound", "ci95", "unit", "note"},
+        {"estimate", "std", "bound", "ci95", "unit", "note", "bracket"},
     ),
 }
 
