@@ -147,7 +147,7 @@ def _drone_models(vehicle: RigidVehicle) -> dict[str, Any]:
     """The mixing matrix turns thrusts over `length` into torques, and in its last row drag torques of the rotors."""
     length = vehicle.arm / math.sqrt(2)  # so that the entries of an X are 1 and -1
     x, y = vehicle.rotor_positions.T
-    mixing = [(y / length).tolist(), (-x / length).tolist(), (-vehicle.rotor_spins).tolist()]
+    mixing = [(y / length).tolist(), (0 - x / length).tolist(), (-vehicle.rotor_spins).tolist()]
     return {"length": length, "mixing": mixing, "rpm": 60 / (2 * math.pi)}
 
 
