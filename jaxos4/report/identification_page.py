@@ -93,17 +93,19 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
 
     A moment of inertia that was not identified is in the table too.
     """
-    found_, rows = physical_quantities(found), []
-    for row, cells, note in zip(found_, *quantity_rows(found_), strict=True):
+    every, rows = physical_quantities(found), []
+    for row, cells, note in zip(every, *quantity_rows(every), strict=True):
         own = found.parameters.get(row.name.replace(" ", "_"))
         small = row.judged == RIGID_BODY and abs(row.value) <= NINETY_FIVE * row.std
-        reasons_ = row.verdict.reasons if row.verdict is not None and row.name == row.judged else ()
-        said = dict.fromkeys([note, "" if own is None else own.note, "below noise" if small else "", *reasons_])
+        causes = row.verdict.reasons if row.verdict is not None and row.name == row.judged else ()
+        said = dict.fromkeys([note, "" if own is None else own.note, "below noise" if small else "", *causes])
         rows.append((cells, "; ".join(filter(None, said))))
     listed = {cells[0] for cells, _ in rows}
-    missing = {name: each for name, each in found.verdicts.items() if name in INERTIAS and name not in listed}
-    rows += [((name, MISSING, "", "kg m^2"), "; ".join((each.status, *each.reasons))) for name, each in missing.items()]
-    return rows
+    for name in INERTIAS:
+        if name in found.verdicts and name not in listed:
+            why = found.verdicts[name]
+            rows.append(((name, MISSING, "", "kg m^2"), "; ".join((why.status, *why.reasons))))
+    return sorted(rows, key=lambda row: INERTIAS.index(row[0][0]) if row[0][0] in INERTIAS else len(INERTIAS))
 
 
 def identification_html(found: Identification) -> str:

@@ -120,7 +120,8 @@
         if (panel.residual) {
           const [first, other] = [lines[0].values, lines[lines.length - 1].values];
           const left = first.map((value, i) => (value == null || other[i] == null ? null : value - other[i]));
-          plot("residual", 95, time, [{ label: "measured - predicted", values: left, color: lines[lines.length - 1].color, dash: [] }], 0);
+          const color = lines[lines.length - 1].color;
+          plot("residual", 95, time, [{ label: "measured - predicted", values: left, color, dash: [] }], 0);
         }
       }
     }
@@ -141,7 +142,8 @@
     const before = [...fingers.values()].slice(0, 2).map((position) => at(position, shown));
     fingers.set(event.pointerId, event.clientX);
     const [a, b] = [...fingers.values()].map((position) => at(position, [0, 1]));
-    if (b === undefined) zoom(shown[0] + before[0] - at(event.clientX, shown), shown[1] + before[0] - at(event.clientX, shown));
+    const moved = before[0] - at(event.clientX, shown);
+    if (b === undefined) zoom(shown[0] + moved, shown[1] + moved);
     else if (Math.abs(b - a) > 0.02) {
       const length = Math.abs((before[1] - before[0]) / (b - a)), low = before[0] - a * length;
       zoom(low, low + length);
@@ -164,6 +166,8 @@
   if (list) list.parentElement.hidden = given.views.length < 2;
   list?.addEventListener("change", draw);
   document.addEventListener("theme", draw);
-  addEventListener("resize", () => plots.forEach((each) => each.setSize({ width: box.clientWidth, height: each.height })));
+  addEventListener("resize", () => {
+    for (const each of plots) each.setSize({ width: box.clientWidth, height: each.height });
+  });
   draw();
 })();
