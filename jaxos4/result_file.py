@@ -10,10 +10,13 @@ import numpy as np
 
 from ._files import read_json
 from .airframe import airframe_from_table
+from .analysis.diagnostics import Correlations
 from .analysis.frequency_response import AxisResponse, FrequencyResponse
 from .analysis.prediction import Predictions
+from .analysis.traces import Traces
 from .errors import InputError, named, shortened
 from .identification.results import APART, Constant, Identification, RigidBody
+from .models.state import CHANNELS
 from .results import NAMES
 
 _NAME = re.compile(r"[\w.() -]{1,80}")
@@ -35,6 +38,8 @@ _File = msgspec.defstruct(
         ("airframe", dict[str, Any] | None),
         ("predictions", dict[str, Any] | None, None),
         ("response", dict[str, dict[str, Any]] | None, None),
+        ("traces", dict[str, Any] | None, None),
+        ("correlations", dict[str, Any] | None, None),
     ],
     kw_only=True,
 )
@@ -67,6 +72,8 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
             "is_vehicle": fields["model"] == "flight",
             "predictions": _predictions(fields["predictions"]),
             "response": _response(fields["response"]),
+            "traces": _traces(fields["traces"]),
+            "correlations": _correlations(fields["correlations"]),
         }
         found = Identification(**fields)
         if problem := next(_problems(found, tests), None):
@@ -116,6 +123,11 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
     fits = [*found.fit.values(), *(() if found.validation is None else (found.validation.fit or {}).values())]
     if any(each.level < 0 for each in fits):
         yield "`level`: is negative"
+    if (traces := found.traces) is not None:
+        if found.predictions is not None and found.predictions.start.size != traces.start_time.size:
+            yield "`traces`: has not one time for each start of the predictions"
+        if max(traces.log.max(), traces.start_log.max(initial=0)) > len(found.logs):  # one more: that of `validate`
+            yield "`traces`: is of a log that has no name"
     if (skill := found.skill) is not None:
         table = [each for rate in (skill.p, skill.q, skill.r) for each in msgspec.structs.astuple(rate)]
         if any(len(column) != len(skill.horizons) for column in table):
@@ -124,19 +136,47 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
 
 def _arrays(kind: type, table: dict[str, Any], place: str) -> dict[str, Any]:
     """The arrays of a named tuple by name, checked against the shapes in its annotations; a missing number is NaN."""
-    arrays, sizes = {}, {"3": 3}
+    arrays, sizes = {}, {"3": 3, "4": 4}
     for name, hint in get_type_hints(kind).items():
         try:
             array = np.array(table[name], dtype=float)
         except (KeyError, TypeError, ValueError):
             raise InputError(f"`{place}.{name}`: is not an array of numbers; {_AGAIN}") from None
         names = getattr(hint, "dim_str", "").split()
+        if array.shape == (0,) and len(names) == 2:
+            array = np.zeros((0, sizes.get(names[1], 0)))  # a list of no rows does not say how long they are
         if array.ndim != len(names) or any(
             sizes.setdefault(each, size) != size for each, size in zip(names, array.shape, strict=True)
         ):
             raise InputError(f"`{place}.{name}`: has another shape than the arrays beside it; {_AGAIN}")
         arrays[name] = array if names else float(array)
     return arrays
+
+
+def _traces(table: dict[str, Any] | None) -> Traces | None:
+    if table is None:
+        return None
+    arrays = _arrays(Traces, table, "traces")
+    channels, simulated = arrays["measured"].shape[1], arrays["predicted"].shape[1]
+    spatial = {arrays[name].shape[1] for name in ("position", "disturbance")}
+    if not np.isfinite(np.concatenate([arrays["time"], arrays["start_time"]])).all() or arrays["time"].size < 2:
+        raise InputError(f"`traces`: a time is missing; {_AGAIN}")
+    if channels not in CHANNELS.values() or simulated not in (0, channels) or spatial - {0, 3}:
+        raise InputError(f"`traces`: has channels that no model has; {_AGAIN}")
+    for name in ("log", "start_log"):
+        log = arrays[name] = np.nan_to_num(arrays[name], nan=-1.0).astype(int)
+        if (log < 0).any():
+            raise InputError(f"`traces.{name}`: is not the number of a log; {_AGAIN}")
+    return Traces(**arrays)
+
+
+def _correlations(table: dict[str, Any] | None) -> Correlations | None:
+    if table is None:
+        return None
+    arrays = _arrays(Correlations, table, "correlations")
+    if arrays["own"].shape[0] not in CHANNELS.values() or arrays["with_torque"].shape[2] % 2 == 0:
+        raise InputError(f"`correlations`: has channels that no model has; {_AGAIN}")
+    return Correlations(**arrays)
 
 
 def _predictions(table: dict[str, Any] | None) -> Predictions | None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer
 from helpers import CRAZYFLIE_TOML, refused
+from pages import words
 from synthetic_results import vehicle_result
 
 import jaxos4
@@ -50,14 +51,16 @@ def test_simulate_writes_the_standard_flight(run, tmp_path):
 
 def test_estimate_recovers_the_truth_within_its_intervals(run):
     simulate(run, "flight.csv", "--noise", "1")
-    code, out, err, report = estimate(run)
+    code, out, err, report = estimate(run, "--report", "e.html")
     assert code == 0, err
+    page = words(pathlib.Path("e.html").read_text(encoding="utf-8"))
+    assert all(said in page for said in ("What was found", "Measured, predicted, residual", "What the residuals say"))
     assert {"estimator", "model", "result", "rollouts", "cost", "seconds", "parameters", "fit"} <= report.keys()
     assert pathlib.Path("e.json").read_text().count('"ci95": [-') > 1  # a list of numbers is one line
     assert (report["estimator"], report["model"], report["result"]) == ("ibss", "published", "successful")
     assert list(report["parameters"]) == [f"alpha{i}" for i in range(1, 9)]
     for name, row in report["parameters"].items():
-        assert {"estimate", "std", "bound", "ci95", "unit", "noise_limit", "note"} == row.keys()
+        assert {"estimate", "std", "bound", "ci95", "unit", "noise_limit", "note", "bracket"} == row.keys()
         assert row["ci95"][0] < row["estimate"] < row["ci95"][1]
         assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4 * row["std"]
         assert name in out

@@ -1,11 +1,12 @@
 """`jaxos4 export`: result files, SDF, samples from the covariance, and wrong input."""
 
 import json
+import tomllib
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import CRAZYFLIE, refused
 from synthetic_results import AIRFRAME, VALUES, held, vehicle_result
 
 import jaxos4
@@ -111,6 +112,8 @@ CURVES = {
     "mujoco": "control = ctrlrange x ({})",
     "rotorpy": "rotor speed = rotor_speed_max x sqrt({})",
     "sdf": "rotor speed = maxRotVelocity x sqrt({})",
+    "drone-models": "rotor speed = that of thrust_max x sqrt({})",
+    "urdf": "thrust = the largest x ({})",
 }
 
 
@@ -127,6 +130,61 @@ def test_the_thrust_curve_is_noted_in_the_words_of_the_file(write):
         assert "thrust_curve" not in " ".join(export_vehicle(found, target).notes)
     assert found.vehicle.thrust_curve == 1
     assert "thrust_curve" not in found.drawn
+
+
+def test_the_parameters_of_drone_models_make_the_forces_of_the_vehicle(write):
+    """By the equations of `drone_models.first_principles`."""
+    found = read_result(write(vehicle_result())).vehicle
+    own = tomllib.loads(export_vehicle(read_result(write(vehicle_result())), "drone-models").text)["vehicle"]
+    speed = np.array([1000.0, 1100.0, 1200.0, 1300.0])
+    rpm, (x, y) = speed * 60 / (2 * np.pi), found.rotor_positions.T
+    thrust = own["rpm2thrust"][2] * rpm**2
+    torque = own["mixing_matrix"] @ thrust * [own["L"], own["L"], 0]
+    torque[2] = own["mixing_matrix"][2] @ (own["rpm2torque"][2] * rpm**2)
+    expected = found.thrust_coefficient * speed**2
+    np.testing.assert_allclose(thrust, expected)
+    yaw = -found.rotor_spins * found.drag_coefficient @ speed**2
+    np.testing.assert_allclose(torque, [y @ expected, -x @ expected, yaw])
+    np.testing.assert_allclose(own["J"], np.diag(found.inertia))
+    np.testing.assert_allclose(np.diag(own["drag_matrix"]), -found.drag)
+    assert own["rotor_dyn_coef"] == [1 / found.lag, 0, 1 / found.lag, 0]
+    # Of a plain X, the matrix has the entries of the presets there.
+    plain = read_result(
+        write(
+            vehicle_result(
+                airframe=airframe_table(CRAZYFLIE), values={name: VALUES[name] for name in ("alpha3", "alpha6")}
+            )
+        )
+    )
+    own = tomllib.loads(export_vehicle(plain, "drone-models").text)["vehicle"]
+    np.testing.assert_allclose(own["mixing_matrix"], [[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
+
+
+def test_an_urdf_has_the_mass_the_inertia_and_the_rotors(write):
+    found = read_result(write(vehicle_result()))
+    robot = ElementTree.fromstring(export_vehicle(found, "urdf").text)
+    inertia = robot.find("link/inertial/inertia")
+    np.testing.assert_allclose([float(inertia.get(name)) for name in ("ixx", "iyy", "izz")], found.vehicle.inertia)
+    assert float(robot.find("link/inertial/mass").get("value")) == found.vehicle.mass
+    places = [[float(x) for x in joint.find("origin").get("xyz").split()] for joint in robot.findall("joint")]
+    np.testing.assert_allclose(np.array(places)[:, :2], found.vehicle.rotor_positions)
+    links = {link.get("name") for link in robot.findall("link")}
+    assert {joint.find("child").get("link") for joint in robot.findall("joint")} == links - {"base_link"}
+
+
+def test_an_inertia_that_no_rigid_body_has_is_given_on_demand_and_clamped(run, write):
+    values = {name: VALUES[name] for name in ("alpha3", "alpha6")}
+    path = write(vehicle_result(values, held={"alpha8": held(1e4)}))  # Iz = 1e-4, and Ix + Iy = 3.3e-5
+    refused(run("export", "found.json", "--to", "urdf"), "Iz was not identified and is a guess: give --inertia-z")
+    refused(run("export", "found.json", "--to", "urdf", "--inertia-z", "-1"), "--inertia-z: must be positive")
+    ix, iy = (1 / VALUES[name] for name in ("alpha3", "alpha6"))
+    for given, used in ((3e-5, 3e-5), (1e-4, ix + iy), (1e-9, abs(ix - iy))):
+        found = read_result(path, inertia_z=given)
+        assert found.vehicle.inertia[2] == pytest.approx(used, rel=1e-6)
+        assert not found.draw(1, seed=0)[0].impossible
+        (note,) = [note for note in found.notes if note.startswith("Iz: ")]
+        assert note.startswith("Iz: a guess")
+        assert ("allows" in note) == (given != used)
 
 
 def test_an_sdf_is_valid_and_has_the_inertia(write):

@@ -1,8 +1,10 @@
 """An identification as a page and as text; numbers and tables as text: no digit and no cell is lost."""
 
+import base64
 import io
 import json
 import math
+import tempfile
 
 import msgspec
 import numpy as np
@@ -18,12 +20,15 @@ from synthetic_identification import (
     CONSTANTS,
     SAMPLE_TIMES,
     WHITE,
+    behind_an_estimate,
     identified_flight,
     identified_vehicle,
-    synthetic_predictions,
     synthetic_response,
+    synthetic_traces,
+    vehicle_traces,
 )
 
+from jaxos4 import Predictions, read_result
 from jaxos4.analysis.inertia import CenterOfMass
 from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
 from jaxos4.identification.verdict import Verdict
@@ -31,10 +36,10 @@ from jaxos4.report import print_identification, write_flight_page
 from jaxos4.report.identification_page import (
     frequency_responses,
     inertias_by_sample_time,
-    predicted_rates,
     vehicle,
     verdict,
 )
+from jaxos4.report.identification_signals import identified_signals, prediction_band
 from jaxos4.report.style import drawing, styles, svg
 from jaxos4.report.text import MISSING, Listing, plain
 
@@ -67,33 +72,87 @@ def test_the_page_says_what_was_found(tmp_path):
         shown,
         *("ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230", "57710 56710 to 58720 130"),
         *("alpha6 1/(kg m^2) – 2.0e6 not identifiable: not excited", "alpha1 1 -0.8125 held: not identifiable"),
-        *("1.733e-5 1.704e-5 to 1.762e-5 if arms and mass are right", "p = 0.21", "377 starts"),
-        *("0.248 0.73 ± 0.14 0.41 0.400 0.800", "Predicted ahead", "known to less than half of the model"),
+        *("1.733e-05 1.704e-05 to 1.762e-05 if arms and mass are right", "p = 0.21", "377 starts"),
+        *("0.248 0.73 ± 0.14 0.41 0.400 0.800", "known to less than half of the model"),
         *("jaxos4 estimate flight.csv --model flight --report flight.html", "t is not uniform", "sample time 0.004"),
     )
-    absent = {"predictions": None, "skill": None, "response": None, "rigid_body": RigidBody()}
+    absent = {"traces": None, "predictions": None, "skill": None, "response": None, "rigid_body": RigidBody()}
     text, shown = written(tmp_path / "flight.html", **absent)
-    assert not any(said in shown for said in ("Measured and predicted", "Skill", "Constants", "Frequency response"))
+    assert not any(said in shown for said in ("Measured, predicted", "Skill", "Frequency response"))
     assert len(text) < 100_000
 
 
-def test_the_rates_are_the_predictions_with_a_band_of_95_percent():
-    predicted = synthetic_predictions()
-    drawn = json.loads(predicted_rates(predicted, 0.004, styles(["ibss"])["ibss"]))
-    assert drawn["horizons"][drawn["shown"]] == "0.248"
+def unpacked(line):
+    middle, step, levels = line["values"]
+    levels = np.frombuffer(base64.b64decode(levels), "<i2").astype(float)
+    return np.where(levels == -(1 << 15), np.nan, middle + step * levels), step
+
+
+def test_the_signals_are_the_predictions_with_a_band_of_95_percent():
+    unfitted = vehicle_traces()._replace(measured=np.full((400, 3), np.nan))
+    found = identified_vehicle(traces=unfitted)
+    predicted, look = found.predictions, styles(["ibss"])["ibss"]
+    drawn = json.loads(identified_signals(found, look))
+    assert [view["name"] for view in drawn["views"]] == ["0.1 s ahead", "0.248 s ahead", "0.5 s ahead"]
+    assert drawn["shown"] == 1
     # Nothing was measured so far ahead.
     measured = np.where(np.arange(3)[:, None] > 0, np.nan, predicted.measured)
-    short = json.loads(predicted_rates(predicted._replace(measured=measured), 0.004, styles(["ibss"])["ibss"]))
-    assert short["horizons"][short["shown"]] == "0.1"
-    # A break between the stretches, and each prediction at the time that it is of.
-    assert drawn["measured"][1][1][80] is drawn["predicted"][1][1][80] is None
-    assert drawn["start"] == sorted(drawn["start"])
-    for name, values in (("predicted", predicted.predicted), ("measured", predicted.measured)):
-        kept = np.delete(np.array(drawn[name], dtype=float), 80, axis=2)
-        np.testing.assert_allclose(kept.transpose(2, 0, 1), values, atol=5.1e-5)
-    np.testing.assert_allclose(np.delete(drawn["start"], 80), 0.004 * predicted.start, atol=1e-9)
+    short = msgspec.structs.replace(found, predictions=predicted._replace(measured=measured))
+    assert json.loads(identified_signals(short, look))["shown"] == 0
+    # The line breaks between two stretches.
+    view, half = drawn["views"][1], prediction_band(predicted)
+    time = np.frombuffer(base64.b64decode(view["time"]), "<f4")
+    assert (np.diff(time) > 0).all()
     errors = np.abs(predicted.predicted - predicted.measured)
-    np.testing.assert_allclose(drawn["half"], np.nanquantile(errors, 0.95, axis=0), atol=5.1e-5)
+    np.testing.assert_allclose(half, np.nanquantile(errors, 0.95, axis=0))
+    for i, panel in enumerate(view["panels"]):
+        assert panel["half"] == pytest.approx(half[1, i])
+        for line, values in zip(panel["lines"], (predicted.measured, predicted.predicted), strict=True):
+            shown, step = unpacked(line)
+            assert np.isnan(shown[80])
+            np.testing.assert_allclose(np.delete(shown, 80), values[:, 1, i], atol=step)
+
+
+def test_fitted_and_held_out_parts_are_on_one_axis_of_all_logs():
+    """Two logs: of the second one, the second half is held out. The axis has no empty time."""
+    log, time = np.repeat([0, 1], 100), np.concatenate([5 + 0.02 * np.arange(100), 900 + 0.02 * np.arange(100)])
+    measured = np.where(np.arange(200)[:, None] < 150, 1.0, np.nan) * np.ones(3)
+    start = np.arange(150, 170)
+    ahead = Predictions(start, np.array([0.2]), np.zeros((20, 3)), np.ones((20, 1, 3)), np.full((20, 1, 3), 2.0))
+    traces = synthetic_traces(time, log, measured)._replace(start_time=time[start], start_log=log[start])
+    changes = {"traces": traces, "predictions": ahead, "provenance": {"flights": ["a.csv", "b.csv"]}}
+    drawn = json.loads(identified_signals(identified_vehicle(**changes), styles(["ibss"])["ibss"]))
+    (at, begin, end, name), (later, *_, other) = drawn["pieces"]
+    assert (at, begin, name, other) == (0.0, 5.0, "a.csv", "b.csv")
+    assert end - begin < later < 1.1 * (end - begin)
+    assert drawn["shaded"] == [pytest.approx([-0.01, later + 0.99])]
+    assert [panel["title"] for panel in drawn["common"][0]["panels"]] == ["inputs [rad/s]", "gusts [rad/s²]"]
+    shown = np.frombuffer(base64.b64decode(drawn["views"][0]["time"]), "<f4")
+    values, _ = unpacked(drawn["views"][0]["panels"][0]["lines"][1])
+    np.testing.assert_allclose(shown[np.isfinite(values)], later + 1 + 0.02 * np.arange(20) + 0.2, atol=1e-4)
+
+
+def test_what_stands_behind_an_estimate_is_drawn(tmp_path):
+    behind = behind_an_estimate()
+    correlations = behind["correlations"]
+    assert (np.abs(correlations.own) < correlations.bound[:, None]).mean() == pytest.approx(0.95, abs=0.03)
+    assert correlations.with_torque[1, 2].argmax() == 25 + 5
+    found = identified_flight(**behind)
+    write_flight_page(tmp_path / "flight.html", found)
+    text = (tmp_path / "flight.html").read_text(encoding="utf-8")
+    stands_alone(text)
+    assert len(text) < 600_000
+    assert text.count('class="plus"') == 2
+    assert text.count('class="minus"') == 1
+    says(
+        words(text),
+        "alpha3 and alpha6 (-0.95)",
+        "Measured, predicted, residual",
+        "p rad/s 97.5",
+        "Path",
+        "alpha6, alpha3: -0.95",
+    )
+    assert written_again(found) == found.to_dict()
 
 
 def test_the_figure_says_how_strongly_each_axis_answers(tmp_path):
@@ -195,6 +254,14 @@ def test_the_text_of_a_flight():
     clean = printed(identified_flight(fit={"p": WHITE}, validation=None, provenance={"windows": 4}))
     assert not any(said in clean for said in ("white noise", "Ljung-Box", "validation"))
     says(clean, "tests at 1%: all.")
+
+
+def written_again(found):
+    """What a file of this result holds when it was read and is written again."""
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        json.dump(found.to_dict(), file)
+        file.flush()
+        return read_result(file.name).to_dict()
 
 
 DIVERGED = {"result": "nonfinite_trajectory"}

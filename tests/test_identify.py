@@ -83,7 +83,6 @@ REFUSED = {
     **{f"{VEHICLE} --estimator {name}": f"--estimator {name}: is biased by a controller" for name in BIASED},
     f"{VEHICLE} --model published --terms offset": "--terms",
     f"{VEHICLE} --model published --from 1": "--from",
-    f"{VEHICLE} --model published --report r.html": "--report",
     f"flight2.csv {VEHICLE} --model corrected": "--model flight for several",
     f"flight1.csv {VEHICLE} --model flight": "given twice",
     f"{VEHICLE} --model flight --validate flight1.csv": "is fitted",
@@ -91,15 +90,13 @@ REFUSED = {
     f"{VEHICLE} --model flight --validate rare2.csv": "nothing is long enough to be predicted 0.5 s ahead",
     "flight1.csv": "flight1.csv has commands, not rotor speeds: a real vehicle needs --airframe; `jaxos4 inspect",
     "speeds1.csv --model flight": "--model flight: a real vehicle needs --airframe; `jaxos4 inspect",
-    "speeds1.csv --report r.html": "--report: is for real vehicles, and speeds1.csv has no sign of one",
 }
 
 
 @pytest.mark.parametrize(("line", "said"), REFUSED.items(), ids=REFUSED)
 def test_wrong_requests_are_one_line(run, vehicle, monkeypatch, line, said):
     monkeypatch.chdir(vehicle)
-    out = () if "--report" in line else ("--out", "out.json")
-    refused(run("estimate", *line.split(), *out), said)
+    refused(run("estimate", *line.split(), "--out", "out.json", "--report", "out.html"), said)
     assert not list(vehicle.glob("*.json"))
     assert not list(vehicle.glob("*.html"))
 
@@ -147,17 +144,18 @@ COMMON = (
     *("constants", "airframe", "verdicts", "doubts"),
 )
 SETTINGS = ("airframe", "sample_time", "notes", "version", "jax", "device", "precision")
+ARRAYS = ("traces", "correlations", "predictions", "response")
 # The keys of the JSON, of its provenance, and of a parameter, by the kind of identification.
 KEYS = {
     "flight": (
-        {*COMMON, "fit", "validation"},
+        {*COMMON, "fit", "validation", "traces", "correlations"},
         {*SETTINGS, "flight", "channels", "initial_state", "windows", "samples"},
-        {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit"},
+        {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit", "bracket"},
     ),
     "vehicle": (
-        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times", "predictions", "response"},
+        {*COMMON, "held", "noise", "disturbances", "widened", "skill", "sample_times", *ARRAYS},
         {*SETTINGS, "flights", "validate", "terms", "fitted_seconds", "tested_seconds"},
-        {"estimate", "std", "bound", "ci95", "unit", "note"},
+        {"estimate", "std", "bound", "ci95", "unit", "note", "bracket"},
     ),
 }
 

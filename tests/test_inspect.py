@@ -1,5 +1,6 @@
 """`jaxos4 inspect` as a user types it: logs of each format, and the airframe that a log knows of."""
 
+import base64
 import json
 
 import equinox as eqx
@@ -10,14 +11,20 @@ from blackbox_logs import T as BLACKBOX_TIME, recorded
 from crazyflie_logs import one_event
 from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
+from pages import stands_alone, words
 from px4_logs import everything
 from recorded_logs import VEHICLE, blackbox_csv
 from sign_flights import flown, turned
 
 import jaxos4
+from jaxos4.flight import RATES
 from jaxos4.logs import LogFacts
-from jaxos4.recording.inspection import FULL_SCALE, airframe_draft
+from jaxos4.recording.inspection import FULL_SCALE, airframe_draft, inspect_log
 from jaxos4.recording.motion import rotor_signs
+from jaxos4.report import write_log_page
+from jaxos4.report.log_page import amplitude_density, logged
+
+EVIL = "</script><script>alert(1)</script>"
 
 LOGS = {
     "ULog": everything(),
@@ -33,8 +40,8 @@ def test_each_format_is_inspected(kind, run, tmp_path):
     code, out, err = run("inspect", "log", "--airframe", "vehicle.toml", "--out", "log.json")
     assert (code, err) == (0, "")
     assert len(out.splitlines()) < 40  # a screen
-    for words in ("p q r: ", "rad/s", "usable", "good ("):
-        assert words in out
+    for said in ("p q r: ", "rad/s", "usable", "good ("):
+        assert said in out
     report = json.loads((tmp_path / "log.json").read_text())
     assert report["format"] == kind
     assert report["measured"]["p"]["rate"] == pytest.approx(1 / report["sample_time"], rel=0.02)
@@ -45,8 +52,10 @@ def test_each_format_is_inspected(kind, run, tmp_path):
 
 def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):
     assert run("simulate", "--duration", "3", "--noise", "1", "--out", "flight.csv")[0] == 0
-    code, out, err = run("inspect", "flight.csv", "--airframe", "os4")
+    code, out, err = run("inspect", "flight.csv", "--airframe", "os4", "--report", "log.html")
     assert (code, err) == (0, "")
+    assert "report: log.html" in out
+    assert "jaxos4 inspect flight.csv --airframe os4" in (tmp_path / "log.html").read_text()
     assert "flight CSV, 0.00 to 3.00 s, 301 samples, one every 10 ms" in out
     rows = [f"{0.01 * k:.2f},226,226,226,226,0,0,0" for k in range(200)]
     (tmp_path / "hover.csv").write_text("\n".join(["t,omega1,omega2,omega3,omega4,p,q,r", *rows]))
@@ -165,3 +174,43 @@ def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
         refused(run("inspect", "log", "--airframe", "mine.toml"), f"`{key}` is missing")
     (tmp_path / "mine.toml").write_text(f"hover_speed = 500\n{text}")
     refused(run("inspect", "log", "--airframe", "mine.toml"), "`rotor_spins` must be finite numbers of shape [4]")
+
+
+def test_the_page_of_a_log_shows_what_would_be_fitted(tmp_path):
+    """A flight with a part on the ground, whose name is no part of the page's code."""
+    flight = with_force(flown(CRAZYFLIE, 0), CRAZYFLIE)
+    idle = np.arange(flight.time.size) < flight.time.size // 4
+    flight = flight._replace(omega=np.where(idle[:, None], 0.0, flight.omega), name=f"{EVIL}.csv")
+    write_log_page(tmp_path / "log.html", flight, CRAZYFLIE, command="jaxos4 inspect")
+    text = (tmp_path / "log.html").read_text(encoding="utf-8")
+    stands_alone(text)
+    shown, found = words(text), inspect_log(flight, CRAZYFLIE)
+    assert len(text) < 600_000
+    for said in (
+        "excitation: roll",
+        "on the ground",
+        "would be fitted",
+        "would be held out",
+        "Vibration",
+        "jaxos4 inspect",
+    ):
+        assert said in shown
+    drawn = json.loads(logged(flight, found))
+    panels = drawn["common"][0]["panels"]
+    assert [panel["title"] for panel in panels][:3] == ["rate [rad/s]", "motor [rad/s]", "force [m/s²]"]
+    middle, step, levels = panels[0]["lines"][0]["values"]
+    levels = np.frombuffer(base64.b64decode(levels), "<i2")
+    np.testing.assert_allclose(middle + step * levels, flight.states[:, RATES[0]], atol=step)
+    begin, end = drawn["shaded"][0]
+    assert (begin, end) == pytest.approx((found.parts[0].begin, found.parts[0].end))
+
+
+def test_the_spectrum_of_white_noise_and_of_a_tone():
+    noise = np.random.default_rng(0).normal(size=(4000, 1))
+    tone = np.sin(2 * np.pi * 60 * 0.002 * np.arange(4000))[:, None]
+    frequency, density = amplitude_density([np.hstack([noise, 5 * tone])], 0.002)
+    np.testing.assert_allclose(np.mean(density[:, 0] ** 2), 2 * 0.002, rtol=0.1)  # its variance is 1, over 250 Hz
+    assert frequency[density[:, 1].argmax()] == pytest.approx(60)
+    gap = np.where(np.arange(400) % 100 < 50, np.nan, 1.0)[:, None]
+    assert np.isfinite(amplitude_density([gap], 0.01)[1]).all()
+    assert np.isnan(amplitude_density([gap[:5]], 0.01)[1]).all()

@@ -1,6 +1,10 @@
 """Bags of ROS 1 and 2 and MCAP, written by rosbags: the same flight as a CSV, presets, clocks, and damage."""
 
+import bz2
 import shutil
+import struct
+import tracemalloc
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +29,14 @@ from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log, read_recording
+from jaxos4.logs.compression import _decompressor, check_parts
 
 pytest.importorskip("rosbags", reason="reading a ROS bag needs rosbags")
+import lz4.frame  # noqa: E402
 import recorded_bags as bags  # noqa: E402
 from recorded_bags import KINDS, T, bag  # noqa: E402
+
+zstd = import_module(_decompressor("zstd").__module__.removeprefix("_"))
 
 ATTITUDE = ("p", "q", "r", "phi", "theta", "psi")
 MAP = {
@@ -231,6 +239,40 @@ def test_what_a_bag_lacks_is_said(bagged, tmp_path, save):
         read_log(tmp_path)
     with pytest.raises(InputError, match="metadata"):
         read_log(save("rosbag2_bagfile_information: 3", "metadata.yaml").parent)
+
+
+def bomb(kind):
+    """A bag of a few kilobytes with one part of 300 MB, as its name and content."""
+    megabyte = bytes(1 << 20)
+    packed = 300 * {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstd.compress}[kind.split()[1]](megabyte)
+    if kind.startswith("ros1"):
+        fields = b"op=\x05", b"compression=" + kind.split()[1].encode(), b"size=" + struct.pack("<I", 300 << 20)
+        header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+        record = struct.pack("<I", len(header)) + header + struct.pack("<I", len(packed)) + packed
+        return "flight.bag", b"#ROSBAG V2.0\n" + record
+    if kind.startswith("mcap"):
+        name = kind.split()[1].encode()
+        chunk = struct.pack("<QQQII", 0, 1, 300 << 20, 0, len(name)) + name + struct.pack("<Q", len(packed)) + packed
+        return "flight.mcap", b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(chunk)) + chunk
+    return "flight.db3.zstd", packed
+
+
+@pytest.mark.parametrize("kind", ["ros1 bz2", "ros1 lz4", "mcap lz4", "mcap zstd", "folder zstd"])
+def test_a_small_file_does_not_fill_the_memory(kind, tmp_path):
+    name, content = bomb(kind)
+    assert len(content) < 400_000 or "lz4" in kind
+    (tmp_path / name).write_bytes(content)
+    path = tmp_path / name
+    if kind.startswith("folder"):
+        path = tmp_path / "metadata.yaml"
+        path.write_text("rosbag2_bagfile_information:\n  version: 5\n")
+    tracemalloc.start()
+    with pytest.raises(InputError, match="holds a compressed part of more than 268,435,456 bytes"):
+        read_log(path)
+    assert tracemalloc.get_traced_memory()[1] < 30 << 20
+    tracemalloc.stop()
+    # Parts of a usual size are no bomb, and neither is what cannot be decompressed.
+    check_parts("bag", [("zstd", zstd.compress(bytes(1 << 20))), ("zstd", b"damaged"), ("", bytes(9)), ("none", b"")])
 
 
 @pytest.mark.parametrize("kind", KINDS)

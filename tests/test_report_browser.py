@@ -1,18 +1,21 @@
 """The reports as a reader sees them: in chromium, on a phone, a tablet and a desktop, in light and in dark."""
 
 import os
+import re
 import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle
+from helpers import CRAZYFLIE
+from sign_flights import flown
+from synthetic_identification import SAMPLE_TIMES, behind_an_estimate, identified_flight, identified_vehicle
 from synthetic_study import ESTIMATORS, synthetic_study
 
 from jaxos4 import PublishedOS4, compare_results
 from jaxos4.design import Design
 from jaxos4.design.task import Designed
-from jaxos4.report import write_comparison, write_flight_page, write_report
+from jaxos4.report import write_comparison, write_flight_page, write_log_page, write_report
 from jaxos4.report.design_page import write_design
 
 pytestmark = pytest.mark.slow
@@ -92,10 +95,12 @@ def addresses(tmp_path_factory):
     for name, found in {
         "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
         "without predictions": identified_vehicle(predictions=None),
-        "os4": identified_flight(),
+        "os4": identified_flight(**behind_an_estimate()),
     }.items():
         files[name] = folder / f"{name}.html"
         write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")
+    files["log"] = folder / "log.html"
+    write_log_page(files["log"], flown(CRAZYFLIE, 0), CRAZYFLIE)
     long = [identified_vehicle(provenance={"flights": [f"A_flight_with_a_long_name_{i}.csv"]}) for i in range(4)]
     files["comparison"] = folder / "comparison.html"
     write_comparison(files["comparison"], compare_results(long))
@@ -138,7 +143,7 @@ def opened(browser, addresses):
 
 
 @pytest.mark.parametrize("width", [390, 768, 1280])
-@pytest.mark.parametrize("name", ["study", "vehicle", "os4", "comparison", *DESIGNS])
+@pytest.mark.parametrize("name", ["study", "vehicle", "os4", "log", "comparison", *DESIGNS])
 def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
     page = opened(name, width)
     page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true; })")
@@ -187,25 +192,47 @@ def test_a_checkbox_hides_an_estimator_everywhere(opened):
     assert all(page.evaluate(shown, 1))
 
 
-def test_rates_can_be_zoomed_and_say_their_values(opened):
+def test_signals_zoom_together_and_stay_so(opened):
     page = opened("vehicle")
-    values = page.locator("#rates .u-value")
-    page.locator("#rates").scroll_into_view_if_needed()
-    assert page.locator("#horizon option:checked").text_content() == "0.248 s"
-    ticks = "() => [...document.querySelectorAll('#rates canvas')].map(canvas => canvas.toDataURL())"
-    before, box = page.evaluate(ticks), page.locator("#rates .u-over").first.bounding_box()
-    assert len(before) == 3
+    values = page.locator("#timeline .u-value")
+    page.locator("#timeline").scroll_into_view_if_needed()
+    assert page.locator("#view option:checked").text_content() == "0.248 s ahead"
+    drawn = "() => [...document.querySelectorAll('#timeline canvas')].map(canvas => canvas.toDataURL())"
+    changed = "before => document.querySelector('#timeline canvas').toDataURL() !== before"
+    before, box = page.evaluate(drawn), page.locator("#timeline .u-over").first.bounding_box()
     across = [box["x"] + share * box["width"] for share in (0.2, 0.4)]
     page.mouse.move(across[0], box["y"] + 20)
-    assert all(any(digit.isdigit() for digit in text) for text in values.all_text_contents())
+    assert any(any(digit.isdigit() for digit in text) for text in values.all_text_contents())
     page.mouse.down()
     page.mouse.move(across[1], box["y"] + 20, steps=4)
     page.mouse.up()
-    page.wait_for_function("before => document.querySelector('#rates canvas').toDataURL() !== before", arg=before[0])
-    zoomed = page.evaluate(ticks)
-    assert not set(zoomed) & set(before)  # all three
-    page.locator("#horizon").select_option(label="0.5 s")
-    page.wait_for_function("before => document.querySelector('#rates canvas').toDataURL() !== before", arg=zoomed[0])
+    page.wait_for_function(changed, arg=before[0])
+    zoomed = page.evaluate(drawn)
+    assert not set(zoomed) & set(before)  # all of them
+    page.locator("#view").select_option(label="0.5 s ahead")
+    page.locator("#view").select_option(label="0.248 s ahead")
+    page.mouse.move(0, 0)
+    assert page.evaluate(drawn) == zoomed  # the zoom survives
+    page.get_by_role("button", name="All").click()
+    page.wait_for_function(changed, arg=zoomed[0])
+    assert page.evaluate(drawn) == before
+
+
+def test_a_range_of_a_log_is_ready_to_copy_and_a_finger_moves_it(opened):
+    page = opened("log", 390)
+    before = page.locator("#range").text_content()
+    page.get_by_role("button", name="Zoom in").click()
+    zoomed = page.locator("#range").text_content()
+    assert re.fullmatch(r"--from \d+\.\d\d --to \d+\.\d\d", zoomed)
+    assert zoomed != before
+    finger = """how => document.querySelector("#timeline .u-over").dispatchEvent(new PointerEvent(how[0],
+        {bubbles: true, pointerType: "touch", pointerId: 1, clientX: how[1]}))"""
+    for how in (("pointerdown", 200), ("pointermove", 150), ("pointerup", 150)):
+        page.evaluate(finger, how)
+    begin, end = (float(x) for x in re.findall(r"[\d.]{3,}", page.locator("#range").text_content()))
+    before, after = (float(x) for x in re.findall(r"[\d.]{3,}", zoomed))
+    assert begin > before
+    assert end - begin == pytest.approx(after - before, abs=0.02)
 
 
 def test_figures_tell_names_and_values_as_tooltips(opened):

@@ -17,7 +17,14 @@ from matplotlib.figure import Figure
 from pages import stands_alone, words
 from rich.console import Console
 from strange import in_one_line, nodes
-from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle, synthetic_predictions
+from synthetic_identification import (
+    SAMPLE_TIMES,
+    behind_an_estimate,
+    identified_flight,
+    identified_vehicle,
+    synthetic_predictions,
+    vehicle_traces,
+)
 
 import jaxos4
 from jaxos4.errors import InputError
@@ -30,6 +37,7 @@ FULL = {
     "covariance": [[1.0, 0.0], [0.0, 4.0]],
     "widened": {"alpha3": 1.7},
     "disturbances": {"p": Disturbance(1.2, "rad/s^2", 0.1, 0.02, 0.01)},
+    "correlations": behind_an_estimate()["correlations"],
 }
 
 
@@ -48,7 +56,9 @@ def text_of(found):
     return console.file.getvalue()
 
 
-@pytest.mark.parametrize("found", [identified_vehicle(**FULL), identified_flight()], ids=["vehicle", "os4"])
+@pytest.mark.parametrize(
+    "found", [identified_vehicle(**FULL), identified_flight(**behind_an_estimate())], ids=["vehicle", "os4"]
+)
 def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
     again = written(found, tmp_path / "found.json")
     assert (again.estimate, again.problem) == (None, None)
@@ -79,7 +89,9 @@ def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path)
 def test_a_file_of_an_older_version_has_a_page_without_the_figures_that_it_lacks(tmp_path):
     found = identified_vehicle()
     table = {
-        name: each for name, each in found.to_dict().items() if name not in ("predictions", "response", "verdicts")
+        name: each
+        for name, each in found.to_dict().items()
+        if name not in ("traces", "correlations", "predictions", "response", "verdicts")
     }
     (tmp_path / "old.json").write_text(json.dumps(table))
     old = jaxos4.read_result(tmp_path / "old.json")
@@ -92,7 +104,8 @@ def test_predictions_in_a_file_are_few(tmp_path):
     many = synthetic_predictions(4000).thinned(1000)
     np.testing.assert_array_equal(many.start, synthetic_predictions(4000).start[::4])
     np.testing.assert_allclose(many.predicted, synthetic_predictions(4000).predicted[::4], atol=5.1e-5)
-    found = identified_vehicle(predictions=synthetic_predictions(4000).thinned(1200))
+    many = synthetic_predictions(4000).thinned(1200)
+    found = identified_vehicle(predictions=many, traces=vehicle_traces(many.start))
     written(found, tmp_path / "found.json")
     assert (tmp_path / "found.json").stat().st_size < 5e5
     write_flight_page(tmp_path / "found.html", found)
@@ -118,6 +131,12 @@ WRONG = [
     (("response", "roll", "phase"), [1.0], "`response.roll.phase`: has another shape"),
     (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),
     (("response", "yaw"), {}, "`response.yaw.frequency`: is not an array"),
+    (("traces", "start_time"), [0.1], "`traces"),
+    (("traces", "log", 0), 7, "`traces`: is of a log that has no name"),
+    (("traces", "time", 3), None, "`traces`: a time is missing"),
+    (("traces", "measured"), [[1.0]] * 400, "`traces`: has channels that no model has"),
+    (("traces", "rotors", 0), [1.0], "`traces.rotors`: is not an array"),
+    (("correlations", "bound"), [1.0], "`correlations"),
     (("skill", "horizons"), [0.1], "`skill`"),
     (("constants", "Ix", "std"), -1.0, "`std`: is negative"),
     (("constants", "other"), 1.0, "'other' is no name"),

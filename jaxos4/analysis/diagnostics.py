@@ -1,11 +1,29 @@
 """Diagnostics of the residuals of a fit: their size, whether they are white, and whether they depend on the inputs."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..results import NINETY_FIVE
 from ..shooting import ROUNDING
 from .evaluation import Evaluation
+
+
+class Correlations(NamedTuple):
+    """Correlations of the residuals of some channels: with themselves, and with the roll, pitch and yaw torque.
+
+    - `own`: at 1, 2, ... samples apart. `with_torque`: at lags from -`lags` to `lags`; at a positive lag, the residual
+      is the later one. A controller answers residuals, so that a vehicle has correlations at negative lags.
+    - `bound`, `torque_bound`: 95 % of the correlations of residuals that are white, and that no torque causes, are
+      smaller. The second one allows for coloured residuals.
+    """
+
+    own: Float[np.ndarray, "channels lags"]
+    with_torque: Float[np.ndarray, "channels 3 both"]
+    bound: Float[np.ndarray, " channels"]
+    torque_bound: Float[np.ndarray, "channels 3"]
 
 
 class Diagnostics(eqx.Module):
@@ -91,6 +109,41 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
     )
 
 
+def residual_correlations(
+    errors: Float[np.ndarray, "samples channels"], torques: Float[np.ndarray, "samples 3"], lags: int = 25
+) -> Correlations:
+    """The correlations of residuals up to so many samples apart. NaN: not measured."""
+    measured = np.isfinite(errors)
+    errors = np.where(measured, errors, 0.0)
+    own, pairs = (x[:, lags + 1 :] for x in _correlations(errors, errors, measured, measured, lags))
+    crossed = [_with_torque(errors, measured, own, torque, lags) for torque in _moves(torques).T]
+    known = np.maximum(measured.sum(axis=0), 1)
+    return Correlations(
+        own,
+        np.stack([correlation for correlation, _ in crossed], axis=1),
+        NINETY_FIVE / np.sqrt(known),
+        NINETY_FIVE * np.stack([error[:, lags] for _, error in crossed], axis=1),
+    )
+
+
+def _moves(torques: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
+    """The torques less their means. The last row of rotor speeds drives nothing."""
+    return np.append(torques[:-1] - torques[:-1].mean(axis=0), np.zeros((1, 3)), axis=0)
+
+
+def _with_torque(
+    errors: np.ndarray, measured: np.ndarray, autocorrelation: np.ndarray, torque: np.ndarray, lags: int
+) -> tuple[Float[np.ndarray, "size both"], Float[np.ndarray, "size both"]]:
+    """The correlation with a torque at each lag, and its standard deviation if there is no dependence."""
+    column, taper = torque[:, None], 1 - np.arange(1, lags + 1) / (lags + 1)
+    drives = np.arange(len(column))[:, None] < len(column) - 1
+    correlation, pairs = _correlations(errors, column, measured, drives, lags)
+    own = _correlations(column, column, drives, drives, lags)[0][0, lags + 1 :]
+    # Variance of the correlation of two coloured series, relative to white ones; at least 1.
+    inflation = np.maximum(1 + 2 * (autocorrelation * (taper * own)).sum(axis=1), 1.0)
+    return correlation, np.sqrt(inflation[:, None] / np.maximum(pairs, 1e-9))
+
+
 def _dependence(
     errors: np.ndarray,
     measured: np.ndarray,
@@ -102,18 +155,12 @@ def _dependence(
     """The largest correlation with each torque, and the p-value of residuals that depend on no torque."""
     from scipy.special import ndtr
 
-    # The last row of rotor speeds drives nothing.
-    driving = np.arange(torques.shape[0]) < torques.shape[0] - 1
-    moves = np.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
+    moves = _moves(torques)
     torques = np.where(np.abs(moves).max(axis=0) > rounding * np.abs(torques[:-1]).max(axis=0), moves, 0.0)
-    taper, found, worst = 1 - np.arange(1, lags + 1) / (lags + 1), [], []
+    found, worst = [], []
     for torque in torques.T:
-        column, drives = torque[:, None], driving[:, None]
-        correlation, pairs = _correlations(errors, column, measured, drives, lags)
-        own = _correlations(column, column, drives, drives, lags)[0][0, lags + 1 :]
-        # Variance of the correlation of two coloured series, relative to white ones; at least 1.
-        inflation = np.maximum(1 + 2 * (autocorrelation * (taper * own)).sum(axis=1), 1.0)
-        deviations = np.abs(correlation) * np.sqrt(pairs / inflation[:, None])
+        correlation, error = _with_torque(errors, measured, autocorrelation, torque, lags)
+        deviations = np.abs(correlation) / error
         at = np.argmax(deviations, axis=1)[:, None]
         found.append(np.take_along_axis(correlation, at, axis=1)[:, 0])
         worst.append(2 * ndtr(-np.take_along_axis(deviations, at, axis=1)[:, 0]))

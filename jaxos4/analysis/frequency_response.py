@@ -21,7 +21,9 @@ _RESOLUTION = 1.0
 _MEMORY, _FEWEST_LAGS = 0.1, 4
 # The regression needs so many samples for each unknown.
 _SAMPLES = 8
-# The band in which the model is compared [Hz], and the largest error of a clear gain there. Few vehicles move above.
+# The highest frequency [Hz]: few vehicles move above.
+HIGHEST = 40.0
+# The band in which the model is compared [Hz], and the largest error of a clear gain there.
 _LOW, _HIGH, _UNCLEAR = 4.0, 20.0, 0.5
 # Of the regression, as a share of the sum of squares.
 _RIDGE = 1e-13
@@ -82,6 +84,12 @@ class AxisResponse(NamedTuple):
         deviation = math.sqrt(weight @ self.covariance[np.ix_(clear, clear)] @ weight)
         return Agreement(math.exp(weight @ np.log(gain)), deviation, float(frequency[0]), float(frequency[-1]))
 
+    def rounded(self, digits: int = 4) -> "AxisResponse":
+        """The same with so many significant digits, which is what files keep."""
+        return self._replace(
+            **{name: significant(each, digits) for name, each in zip(self._fields, self[:-1], strict=False)}
+        )
+
     @property
     def error(self) -> Float[np.ndarray, " frequencies"]:
         """Standard deviation of the gain's logarithm, and about that of the phase [rad]."""
@@ -130,7 +138,12 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     usable = known[1:] & known[:-1] & np.isfinite(caused).all(axis=1)
     if problem.flight.stretch is not None:
         usable &= np.diff(np.asarray(problem.flight.stretch)) == 0
-    return FrequencyResponse(*(response(caused[:, i], measured[:, i], usable, dt) for i in range(3)))
+    return FrequencyResponse(*(response(caused[:, i], measured[:, i], usable, dt).rounded() for i in range(3)))
+
+
+def significant(values: Float[np.ndarray, "..."], digits: int) -> Float[np.ndarray, "..."]:
+    """Numbers with so many significant digits."""
+    return np.array([float(f"{x:.{digits - 1}e}") for x in values.ravel()]).reshape(values.shape)
 
 
 def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[np.ndarray, "steps 3"]:
@@ -186,7 +199,7 @@ def response(
     **Arguments:** signals with one sample every `dt` [s], and which of them are `usable`.
     """
     lags = max(round(_MEMORY / dt), _FEWEST_LAGS)
-    frequency = np.arange(_RESOLUTION, 0.4 / dt, _RESOLUTION)
+    frequency = np.arange(_RESOLUTION, min(0.4 / dt, HIGHEST + _RESOLUTION / 2), _RESOLUTION)
     rows = np.flatnonzero(np.convolve(usable, np.ones(lags + 1))[: usable.size] > lags + 0.5)
     if rows.size < _SAMPLES * (2 * lags + 2):
         nothing = np.full(frequency.size, np.nan)

@@ -89,15 +89,32 @@ def filtered(
     return jax.lax.scan(step, Filtered(zero, zero), rows)[1]
 
 
-def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Float[np.ndarray, "samples 3"]:
-    """The disturbance of each body rate [rad/s^2] at each sample, from the measurements until then.
+class Traced(NamedTuple):
+    """The disturbance of each body rate [rad/s^2] at each sample, and its innovation [rad/s]; NaN: not measured."""
 
-    Kalman filters find it, for the noise that `FilterError` found. The model is evaluated at the measured rates.
-    `noise`: its first three channels are p, q and r.
+    disturbance: Float[np.ndarray, "samples 3"]
+    innovation: Float[np.ndarray, "samples 3"]
+
+
+def traced(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Traced:
+    """What Kalman filters know at each sample from the measurements until then, for the noise that was found.
+
+    The model is evaluated at the measured rates. An innovation is a measured rate less its prediction from the sample
+    before. `noise`: its first three channels are p, q and r.
     """
     rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
     modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
     own = LogNoise(*(as_float(np.asarray(leaf)[: len(RATES)]) for leaf in noise))
     number = np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch)
-    known = eqx.filter_jit(filtered)(own, as_float(rates), as_float(modelled), number, problem.flight.dt)
-    return np.asarray(known.disturbance)
+    dt = problem.flight.dt
+    known = eqx.filter_jit(filtered)(own, as_float(rates), as_float(modelled), number, dt)
+    _, reach = (np.asarray(x) for x in transition(jnp.exp(own.time_constant), dt))
+    later = np.asarray(known.rate) + modelled * float(dt) + reach * np.asarray(known.disturbance)
+    innovation = np.full(rates.shape, np.nan)
+    innovation[1:] = np.where(np.diff(number)[:, None] == 0, rates[1:] - later[:-1], np.nan)
+    return Traced(np.asarray(known.disturbance), innovation)
+
+
+def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Float[np.ndarray, "samples 3"]:
+    """The disturbance of each body rate [rad/s^2] at each sample, see `traced`."""
+    return traced(problem, parameters, noise).disturbance

@@ -7,7 +7,9 @@ import contextlib
 import json
 import re
 import secrets
+import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,23 @@ from typing import Any
 import typer
 
 from .._files import check_writable, write_file
-from ..errors import InputError
+from ..errors import InputError, printable
 
 _ARGUMENTS = (
     *("angle", "bandwidth", "bracket", "channels", "criterion", "distance", "dt", "duration", "estimator", "fastest"),
-    *("gust", "holdout", "horizon", "initial_state", "network", "rate", "sample_time", "samples", "seed", "slew"),
+    *(
+        "gust",
+        "holdout",
+        "horizon",
+        "inertia_z",
+        "initial_state",
+        "network",
+        "rate",
+        "sample_time",
+        "samples",
+        "seed",
+        "slew",
+    ),
     *("slowest", "spacing", "terms", "validate", "velocity", "window"),
 )
 OPTIONS = {
@@ -41,6 +55,11 @@ def in_options(text: str, **files: Path | None) -> str:
         path = files.get(argument.strip("`"))
         text = text.replace(argument, option if path is None else f"{option} {path}")
     return text
+
+
+def command() -> str:
+    """The command line as the user can repeat it."""
+    return printable(shlex.join(["jaxos4", *sys.argv[1:]]))
 
 
 @contextlib.contextmanager

@@ -1,7 +1,6 @@
 """`jaxos4 estimate` and `jaxos4 train`: parameters from recorded flights, with 95 % intervals; a network for these."""
 
 import shlex
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +12,7 @@ import jaxos4
 
 from ..errors import InputError, named, printable
 from . import _options as options
-from ._output import check_outputs, end, in_options, option_names, stages, write_json
+from ._output import check_outputs, command, end, in_options, option_names, stages, write_json
 
 _OS4, _PUBLISHED = "os4", "published"
 # The defaults of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
@@ -45,7 +44,7 @@ def estimate(
     end: Annotated[float | None, Option("--to", help="Real vehicle: use the logs up to this time [s].")] = None,
     sample_time: Annotated[float | None, Option(help="Real vehicle: the sample time to average to [s].")] = None,
     holdout: Annotated[float | None, Option(help="Real vehicle: the share to predict; default: 0.25.")] = None,
-    report: Annotated[Path | None, Option(help="Real vehicle: an HTML report to write.")] = None,
+    report: Annotated[Path | None, Option(help="An HTML report to write.")] = None,
     out: options.OutOption = None,
     verbose: Annotated[
         bool, Option("--verbose", "-v", help="Real vehicle: all parameters, noise and predictions.")
@@ -66,9 +65,6 @@ def estimate(
         full_scale = 1.0 if airframe is None and model in (None, "flight") else None
         recordings = [read_recording(path, vehicle, full_scale=full_scale, columns=columns) for path in flights]
         subject, evidence = _subject(recordings, model, vehicle, given=airframe is not None)
-        if report is not None and not isinstance(subject, jaxos4.Airframe):
-            sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
-            raise InputError(f"--report: is for real vehicles, {sign}; leave it out.")
         found = jaxos4.identify(
             recordings,
             subject,
@@ -110,7 +106,7 @@ def _with_command(found: "jaxos4.Identification", airframe: str, evidence: str) 
         found.provenance,
         airframe=printable(airframe),
         notes=[*notes, *(in_options(note) for note in found.provenance.notes)],
-        command=printable(shlex.join(["jaxos4", *sys.argv[1:]])),
+        command=command(),
     )
     doubts = (msgspec.structs.replace(doubt, remedy=in_options(doubt.remedy)) for doubt in found.doubts)
     verdicts = {

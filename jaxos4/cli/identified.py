@@ -16,11 +16,16 @@ from ._output import check_outputs, end, in_options, option_names, stages, write
 
 def export(
     result: Annotated[Path, Argument(metavar="RESULT.json", help="A file of `jaxos4 estimate --out`, of a vehicle.")],
-    to: Annotated[options.Simulator, Option(help="MuJoCo (MJCF), RotorPy (Python) or SDF (Gazebo).")],
+    to: Annotated[
+        options.Simulator, Option(help="MuJoCo (MJCF), RotorPy, SDF (Gazebo), drone_models (crazyflow) or URDF.")
+    ],
     out: Annotated[Path | None, Option(help="The file to write. Default: standard output.")] = None,
     samples: Annotated[
         int, Option(help="Also draw N vehicles from the covariance, into the folder OUT-samples.", metavar="N")
     ] = 0,
+    inertia_z: Annotated[
+        float | None, Option(help="Iz to use [kg m^2], as far as a rigid body can have it: for one that is a guess.")
+    ] = None,
     seed: options.SeedOption = 0,
 ) -> None:
     """Write an identified vehicle as a model for a simulator, and vehicles drawn from its uncertainty."""
@@ -38,7 +43,7 @@ def export(
         from ..export import TARGETS, export_vehicle, read_result
 
         progress("reading")
-        found, target = read_result(result), TARGETS[to]
+        found, target = read_result(result, inertia_z=inertia_z), TARGETS[to]
         progress("drawing and writing")
         written = export_vehicle(found, to, samples=samples, seed=seed)
     if folder is not None:

@@ -10,7 +10,7 @@ import jaxos4
 from .._files import write_file
 from ..errors import InputError
 from . import _options as options
-from ._output import check_outputs, option_names, stages, write_json
+from ._output import check_outputs, command, in_options, option_names, stages, write_json
 
 
 def inspect(
@@ -24,10 +24,13 @@ def inspect(
         Path | None,
         Option(metavar="FILE.toml", help="An airframe to write: what the log knows, and what must be measured."),
     ] = None,
+    report: Annotated[
+        Path | None, Option(metavar="LOG.html", help="A page to write: signals over time, parts, checks, spectra.")
+    ] = None,
     out: options.OutOption = None,
 ) -> None:
     """Show what a log contains, whether it agrees with itself, which parts can be used, and how much they excite."""
-    check_outputs(log, airframe, columns, out=out, airframe_out=airframe_out)
+    check_outputs(log, airframe, columns, out=out, airframe_out=airframe_out, report=report)
     if airframe_out is not None and airframe_out.exists():
         raise InputError(f"{airframe_out}: exists, and may hold what you measured; give another name.")
     if airframe is not None and airframe_out is not None:
@@ -50,6 +53,10 @@ def inspect(
     if airframe_out is not None:
         write_file(airframe_out, text)
     print_inspection(console, found, recording.facts.format.label if recording.facts.format else "")
+    if report is not None:
+        with stages("drawing"):
+            jaxos4.report.write_log_page(report, recording, vehicle, found=found, command=command(), words=in_options)
+        console.print(f"report: {report}", soft_wrap=True)
     if airframe_out is not None:
         still = f"; weigh or measure, and fill in: {', '.join(missing)}"
         console.print(f"airframe: {airframe_out}{still}", soft_wrap=True)

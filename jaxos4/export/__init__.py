@@ -1,4 +1,4 @@
-"""An identified vehicle as a model for simulators: MuJoCo, RotorPy and SDF (Gazebo)."""
+"""An identified vehicle as a model for simulators: MuJoCo, RotorPy, SDF (Gazebo), drone_models (crazyflow) and URDF."""
 
 from .formats import TARGETS as TARGETS, Exported as Exported, Target as Target, export_vehicle as export_vehicle
 from .result import Identified as Identified, read_result as read_result

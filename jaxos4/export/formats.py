@@ -143,9 +143,17 @@ def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
     return {"body": body, "rotor": (share, np.zeros(3), rotor), "slowdown": _ASSUMED.slowdown}
 
 
+def _drone_models(vehicle: RigidVehicle) -> dict[str, Any]:
+    """The mixing matrix turns thrusts over `length` into torques, and in its last row drag torques of the rotors."""
+    length = vehicle.arm / math.sqrt(2)  # so that the entries of an X are 1 and -1
+    x, y = vehicle.rotor_positions.T
+    mixing = [(y / length).tolist(), (0 - x / length).tolist(), (-vehicle.rotor_spins).tolist()]
+    return {"length": length, "mixing": mixing, "rpm": 60 / (2 * math.pi)}
+
+
 @functools.cache
 def _templates(suffix: str) -> jinja2.Environment:
-    made = templates("jaxos4.export", printable if suffix == ".py" else in_xml)
+    made = templates("jaxos4.export", printable if suffix in (".py", ".toml") else in_xml)
     made.filters["short"] = lambda values: ", ".join(f"{value:.3g}" for value in np.atleast_1d(values))
     made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}
     return made
@@ -160,4 +168,6 @@ TARGETS: dict[str, Target] = {
     "mujoco": Target("MJCF for MuJoCo", ".xml", _mujoco),
     "rotorpy": Target("parameters for RotorPy", ".py", lambda _: {}),
     "sdf": Target("SDF model for Gazebo", ".sdf", _sdf),
+    "drone-models": Target("parameters for drone_models and crazyflow", ".toml", _drone_models),
+    "urdf": Target("URDF", ".urdf", lambda _: {}),
 }

@@ -1,6 +1,7 @@
 """Result files of `jaxos4 estimate`, and vehicles drawn from the uncertainty of a result."""
 
 import itertools
+import math
 import os
 import re
 from pathlib import Path
@@ -35,6 +36,7 @@ class Identified(NamedTuple):
     - `drawn`, `covariance`: the names of the parameters that are uncertain, and their covariance.
     - `doubts`: why the estimate cannot be trusted, and what to do; one line each. Empty if the result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.
+    - `inertia_z`: the moment of inertia Iz [kg m^2] that the user gave in the place of the estimate.
     """
 
     source: str
@@ -45,6 +47,7 @@ class Identified(NamedTuple):
     covariance: Float[np.ndarray, "drawn drawn"]
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
+    inertia_z: float | None = None
 
     @property
     def successful(self) -> bool:
@@ -54,7 +57,15 @@ class Identified(NamedTuple):
     @property
     def vehicle(self) -> RigidVehicle:
         """The vehicle with the estimated parameters."""
-        return rigid_vehicle(self.airframe, self.values)
+        return self._made(self.values)
+
+    def _made(self, values: dict[str, float]) -> RigidVehicle:
+        if self.inertia_z is None:
+            return rigid_vehicle(self.airframe, values)
+        gain, (ix, iy) = values.get("thrust_gain", 1.0), rigid_vehicle(self.airframe, values).inertia[:2]
+        rounding = 1e-9
+        allowed = min(max(self.inertia_z, (1 + rounding) * abs(ix - iy)), (1 - rounding) * (ix + iy))
+        return rigid_vehicle(self.airframe, values | {INERTIAS["Iz"]: gain / allowed})
 
     def draw(self, number: int, *, seed: int, most: int = 1000) -> tuple[RigidVehicle, int]:
         """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
@@ -69,7 +80,7 @@ class Identified(NamedTuple):
         for impossible in range(most):
             errors = root @ generator.standard_normal(len(root))
             changed = {name: self.values[name] + float(error) for name, error in zip(self.drawn, errors, strict=True)}
-            vehicle = rigid_vehicle(self.airframe, _clipped(self.values | changed))
+            vehicle = self._made(_clipped(self.values | changed))
             if not vehicle.impossible:
                 return vehicle, impossible
         raise InputError(
@@ -78,12 +89,17 @@ class Identified(NamedTuple):
         )
 
 
-def read_result(path: str | os.PathLike[str]) -> Identified:
+def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None) -> Identified:
     """Read a file that `jaxos4 estimate --out` wrote.
+
+    `inertia_z`: Iz [kg m^2] to use in the place of the estimate, as far as a rigid body with these Ix and Iy can have
+    it: no moment of inertia exceeds the sum of the other two. Flights hardly ever show Iz well.
 
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.
     """
+    if inertia_z is not None and not 0 < inertia_z < math.inf:
+        raise InputError(f"`inertia_z`: must be positive, got {inertia_z:g}.")
     file = vehicle_result(path)
     with named(path):
         values, estimated, notes = _parts(file)
@@ -91,7 +107,9 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
         notes += [f"{name}: came out negative, which is impossible; it is 0 here" for name in negative]
         if not np.isfinite(file.airframe.max_rotor_speed):
             notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
-        drawn = tuple(name for name in estimated if name not in negative)
+        drawn = tuple(
+            name for name in estimated if name not in (*negative, *[INERTIAS["Iz"]] * (inertia_z is not None))
+        )
         places = [list(file.parameters).index(name) for name in drawn]
         found = Identified(
             source=f"{printable(Path(path).name)} ({file.estimator}, {file.model} model, {file.result})",
@@ -102,9 +120,22 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
             covariance=np.array(file.covariance)[np.ix_(places, places)],
             doubts=file.reasons,
             notes=tuple(notes),
+            inertia_z=inertia_z,
         )
+        if inertia_z is not None:
+            used = float(found.vehicle.inertia[2])
+            limit = (
+                ""
+                if math.isclose(used, inertia_z, rel_tol=1e-6)
+                else f": a rigid body with these Ix and Iy allows {used:.4g}"
+            )
+            own = tuple(note for note in found.notes if not note.startswith("Iz: "))
+            found = found._replace(notes=(*own, f"Iz: a guess, {inertia_z:.4g} kg m^2 was given{limit}"))
         if why := found.vehicle.impossible:
-            raise InputError(f"no vehicle is like this: {why}; correct the airframe, or fly with more excitation.")
+            guess = "; Iz was not identified and is a guess: give `inertia_z`" if INERTIAS["Iz"] not in drawn else ""
+            raise InputError(
+                f"no vehicle is like this: {why}{guess}; correct the airframe, or fly with more excitation."
+            )
         return found
 
 
@@ -140,7 +171,7 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
     values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values
     for moment, name in INERTIAS.items():
         if name not in found:
-            notes.append(f"{moment}: not identified; it follows from the airframe, or from the bracket")
+            notes.append(f"{moment}: not identified; a guess, from the airframe or from the bracket")
     for names, why in _NOT_CARRIED.items():
         some = [name for name in found if _vehicles_own(name) in names]
         if some:

@@ -129,6 +129,7 @@ def parameter_table(answer: Answer, prior: float, reasons: Mapping[str, str] = {
     estimate, unknowns = answer.estimate, answer.problem.unknowns
     std, width = map(np.asarray, _intervals(estimate))
     values, half_width = np.asarray(estimate.parameters), np.asarray(unknowns.half_width)
+    lower, upper = np.asarray(unknowns.bracket.lower), np.asarray(unknowns.bracket.upper)
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
 
     def row(i: int, name: str) -> ParameterEstimate:
@@ -141,6 +142,7 @@ def parameter_table(answer: Answer, prior: float, reasons: Mapping[str, str] = {
             ci95=(max(value - half, least), value + half) if known else None,
             unit=unknowns.units[i],
             note=_note(answer, i, half) if known else reasons.get(name, "not identifiable from this flight"),
+            bracket=(float(lower[i]), float(upper[i])) if np.isfinite([lower[i], upper[i]]).all() else None,
         )
 
     return {unknowns.names[i]: row(i, unknowns.names[i]) for i in answer.free}

@@ -8,10 +8,11 @@ import msgspec
 import numpy as np
 
 from .._custom_types import as_float
-from ..analysis.diagnostics import residual_diagnostics
+from ..analysis.diagnostics import Correlations, residual_correlations, residual_diagnostics
 from ..analysis.frequency_response import FrequencyResponse, frequency_response
 from ..analysis.identifiability import identifiability
 from ..analysis.prediction import Predictions
+from ..analysis.traces import Traces, flight_traces
 from ..bracket import GAUSSIAN_PRIOR
 from ..estimators import FilterError
 from ..recording.motion import EXCITED
@@ -29,7 +30,7 @@ from .doubts import (
     neighbours,
     vibration,
 )
-from .held_out import predict_held_out, validate_on
+from .held_out import predict_held_out, validate_on, vehicle_traces
 from .quantities import doubts_of_flight, flight_quantities, vehicle_quantities
 from .results import (
     ChannelFit,
@@ -72,18 +73,23 @@ class Checked(NamedTuple):
     skill: PredictionSkill | None = None
     predictions: Predictions | None = None
     response: FrequencyResponse | None = None
+    traces: Traces | None = None
+    correlations: Correlations | None = None
 
 
 def check_flight(data: Data, answer: Answer, prior: float) -> Checked:
     """The checks of a flight of an OS4. `prior`: how the estimator uses the bracket."""
     names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
-    reasons, limits, fit = {}, dict.fromkeys(names), {}
-    if answer.evaluation is not None:
-        fit = channel_fits(answer.problem, residual_diagnostics(answer.evaluation))
-        information = identifiability(answer.evaluation, answer.problem.unknowns.bracket)
+    reasons, limits, fit, traces, correlations = {}, dict.fromkeys(names), {}, None, None
+    if (found := answer.evaluation) is not None:
+        fit = channel_fits(answer.problem, residual_diagnostics(found))
+        information = identifiability(found, answer.problem.unknowns.bracket)
         notes, known = information.notes(names), information.identifiable & information.excited
         reasons = {name: notes[name] for i, name in enumerate(names) if not known[i] and name in notes}
         limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
+        if found.feasible:
+            errors = np.where(np.isnan(found.measured), np.nan, found.errors)[:, : found.problem.size]
+            traces, correlations = flight_traces(found), residual_correlations(errors, found.torques)
     table = {
         name: msgspec.structs.replace(row, noise_limit=limits[name])
         for name, row in parameter_table(answer, prior, reasons).items()
@@ -103,6 +109,8 @@ def check_flight(data: Data, answer: Answer, prior: float) -> Checked:
         result=outcome(search, wrong if search == "successful" else tuple(verdicts), verdicts, doubts),
         fit=fit,
         validation=None if data.held_out is None else validate_on(answer, data.held_out),
+        traces=traces,
+        correlations=correlations,
     )
 
 
@@ -144,6 +152,8 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
     doubts += _doubts_of_search(search, quantities)
     verdicts = verdicts_of(quantities, doubts)
     values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
+    predicted = None if predicted is None else predicted.thinned(_MOST_STARTS)
+    traces, correlations = vehicle_traces(data, answer, optimum, predicted)
     return Checked(
         parameters=table,
         rigid_body=body,
@@ -152,7 +162,9 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
         result=outcome(search, ("Ix", "Iy"), verdicts, doubts),
         notes=notes,
         skill=skill,
-        predictions=None if predicted is None else predicted.thinned(_MOST_STARTS),
+        predictions=predicted,
+        traces=traces,
+        correlations=correlations,
         response=frequency_response(with_room(answer.problem, data.room), values),
     )
 

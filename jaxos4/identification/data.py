@@ -6,7 +6,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from .._version import __version__
 from ..airframe import PRESETS, Airframe
@@ -22,15 +22,23 @@ def silent(stage: str) -> None:
     """Tells nobody about a stage."""
 
 
+class Clock(NamedTuple):
+    """Of each sample, the number of its log, and its time in this log [s]."""
+
+    log: Int[np.ndarray, " samples"] = np.zeros(0, int)
+    time: Float[np.ndarray, " samples"] = np.zeros(0)
+
+
 class HeldOut(NamedTuple):
     """Measurements that are not fitted.
 
     - `problem`: the flight and its model.
-    - `recording`: the name of the other recording that it is; empty: it is a part of the fitted ones.
+    - `recording`, `clock`: the name of the other recording that it is; empty: it is a part of the fitted ones.
     """
 
     problem: ShootingProblem
     recording: str = ""
+    clock: Clock = Clock()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +51,7 @@ class Data(Generic[L]):
     - `provenance`: data, settings and versions.
     - `held_out`: what is not fitted, if there is anything.
     - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
+    - `clock`: of a vehicle's logs.
     """
 
     likelihood: L
@@ -52,6 +61,7 @@ class Data(Generic[L]):
     held_out: HeldOut | None = None
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
+    clock: Clock = Clock()
 
     @property
     def room(self) -> int:

@@ -9,17 +9,20 @@ import numpy as np
 from jaxtyping import Array
 
 from .._custom_types import Numeric, as_float
-from ..analysis.diagnostics import residual_diagnostics
+from ..analysis.diagnostics import Correlations, residual_correlations, residual_diagnostics
 from ..analysis.evaluation import evaluate
-from ..analysis.open_loop import disturbances
+from ..analysis.open_loop import Traced, traced
 from ..analysis.prediction import Predictions, Skill, predictions, skill
+from ..analysis.traces import Traces, position_of
 from ..estimate import fit_start
 from ..estimators import EquationError
+from ..flight import RATES
 from ..shooting import ShootingProblem, padded, with_room
 from ..shooting.gains import LogNoise
 from .answers import Answer, channel_fits
 from .data import Data, HeldOut
 from .results import PredictionSkill, RateSkill, Validation, finite_or_none
+from .search import Optimum
 
 REGRESSION = EquationError(memory=0.9)
 """For comparison. This memory is the best on real flights."""
@@ -41,7 +44,9 @@ def predict_held_out(
             fitted = dict(zip(names, values.tolist(), strict=True))
             each = {n: [fitted[own] for own in fitted if own.rpartition("_")[0] == n] for n in problem.unknowns.names}
             parameters = np.array([fitted[n] if n in fitted else np.mean(each[n]) for n in each])
-        known = None if noise is None else _disturbances(data, held_out, parameters, noise)
+        seen, known = _together(data, held_out), None
+        if noise is not None:
+            known = _traced(data, seen, parameters, noise).disturbance
         predicted = predictions(problem, as_float(parameters), disturbance=known, noise=noise)
         return predicted, skill(predicted)
 
@@ -55,15 +60,46 @@ def predict_held_out(
     return predicted, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
 
 
-def _disturbances(data: Data, held_out: HeldOut, parameters: np.ndarray, noise: LogNoise) -> np.ndarray:
-    """The disturbances of the vehicle, from all measurements: those that were fitted and those that were not."""
-    problem = held_out.problem
-    if not held_out.recording:
-        own, others = np.asarray(problem.flight.states), np.asarray(data.flight.flight.states)
-        both = as_float(np.where(np.isnan(own), others, own))
-        problem = eqx.tree_at(lambda p: p.flight.states, problem, both)
+def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
+    """The problem with all measurements: those that were fitted, and those that were held out of the same flight."""
+    if held_out.recording:
+        return held_out.problem
+    own, others = np.asarray(held_out.problem.flight.states), np.asarray(data.flight.flight.states)
+    both = as_float(np.where(np.isnan(own), others, own))
+    return eqx.tree_at(lambda p: p.flight.states, held_out.problem, both)
+
+
+def _traced(data: Data, problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise) -> Traced:
+    """The disturbances and innovations of all samples of a flight."""
     samples = problem.flight.time.shape[0]
-    return disturbances(with_room(problem, max(samples, data.room)), as_float(parameters), noise)[:samples]
+    found = traced(with_room(problem, max(samples, data.room)), as_float(parameters), noise)
+    return Traced(*(each[:samples] for each in found))
+
+
+def vehicle_traces(
+    data: Data, answer: Answer, optimum: Optimum, predicted: Predictions | None
+) -> tuple[Traces, Correlations]:
+    """The signals of the fitted flights, and the correlations of the innovations.
+
+    `predicted`: the predictions that the result keeps.
+    """
+    other = data.held_out
+    problem = answer.problem if other is None or other.recording else _together(data, other)
+    values = np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count]
+    found, flight = _traced(data, problem, values, optimum.noise), answer.problem.flight
+    states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
+    position = position_of(np.asarray(problem.flight.states, float))
+    start = np.zeros(0, int) if predicted is None else predicted.start
+    clock = data.clock if other is None or not other.recording else other.clock
+    signals = omega, states[:, RATES], states[:, :0], found.disturbance, position
+    traces = Traces(data.clock.time, data.clock.log, *signals, clock.time[start], clock.log[start])
+    torques = omega**2 @ np.asarray(answer.problem.model.airframe.mixer)[:3].T
+    crossed = residual_correlations(found.innovation, torques)
+    if (parts := optimum.estimate.parts) is not None:
+        # Of the innovations of the likelihood itself, which is exact for means.
+        products = np.asarray(parts.products).sum(axis=0)[:3]
+        crossed = crossed._replace(own=products[:, 1:] / np.maximum(products[:, :1], 1.0))
+    return traces.thinned(), crossed
 
 
 def _regressed(problem: ShootingProblem, room: int, values: np.ndarray, fixed: Sequence[bool]) -> np.ndarray:

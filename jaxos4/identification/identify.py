@@ -119,4 +119,6 @@ def describe(
         skill=checked.skill,
         predictions=checked.predictions,
         response=checked.response,
+        traces=checked.traces,
+        correlations=checked.correlations,
     )

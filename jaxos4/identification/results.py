@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING, Any, SupportsFloat
 import msgspec
 
 from ..airframe import Airframe, airframe_table
+from ..analysis.diagnostics import Correlations
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
+from ..analysis.traces import Traces
 from ..estimate import Estimate
 from ..results import result_names
 from ..shooting import ShootingProblem
+from .provenance import Provenance as Provenance
 from .tables import dataframe, dataset, series
 from .verdict import TOLERANCE, Doubt, Verdict
 
@@ -40,6 +43,7 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     - `std`: standard deviation of the estimate; `None` if it is not finite.
     - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation.
     - `unit`: of all these. `note`: a warning, or an empty string.
+    - `bracket`: where the parameter was searched; of a vehicle, a prior with this centre and half-width.
     - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise. Only for one
       flight of an OS4.
     """
@@ -51,6 +55,7 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     unit: str
     note: str
     noise_limit: float | None | msgspec.UnsetType = msgspec.UNSET
+    bracket: tuple[float, float] | None | msgspec.UnsetType = msgspec.UNSET
 
 
 class Constant(msgspec.Struct, frozen=True):
@@ -161,40 +166,6 @@ class PredictionSkill(msgspec.Struct, frozen=True):
     r: RateSkill
 
 
-class Provenance(msgspec.Struct, frozen=True, kw_only=True):
-    """Inputs, settings and versions of an identification. Fields that do not apply are not written.
-
-    - `flight`: the name of the flight of an OS4; `flights`, `validate`: of a vehicle's recordings.
-    - `airframe`: its name or file; `terms`: of the vehicle's model; `battery_voltage`: its usual one [V].
-    - `channels`, `initial_state`, `windows`, `samples`: of the problem of a flight.
-    - `sample_time`: of the fitted data [s]. `fitted_seconds`, `tested_seconds`: how long these last [s].
-    - `network`: where a network is from, and how it was trained.
-    - `notes`: about the data. `command`: the command line, if there was one.
-    - `version`, `jax`, `device`, `precision`: of the computation.
-    """
-
-    flight: str | msgspec.UnsetType = msgspec.UNSET
-    flights: list[str] | msgspec.UnsetType = msgspec.UNSET
-    validate: str | None | msgspec.UnsetType = msgspec.UNSET
-    airframe: str
-    channels: str | msgspec.UnsetType = msgspec.UNSET
-    initial_state: str | msgspec.UnsetType = msgspec.UNSET
-    windows: int | msgspec.UnsetType = msgspec.UNSET
-    samples: int | msgspec.UnsetType = msgspec.UNSET
-    terms: list[str] | msgspec.UnsetType = msgspec.UNSET
-    sample_time: float
-    fitted_seconds: float | msgspec.UnsetType = msgspec.UNSET
-    tested_seconds: float | msgspec.UnsetType = msgspec.UNSET
-    battery_voltage: float | msgspec.UnsetType = msgspec.UNSET
-    network: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
-    notes: list[str] = []
-    command: str | msgspec.UnsetType = msgspec.UNSET
-    version: str
-    jax: str
-    device: str
-    precision: str
-
-
 class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The parameters of a quadrotor, with what a user needs to judge them.
 
@@ -214,6 +185,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `airframe`: the constants that were not estimated.
     - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the noise levels
       that were found. Files do not hold them: `None` if the result was read from one.
+
+    - `traces`: signals of the fitted flights, at most 1,200 samples. `correlations`: of the residuals. `None` without
+      an answer.
 
     Only of a flight of an OS4:
 
@@ -258,6 +232,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     skill: PredictionSkill | None = None
     predictions: Predictions | None = None
     response: FrequencyResponse | None = None
+    traces: Traces | None = None
+    correlations: Correlations | None = None
 
     @property
     def successful(self) -> bool:
@@ -295,8 +271,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         apart = APART | (_OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES)
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
         fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
-        if self.is_vehicle:
-            fields |= {"predictions": series(self.predictions), "response": series(self.response)}
+        arrays = (*ARRAYS[:2], *ARRAYS[2:] * self.is_vehicle)
+        fields |= {name: series(getattr(self, name)) for name in arrays}
         return msgspec.to_builtins(fields)
 
     def summary(self, *, verbose: bool = False, width: int = 80) -> str:
@@ -343,7 +319,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return dataset(*parts, sample_time=step, **about)
 
 
-APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", "predictions", "response"}
+ARRAYS = ("traces", "correlations", "predictions", "response")
+"""Fields that are arrays by name; the last two of a vehicle only."""
+APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", *ARRAYS}
 """Fields that a file holds in another form, or not at all."""
 _OF_FLIGHTS = {"fit", "validation"}  # and those of a vehicle: written of this kind only
 _OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}

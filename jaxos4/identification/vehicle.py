@@ -25,7 +25,7 @@ from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_o
 from ..shooting.feedthrough import input_innovations
 from .answers import Solution
 from .checks import Checked, check_vehicle
-from .data import Data, HeldOut, Progress, airframe_name, versions
+from .data import Clock, Data, HeldOut, Progress, airframe_name, versions
 from .problem import Intervals, bracket_of
 from .results import Provenance
 from .sample_time import sample_time_of, search_sample_times, shortest
@@ -174,14 +174,16 @@ def _data(
         notes=list(notes),
         **versions(shooting),
     )
+    recording = np.asarray(prepared.recordings)[number]
     return Data(
         likelihood=_innovations(shooting, prepared, room),
         flight=shooting,
-        recording=np.asarray(prepared.recordings)[number],
+        recording=recording,
         provenance=provenance,
         held_out=held_out,
         findings=prepared.doubts,
         log_step=prepared.log_step,
+        clock=Clock(recording, prepared.time),
     )
 
 
@@ -251,7 +253,8 @@ def _held_out(
     if validate is not None:
         other = _prepare_other(recordings, validate, prepared, model)
         own = dataclasses.replace(model, recordings=other.recordings)
-        held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name), other.seconds[0]
+        clock = Clock(np.full(other.time.size, len(recordings)), other.time)
+        held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, clock), other.seconds[0]
         name, remedy, notes = validate.name, "give another flight", notes + other.notes
     elif prepared.tested is not None:
         held_out = HeldOut(dataclasses.replace(fitted, flight=prepared.tested))

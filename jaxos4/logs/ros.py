@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
+from .compression import check_parts, check_sizes
 from .messages import ANGLES, RATES, Fields, Messages, Names
 from .sampling import Series, euler_angles
 from .table import (
@@ -56,6 +57,11 @@ def read_ros(path: Path, columns: ColumnMap | None = None) -> tuple[Table, tuple
     try:
         reader = _reader(path)
         reader.open()
+        if getattr(getattr(reader, "metadata", None), "compression_mode", "") == "message":
+            every = (message for store in reader.storages for *_, message in store.messages(store.connections))
+            check_parts(path, (("zstd", message) for message in every))
+    except InputError:
+        raise
     except Exception as error:  # noqa: BLE001 - of a damaged file, rosbags raises any
         _refuse_damage(path, error)
     try:
@@ -70,19 +76,23 @@ ROS = LogFormat(
 
 
 def _reader(path: Path) -> Any:
-    """The reader of rosbags for the bytes with which a file begins, or for a folder. It is not open yet."""
+    """The reader of rosbags for the bytes with which a file begins, or for a folder. It is not open yet.
+
+    Raises `InputError` for a file that is far larger when it is decompressed.
+    """
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2.storage_mcap import McapReader
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-    place = FilePath(path)
+    place, begin = FilePath(path), b""
+    if not place.is_dir():
+        with opened(path, "rb") as file:
+            begin = file.read(len(_FOLDER))
+        place = place.parent if begin.startswith(_FOLDER) else place
+    check_sizes(place)
     if place.is_dir():
         return Reader2(place)
-    with opened(path, "rb") as file:
-        begin = file.read(len(_FOLDER))
-    if begin.startswith(_FOLDER):
-        return Reader2(place.parent)
     kinds = {_ROS1: Reader1, _MCAP: McapReader, _SQLITE: Sqlite3Reader}
     return next(reader for magic, reader in kinds.items() if begin.startswith(magic))(place)
 

@@ -9,5 +9,6 @@ from .identification_text import (
     identification_summary as identification_summary,
     print_identification as print_identification,
 )
+from .log_page import write_log_page as write_log_page
 from .study_page import write_report as write_report
 from .study_tables import error_table as error_table

@@ -15,22 +15,21 @@ from matplotlib.ticker import MultipleLocator
 
 from .._files import check_writable, write_file
 from ..airframe import Airframe
-from ..analysis.frequency_response import FrequencyResponse
+from ..analysis.frequency_response import HIGHEST, FrequencyResponse
 from ..analysis.inertia import CenterOfMass
-from ..analysis.prediction import Predictions, decisive_horizon
 from ..errors import printable
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Constant, Identification, SampleTime
-from ..identification.verdict import headline, reasons
+from ..identification.verdict import RIGID_BODY, headline, reasons
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
-from .identification_plots import GAINS, HIGHEST, INERTIAS, draw_response, gain_band, gaps
+from .identification_figures import correlation_matrix, path_in_space, priors, residual_figure, strongest
+from .identification_plots import GAINS, INERTIAS, draw_response, gain_band
+from .identification_signals import BAND, identified_signals
 from .identification_text import quantity_rows
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
 
-# The share of the errors that the band of the predictions holds.
-_BAND = 0.95
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
 _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 0.2, "hspace": 0.6}
@@ -53,6 +52,12 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
             figures["sample-times"] = inertias_by_sample_time(found.sample_times, used.sample_time, look)
         if found.response is not None:
             figures["response"] = frequency_responses(found.response, look)
+        if (figure := priors(found, look)) is not None:
+            figures["priors"] = figure
+        if found.correlations is not None:
+            figures["residuals"] = residual_figure(found.correlations)
+        if found.traces is not None and np.isfinite(found.traces.position).any():
+            figures["path"] = path_in_space(found.traces, look)
         for figure in figures.values():
             # The page shows each panel by itself. To fit all labels exactly would take a third of the time.
             figure.set_layout_engine(None)
@@ -66,8 +71,11 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         headline=headline(found.verdicts, found.doubts),
         center=[f"{each.axis} {_plus_minus(1e3 * each.value, 1e3 * each.std)} mm" for each in center],
         ninety_five=NINETY_FIVE,
-        rates=None if found.predictions is None else predicted_rates(found.predictions, used.sample_time, look),
-        band=f"{100 * _BAND:g}",
+        quantities=quantities(found),
+        signals=identified_signals(found, look),
+        band=f"{100 * BAND:g}",
+        matrix=None if found.covariance is None or len(found.covariance) < 2 else correlation_matrix(found),
+        strongest=[] if found.covariance is None else strongest(found),
         drawings=drawings,
         command=used.command or "",
         notes=[*used.notes, *filter(None, [found.motor_clock])],
@@ -78,6 +86,26 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         ],
     )
     write_file(path, text)
+
+
+def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
+    """The cells of each physical quantity, and a note: what must be right, and what is wrong.
+
+    A moment of inertia that was not identified is in the table too.
+    """
+    every, rows = physical_quantities(found), []
+    for row, cells, note in zip(every, *quantity_rows(every), strict=True):
+        own = found.parameters.get(row.name.replace(" ", "_"))
+        small = row.judged == RIGID_BODY and abs(row.value) <= NINETY_FIVE * row.std
+        causes = row.verdict.reasons if row.verdict is not None and row.name == row.judged else ()
+        said = dict.fromkeys([note, "" if own is None else own.note, "below noise" if small else "", *causes])
+        rows.append((cells, "; ".join(filter(None, said))))
+    listed = {cells[0] for cells, _ in rows}
+    for name in INERTIAS:
+        if name in found.verdicts and name not in listed:
+            why = found.verdicts[name]
+            rows.append(((name, MISSING, "", "kg m^2"), "; ".join((why.status, *why.reasons))))
+    return sorted(rows, key=lambda row: INERTIAS.index(row[0][0]) if row[0][0] in INERTIAS else len(INERTIAS))
 
 
 def identification_html(found: Identification) -> str:
@@ -149,30 +177,6 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
     bars.grid(axis="y", visible=False)
     bars.set_title("moments of inertia [kg m²], 95 %")
     return figure
-
-
-def predicted_rates(predicted: Predictions, sample_time: float, look: Style) -> str:
-    """Measured and predicted p, q, r for every horizon as JSON, from which the page draws; null between stretches.
-
-    - `start`: when each prediction starts [s]. `horizons`: [s]; `shown`: the index of the first one to show.
-    - `measured`, `predicted`: by horizon, rate and start [rad/s].
-    - `half`: half the width of the band that holds 95 % of the errors, by horizon and rate [rad/s].
-
-    **Arguments:** `sample_time`: of the flight [s].
-    """
-    start, errors = predicted.start, np.abs(predicted.predicted - predicted.measured)
-    breaks, usual = gaps(start)
-    half = np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), _BAND, axis=0)
-    measured, values = (
-        np.insert(each, breaks, np.nan, axis=0).transpose(1, 2, 0) for each in (predicted.measured, predicted.predicted)
-    )
-    start = np.insert(start.astype(float), breaks, start[breaks - 1] + usual)
-    arrays = {"start": start * sample_time, "measured": measured, "predicted": values, "half": half}
-    return json.dumps(
-        {name: np.where(np.isfinite(array), array.round(4), np.nan).tolist() for name, array in arrays.items()}
-        | {"horizons": [f"{x:.3g}" for x in predicted.horizons], "color": look.color, "band": f"{100 * _BAND:g} %"}
-        | {"shown": decisive_horizon(predicted.horizons, np.isfinite(predicted.measured).any(axis=(0, 2)))}
-    ).replace("NaN", "null")
 
 
 def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:

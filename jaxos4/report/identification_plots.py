@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 
-from ..analysis.frequency_response import AxisResponse
+from ..analysis.frequency_response import HIGHEST, AxisResponse
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
 from ..identification.results import Identification
 from .style import BOUND_DASHES, FAINT, INK, log_axis, styles
 
-HIGHEST, GAINS = 40.0, (0.2, 5.0)
-"""The highest frequency [Hz] and the gains that a figure of the response shows."""
+GAINS = (0.2, 5.0)
+"""The gains that a figure of the response shows."""
 
 INERTIAS: tuple[str, ...] = ("Ix", "Iy", "Iz")
 _RATES = ("p", "q", "r")

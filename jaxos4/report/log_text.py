@@ -6,8 +6,15 @@ from ..identification import FlightInformation
 from ..recording.inspection import Inspection
 from .text import Listing
 
+_COMMANDS = "of full scale (commands)"
 _UNITS = {"p q r": "rad/s", "phi theta psi": "rad", "x y z": "m", "vx vy vz": "m/s", "ax ay az": "m/s^2"}
 _UNITS |= {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
+
+
+def unit_of(channel: str, commands: bool) -> str:
+    """The unit of a channel. `commands`: whether rotors have commands."""
+    unit = next(unit for names, unit in _UNITS.items() if channel in names.split())
+    return _COMMANDS if commands and channel.startswith("rotor") else unit
 
 
 def print_inspection(console: Console, found: Inspection, label: str) -> None:
@@ -36,7 +43,7 @@ def _print_contents(console: Console, found: Inspection, label: str) -> None:
         gap = max(channel.longest_gap for channel in measured.values())
         gaps = f", at most {1e3 * gap:.3g} ms apart" if gap > 1.5 * found.sample_time else ""
         commands = "rotor1" in names and 0 < largest <= 1
-        size = f"up to {largest:.3g} {'of full scale (commands)' if commands else unit}"
+        size = f"up to {largest:.3g} {_COMMANDS if commands else unit}"
         console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
     for note in found.notes:
         console.print(f"note: {note}")

@@ -5,6 +5,8 @@ import numpy as np
 from helpers import CRAZYFLIE
 
 from jaxos4 import AxisResponse, FrequencyResponse, Predictions
+from jaxos4.analysis.diagnostics import residual_correlations
+from jaxos4.analysis.traces import Traces
 from jaxos4.identification.results import (
     ChannelFit,
     Constant,
@@ -78,6 +80,7 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         "noise": {"p": 0.41},
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
         "predictions": synthetic_predictions(),
+        "traces": vehicle_traces(),
         "response": synthetic_response(),
         "provenance": Provenance(**VERSIONS | settings | (provenance or {})),
     }
@@ -107,3 +110,33 @@ def synthetic_predictions(starts=160) -> Predictions:
     measured[3, 1, 0] = np.nan
     predicted = np.sin(3 * time) + 0.3 * horizons[:, None] * np.cos(40 * time)
     return Predictions(start, horizons, np.sin(3 * time[:, 0]), predicted, measured)
+
+
+def synthetic_traces(time, log, measured) -> Traces:
+    """Traces of rotors at one speed, with a disturbance and no position."""
+    rotors, none = np.full((time.size, 4), 200.0), np.zeros((time.size, 0))
+    gusts = np.stack([np.sin(time), np.cos(time), time], axis=1)
+    return Traces(time, log, rotors, measured, none, gusts, none, time[:0], log[:0])
+
+
+def behind_an_estimate() -> dict:
+    """What stands behind an estimate of twelve channels: traces, correlations of residuals, brackets, a covariance."""
+    time, rng = 0.01 * np.arange(400), np.random.default_rng(0)
+    flown = synthetic_traces(time, np.zeros(400, int), np.sin(time[:, None] * np.arange(1, 13)))
+    path = np.stack([np.sin(time), np.cos(time), time], axis=1)
+    predicted = flown.measured + 0.01 * rng.normal(size=(400, 12))
+    traces = flown._replace(predicted=predicted, disturbance=flown.measured[:, :0], position=path)
+    torques, noise = rng.normal(size=(400, 3)), rng.normal(size=(400, 12))
+    noise[5:, 1] = 0.5 * torques[:-5, 2]  # q follows the yaw torque
+    rows = {name: msgspec.structs.replace(KNOWN, bracket=(5e4, 6e4)) for name in ("alpha3", "alpha6")}
+    behind = {"traces": traces, "correlations": residual_correlations(noise, torques), "parameters": rows}
+    return behind | {"covariance": [[4.0, -1.9], [-1.9, 1.0]]}
+
+
+def vehicle_traces(start=None) -> Traces:
+    """Those of `synthetic_predictions` with these starts: the first seconds of the flight were fitted."""
+    start = synthetic_predictions().start if start is None else start
+    time = 0.025 * np.arange(400)
+    measured = np.where(time[:, None] < 3.5, np.sin(3 * time[:, None]), np.nan) * np.ones(3)
+    found = synthetic_traces(time, np.zeros(400, int), measured)
+    return found._replace(start_time=0.004 * start, start_log=np.zeros(start.size, int)).thinned()

@@ -1,0 +1,98 @@
+"""Compressed parts of a bag, measured before they are decompressed: a small file must not fill the memory."""
+
+import bz2
+import re
+import struct
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from pathlib import Path as FilePath
+from typing import IO, Any
+
+from .table import Path, opened, refuse
+
+LARGEST = 1 << 28
+"""Bytes of one decompressed part. Recorders write parts of about a megabyte; a bomb has gigabytes."""
+_STEP = 1 << 20  # bytes that are decompressed at a time
+_CHUNK_OF_MCAP, _CHUNK_OF_ROS1 = 6, b"\x05"
+
+
+def check_sizes(path: Path, *, largest: int = LARGEST) -> None:
+    """Refuse a bag or MCAP file with a part that becomes larger than `largest` when it is decompressed.
+
+    `path`: a file, or the folder of a bag of ROS 2. What is damaged is left to the reader. Raises `InputError`.
+    """
+    place = FilePath(path)
+    for each in sorted(file for file in place.iterdir() if file.is_file()) if place.is_dir() else [place]:
+        with opened(each, "rb") as file:
+            begin = file.read(8)
+            if begin.startswith(b"\x89MCAP"):
+                parts = _mcap_parts(file)
+            elif begin == b"#ROSBAG ":
+                file.readline()
+                parts = _ros1_parts(file)
+            else:
+                parts = iter([("zstd", begin + file.read())] if each.suffix == ".zstd" else [])
+            check_parts(path, parts, largest=largest)
+
+
+def check_parts(path: Path, parts: Iterable[tuple[str, bytes]], *, largest: int = LARGEST) -> None:
+    """The same for parts, each the name of its compression and its content."""
+    if any(_exceeds(kind, content, largest) for kind, content in parts):
+        what = f"holds a compressed part of more than {largest:,} bytes, which no recorder writes"
+        refuse(path, f"{what}; record it again in parts of a few megabytes")
+
+
+def _mcap_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
+    """The compression and the content of each chunk."""
+    while len(head := file.read(9)) == 9:
+        kind, length = struct.unpack("<BQ", head)
+        if kind != _CHUNK_OF_MCAP:
+            file.seek(min(length, 1 << 62), 1)
+            continue
+        chunk = file.read(min(length, 1 << 31))
+        (size,) = struct.unpack_from("<I", chunk.ljust(32), 28)
+        yield chunk[32 : 32 + size].decode(errors="replace"), chunk[40 + size :]
+
+
+def _ros1_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
+    """The same of a bag of ROS 1, behind its first line."""
+    while len(head := file.read(4)) == 4:
+        header = file.read(struct.unpack("<I", head)[0])
+        (length,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
+        if b"op=" + _CHUNK_OF_ROS1 not in header:
+            file.seek(length, 1)
+            continue
+        kind = re.search(rb"compression=(none|bz2|lz4)", header)
+        yield "" if kind is None else kind[1].decode(), file.read(length)
+
+
+def _exceeds(kind: str, content: bytes, largest: int) -> bool:
+    made = _decompressor(kind)
+    if made is None:
+        return False
+    length, decompressor = 0, made()
+    try:
+        while content or not decompressor.needs_input:
+            length += len(decompressor.decompress(content, _STEP))
+            content = b""
+            if length > largest:
+                return True
+            if decompressor.eof:
+                content, decompressor = decompressor.unused_data or b"", made()
+    except Exception:  # noqa: BLE001 - of a damaged part, a decompressor raises any
+        return False
+    return False
+
+
+def _decompressor(kind: str) -> Any:
+    """The class that decompresses piece by piece; `None`: not compressed, or not known."""
+    if kind == "bz2":
+        return bz2.BZ2Decompressor
+    if kind == "lz4":
+        return import_module("lz4.frame").LZ4FrameDecompressor
+    if kind != "zstd":
+        return None
+    try:
+        return import_module("compression.zstd").ZstdDecompressor
+    except ImportError:
+        return import_module("backports.zstd").ZstdDecompressor

@@ -1,0 +1,168 @@
+"""Signals on one time axis without gaps, packed into a page, where `timeline.js` draws and zooms them together."""
+
+import base64
+import json
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .style import Style
+
+_LEVELS = 65_000  # of a packed number, which takes two bytes
+
+
+class Line(NamedTuple):
+    """A signal: its name, a value for each time of its view (NaN: none), and its look; `None`: as measured ones."""
+
+    label: str
+    values: Float[np.ndarray, " samples"]
+    look: Style | None = None
+
+
+class Panel(NamedTuple):
+    """Signals on one axis.
+
+    - `title`: with the unit.
+    - `half`: half the width of a band around the last line, in the same unit; 0: no band.
+    - `residual`: whether a panel below shows the first line minus the last.
+    """
+
+    title: str
+    lines: Sequence[Line]
+    half: float = 0.0
+    residual: bool = False
+
+
+class View(NamedTuple):
+    """Panels of the same samples. `time`: of each sample on the axis [s], see `Axis.place`."""
+
+    name: str
+    time: Float[np.ndarray, " samples"]
+    panels: Sequence[Panel]
+
+
+class Axis(NamedTuple):
+    """A time axis without gaps, from 0. It is made of pieces, each an uninterrupted part of a log.
+
+    - `at`: where a piece begins on the axis; `begin`, `end`: its own time [s]; `log`: the number of its log.
+    """
+
+    at: Float[np.ndarray, " pieces"]
+    begin: Float[np.ndarray, " pieces"]
+    end: Float[np.ndarray, " pieces"]
+    log: Int[np.ndarray, " pieces"]
+
+    @classmethod
+    def of(
+        cls, time: Float[np.ndarray, " samples"], log: Int[np.ndarray, " samples"], *, longest: float = 1.0
+    ) -> "Axis":
+        """The axis of samples in their order. `longest`: the longest time without a sample that stays [s]."""
+        steps = np.diff(time)
+        usual = float(np.median(steps)) if steps.size else 1.0
+        edges = np.flatnonzero((np.diff(log) != 0) | (steps > max(longest, 5 * usual)) | (steps < 0)) + 1
+        first, last = np.concatenate([[0], edges]), np.concatenate([edges, [time.size]]) - 1
+        lengths = time[last] - time[first]
+        between = 0.01 * lengths.sum() if len(first) < 20 else 0.0
+        at = np.concatenate([[0.0], np.cumsum(lengths + between)[:-1]])
+        return cls(at, time[first], time[last], log[first])
+
+    def place(
+        self, time: Float[np.ndarray, " moments"], log: Int[np.ndarray, " moments"], *, near: float = 0.05
+    ) -> Float[np.ndarray, " moments"]:
+        """Where moments of logs are on the axis; NaN in a gap. So `near` to a piece [s] is at its end."""
+        placed = np.full(time.shape, np.nan)
+        for at, begin, end, number in zip(*self, strict=True):
+            inside = (log == number) & (time >= begin - near) & (time <= end + near)
+            placed[inside] = at + np.clip(time[inside], begin, end) - begin
+        return placed
+
+
+def spans(time: Float[np.ndarray, " samples"], marked: Bool[np.ndarray, " samples"]) -> list[tuple[float, float]]:
+    """From when to when samples are marked. Samples on both sides of a long gap are of two spans."""
+    steps = np.diff(time)
+    usual = float(np.median(steps)) if steps.size else 0.0
+    edges = np.flatnonzero(np.diff(marked.astype(int)) | (steps > 5 * usual)) + 1
+    parts = np.split(np.arange(time.size), edges)
+    return [(float(time[part[0]] - usual / 2), float(time[part[-1]] + usual / 2)) for part in parts if marked[part[0]]]
+
+
+def thinned(
+    time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples channels"], most: int
+) -> tuple[Float[np.ndarray, " fewer"], Float[np.ndarray, "fewer channels"]]:
+    """At most `most` samples that draw the same lines: the least and the largest value of each block, in turn."""
+    block = -(-2 * time.size // most)
+    if block <= 2:
+        return time, values
+    count = time.size // block
+    cut = values[: count * block].reshape(count, block, values.shape[1])
+    known = np.isfinite(cut)
+    ends = np.where(known, cut, np.inf).min(axis=1), np.where(known, cut, -np.inf).max(axis=1)
+    both = np.where(np.asarray(known.any(axis=1))[:, None], np.stack(ends, axis=1), np.nan).reshape(2 * count, -1)
+    return time[: count * block].reshape(count, block)[:, [0, block // 2]].ravel(), both
+
+
+def signals(
+    axis: Axis,
+    common: Sequence[View],
+    views: Sequence[View] = (),
+    *,
+    shown: int = 0,
+    shaded: Sequence[tuple[float, float]] = (),
+    names: Sequence[str] = (),
+) -> str:
+    """What `timeline.js` draws, as JSON.
+
+    **Arguments:**
+
+    - `common`: views below the chosen one of `views`. `shown`: the number of the first that is chosen.
+    - `shaded`: from when to when the background is grey, on the axis.
+    - `names`: of the logs, shown if there are several.
+    """
+    several = np.ptp(axis.log) > 0
+    pieces = [[*(float(x) for x in row[:3]), names[int(row[3])] if several else ""] for row in zip(*axis, strict=True)]
+    return json.dumps(
+        {
+            "pieces": pieces,
+            "shaded": [[round(x, 4) for x in each] for each in shaded],
+            "views": [_view(each) for each in views],
+            "common": [_view(each) for each in common],
+            "shown": shown,
+        }
+    )
+
+
+def _view(view: View) -> dict[str, Any]:
+    kept = np.isfinite(view.time)
+    order = np.flatnonzero(kept)[np.argsort(view.time[kept], kind="stable")]
+    return {
+        "name": view.name,
+        "time": base64.b64encode(view.time[order].astype("<f4").tobytes()).decode(),
+        "panels": [
+            {
+                "title": panel.title,
+                "half": panel.half,
+                "residual": panel.residual,
+                "lines": [
+                    {
+                        "label": line.label,
+                        "values": _packed(line.values[order]),
+                        "color": None if line.look is None else line.look.color,
+                        "dash": [3.0, 3.0] if line.look is None else [1.6 * x for x in line.look.dash[1]],
+                    }
+                    for line in panel.lines
+                ],
+            }
+            for panel in view.panels
+        ],
+    }
+
+
+def _packed(values: Float[np.ndarray, " samples"]) -> list[Any]:
+    """The lowest value, the size of a level, and the level of each value as text; -1 - 2^15: not finite."""
+    finite = np.isfinite(values)
+    low, high = (float(f(values[finite])) for f in (np.min, np.max)) if finite.any() else (0.0, 0.0)
+    step = (high - low) / _LEVELS or 1.0
+    levels = np.where(finite, np.rint((np.where(finite, values, low) - low) / step) - _LEVELS // 2, -(1 << 15))
+    return [low + step * (_LEVELS // 2), step, base64.b64encode(levels.astype("<i2").tobytes()).decode()]
