@@ -30,7 +30,8 @@ JUDGED = "Ix", "Iy"
 def judged(path: Path, airframe: jaxos4.Airframe) -> Row:
     """Result, value, 95 % half-width, verdict and reasons of each quantity."""
     try:
-        found = jaxos4.identify(read_recording(path, airframe=airframe), airframe)
+        recording = read_recording(path, airframe=airframe)._replace(name=path.stem)
+        found = jaxos4.identify(recording, airframe)
     except InputError as error:
         return {"result": "refused", "why": str(error)}
     row: Row = {"result": found.result}

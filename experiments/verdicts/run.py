@@ -7,8 +7,9 @@ The good flights, and the airframe that is given, are those of `closed_loop/effe
 wherever the answer says so.
 """
 
+import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -30,6 +31,7 @@ from jaxos4.results import NINETY_FIVE
 JUDGED = "Ix", "Iy"
 SURE, FAR = 3.0, 0.12  # an answer beyond either is wrong: standard deviations, and share of the truth
 FORCE = slice(12, 15)  # of the channels
+LOST = "lost"  # the result of a vehicle that turns over
 
 
 class Fault(NamedTuple):
@@ -220,7 +222,24 @@ def share(part: int, whole: int) -> str:
     if not whole:
         return ""
     p = np.clip(part / whole, 0.5 / whole, 1 - 0.5 / whole)
-    return f"{100 * part / whole:.0f} +- {100 * np.sqrt(p * (1 - p) / whole):.1f}"
+    return f"{100 * part / whole:.3g} +- {100 * np.sqrt(p * (1 - p) / whole):.1f}"
+
+
+def errors_of(groups: dict[str, list[Row]], good: list[Row]) -> Iterator[tuple[str, ...]]:
+    """For each group of good flights: mean errors, and shares of the 95 % intervals that hold the truth."""
+    for name, some in groups.items():
+        if not some or any(row not in good for row in some):
+            continue
+        cells = []
+        for inertia in INERTIAS:
+            known = [row[inertia] for row in some if inertia in row]
+            error, std = (np.array([each[key] for each in known]) for key in ("error", "std"))
+            cells += ["", ""]
+            if known:
+                spread = 100 * error.std() / np.sqrt(len(known))
+                held = int((np.abs(error) < NINETY_FIVE * std).sum())
+                cells[-2:] = f"{100 * error.mean():.1f} +- {spread:.1f}", share(held, len(known))
+        yield name, *cells
 
 
 def print_tables(rows: list[Row]) -> None:
@@ -241,6 +260,8 @@ def print_tables(rows: list[Row]) -> None:
     headings = "flights", "identified [%]", "unreserved [%]", "beyond 3 std [%]"
     headings += "of unreserved far [%]", "refused, right [%]", "named [%]"
     print_table("verdicts of Ix and Iy", ("case", *headings), lines, width=140)
+    headings = (f"{name} {what} [%]" for name in INERTIAS for what in ("mean error", "intervals that hold"))
+    print_table("errors of good flights", ("case", *headings), errors_of(groups, good), width=160)
     lines = []
     for axis in ("roll", "pitch", "yaw"):
         every = [r["response"][axis] for r in good if axis in r.get("response", {})]
@@ -253,7 +274,8 @@ def print_tables(rows: list[Row]) -> None:
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of flights of each case.")] = 20,
+    flights: Annotated[int, typer.Option(help="Number of flights of each effect.")] = 100,
+    spoiled: Annotated[int, typer.Option(help="Number of flights of each fault and size.")] = 20,
     cases: Annotated[list[str], typer.Option(help="The cases.")] = tuple(CASES),
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
     seed: Annotated[int, typer.Option(help="Random seed of references, gusts, noise and effects.")] = 48,
@@ -261,15 +283,15 @@ def main(
 ) -> None:
     """Count right and wrong verdicts for each effect, and for each fault in three sizes."""
     report = continued(out, {"duration": duration, "seed": seed}, "rows")
-    flown = {kind: flights_of(kind, flights, duration, seed) for kind in {CASES[name][0]: None for name in cases}}
+    numbers = {name: flights if CASES[name][1] is None else spoiled for name in cases}
+    flown = functools.cache(lambda kind: flights_of(kind, max(numbers.values()), duration, seed))
     # An interrupted report has about as many flights of each case.
-    trials = (
-        {"case": name, "flight": i} for i in range(flights) for name in cases if flown[CASES[name][0]][i] is not None
-    )
+    trials = ({"case": name, "flight": i} for i in range(max(numbers.values())) for name in cases if i < numbers[name])
 
     def row_of(case: str, flight: int) -> Row:
         kind, fault, size = CASES[case]
-        return judged(flown[kind][flight], flight, fault, size)
+        recorded = flown(kind)[flight]
+        return {"result": LOST} if recorded is None else judged(recorded, flight, fault, size)
 
     fill(out, report, report["rows"], trials, row_of)
-    print_tables(report["rows"])
+    print_tables([row for row in report["rows"] if row["result"] != LOST])

@@ -57,7 +57,7 @@ class Tolerance(msgspec.Struct, frozen=True):
       makes a reservation, by less is a note. Errors of discretisation reach 3 %, and an interval allows for one
       standard deviation.
     - `vague`, `unknown`: half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a
-      reservation, or is not identified. With intervals of 12 % and less, 1 answer in 200 is off by more than 12 %.
+      reservation, or is not identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
     - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
       of it, these are not identified. Segments last 1.25 s, and the jackknife compares at least four parts.
     - `prior`: the share of the information about a parameter that its bracket may give without a reservation.
@@ -67,7 +67,7 @@ class Tolerance(msgspec.Struct, frozen=True):
 
     share: float = 0.05
     deviations: float = 1.0
-    vague: float = 0.12
+    vague: float = 0.1
     unknown: float = 0.4
     seconds: float = 10.0
     prior: float = 0.25
