@@ -40,7 +40,8 @@ def run(name: str, arguments: list[str]) -> None:
     """Runs a script with its arguments."""
     if name not in scripts():
         raise SystemExit(f"{name}: no such script; give one of {', '.join(scripts())}, or render.")
-    result, command = published(arguments), [name, *arguments]
+    result = published(arguments)
+    command = [name, *arguments]
     jax.config.update("jax_enable_x64", True)
     app = typer.Typer(add_completion=False)
     app.command()(RECORDER.watching(importlib.import_module(f"experiments.{name}").main))

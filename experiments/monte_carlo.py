@@ -25,12 +25,12 @@ def continued(out: Path | None, settings: Row, rows: str) -> Row:
     Ends the script if the file has other settings.
     """
     settings = settings | {"version": jaxos4.__version__, "precision": str(jnp.result_type(float))}
-    report = {**settings, "commit": commit(), rows: []}
+    report = {**settings, "commits": [], rows: []}
     if out is not None and out.exists():
         report = json.loads(out.read_text())
         if rows not in report or {name: report.get(name) for name in settings} != settings:
             raise SystemExit(f"{out}: has other settings; give --out another name.")
-    RECORDER.commit = report.get("commit", "")
+    RECORDER.commit = ", ".join(report.get("commits", []))
     return report
 
 
@@ -60,7 +60,10 @@ def fill(out: Path | None, report: Row, rows: list[Row], trials: Iterable[Row], 
     for trial in trials:
         if find(rows, trial) is None:
             rows.append(trial | row_of(**trial))
+            if commit() not in report["commits"]:
+                report["commits"].append(commit())
             write_report(out, report)
+    RECORDER.commit = ", ".join(report["commits"])
 
 
 def monte_carlo(

@@ -10,6 +10,7 @@ import datetime
 import functools
 import re
 import shlex
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -38,7 +39,7 @@ class Result(msgspec.Struct):
 
     - `command`: after `python -m experiments`.
     - `settings`: all arguments of the script, with those that have their default: trials, seed.
-    - `commit`: of the code that computed the first row.
+    - `commit`: of the code that computed the rows; several if a run was continued by other code.
     - `machine`: device, cores, precision, version of JAX.
     """
 
@@ -51,12 +52,15 @@ class Result(msgspec.Struct):
     tables: list[Table]
 
 
+@functools.cache
 def commit() -> str:
     """The commit that is checked out, with a + if files differ from it; empty outside of a repository."""
+    if shutil.which("git") is None:
+        return ""
     git = functools.partial(subprocess.run, cwd=ROOT, capture_output=True, text=True, check=False)
     found = git(["git", "rev-parse", "--short=10", "HEAD"]).stdout.strip()
-    differs = git(["git", "diff", "--quiet", "HEAD", "--", "jaxos4", "experiments"]).returncode
-    return found + "+" * bool(found and differs)
+    code = "jaxos4", "experiments", ":!experiments/results", ":!experiments/*.md"
+    return found + "+" * bool(found and git(["git", "status", "--porcelain", "--", *code]).stdout)
 
 
 class Recorder:
@@ -98,7 +102,9 @@ RECORDER = Recorder()
 
 
 def _plain(value: Any) -> Any:
-    return value if isinstance(value, (int, float, str, list, type(None))) else str(value)
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    return value if isinstance(value, (int, float, str, type(None))) else str(value)
 
 
 def read(name: str, folder: Path = FOLDER) -> Result:

@@ -36,14 +36,15 @@ def judged(path: Path, airframe: jaxos4.Airframe) -> Row:
         return {"result": "refused", "why": str(error)}
     row: Row = {"result": found.result}
     for name in JUDGED:
-        if name in found.rigid_body.constants:
-            value, verdict = found.rigid_body.constants[name], found.verdicts[name]
-            row[name] = {"estimate": value.estimate, "half_width": NINETY_FIVE * value.std}
-            row[name] |= {"status": verdict.status, "reasons": list(verdict.reasons)}
+        value, verdict = found.rigid_body.constants.get(name), found.verdicts.get(name)
+        status = found.result if verdict is None else verdict.status
+        row[name] = {"status": status, "reasons": [] if verdict is None else list(verdict.reasons)}
+        if value is not None:
+            row[name] |= {"estimate": value.estimate, "half_width": NINETY_FIVE * value.std}
     return row
 
 
-def vehicle_of(row: Row) -> str:
+def flown_by(row: Row) -> str:
     """The vehicle that flew: that of the file's folder, or of the first words of its name."""
     return row["flight"].split("/")[0] if "/" in row["flight"] else "arpl_crazyflie"
 
@@ -54,7 +55,7 @@ def cells(rows: list[Row]) -> Iterator[tuple[str, ...]]:
         for name in JUDGED:
             if name in row:
                 one = row[name]
-                value = f"{1e5 * one['estimate']:.3g} +- {1e5 * one['half_width']:.2g}"
+                value = f"{1e5 * one['estimate']:.3g} +- {1e5 * one['half_width']:.2g}" if "estimate" in one else ""
                 yield row["flight"], name, value, one["status"], "; ".join(one["reasons"])
         if "why" in row:
             yield row["flight"], "", "", "refused", row["why"]
@@ -62,10 +63,10 @@ def cells(rows: list[Row]) -> Iterator[tuple[str, ...]]:
 
 def pairs(rows: list[Row]) -> Iterator[tuple[str, ...]]:
     """Pairs of identified flights of one vehicle: how many differences lie inside their 95 %, and the largest."""
-    for vehicle in dict.fromkeys(map(vehicle_of, rows)):
+    for vehicle in dict.fromkeys(map(flown_by, rows)):
         for name in JUDGED:
-            known = [row[name] for row in rows if vehicle_of(row) == vehicle and name in row]
-            known = [one for one in known if one["status"].startswith("identified")]
+            known = [row[name] for row in rows if flown_by(row) == vehicle and name in row]
+            known = [one for one in known if one["status"].startswith("identified") and "estimate" in one]
             apart = [
                 abs(a["estimate"] - b["estimate"]) / np.hypot(a["half_width"], b["half_width"])
                 for a, b in itertools.combinations(known, 2)

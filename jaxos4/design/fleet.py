@@ -65,10 +65,12 @@ def fly_batch(
 ) -> Flight:
     """Fly a batch. Velocity and position are integrals of measured attitude and specific force.
 
-    `substeps`: of the physics in a sample, twice as many as `fly_closed_loop` takes by default.
+    `substeps`: of the physics in a sample, twice as many as `fly_closed_loop` takes by default. How the sensors are
+    mounted changes no design: they measure along the body's axes.
     """
 
     def one(loop: ClosedLoop, references: References, key: Key) -> Flight:
+        loop = eqx.tree_at(lambda each: each.airframe.sensor_rotation, loop, jnp.zeros(3))
         flight = fly_closed_loop(loop, references, dt=dt, key=key, substeps=substeps)
         vertical = flight.channels[:, -1]
         nothing = jnp.zeros_like(vertical)

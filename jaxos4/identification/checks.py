@@ -95,7 +95,7 @@ def check_flight(data: Data, answer: Answer, prior: float) -> Checked:
         for name, row in parameter_table(answer, prior, reasons).items()
     }
     if not answer.answered:
-        return Checked(table, search)
+        return Checked(table, search, doubts=tuple(doubts_of_log(data.findings)))
     body = rigid_body(answer)
     doubts = [*doubts_of_flight(table, body, data.findings), *_doubts_of_search(search, (*table, RIGID_BODY))]
     verdicts = verdicts_of(flight_quantities(table, body), doubts)
@@ -121,7 +121,7 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
     """
     search, optimum = str(result_names(answer.estimate.result)), answer.optimum
     if not answer.answered or optimum is None:
-        return Checked({}, search)
+        return Checked({}, search, doubts=tuple(doubts_of_log(data.findings)))
     table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
     predicted = skill = None
     if data.held_out is not None:

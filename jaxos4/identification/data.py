@@ -33,11 +33,11 @@ class HeldOut(NamedTuple):
     """Measurements that are not fitted.
 
     - `problem`: the flight and its model.
-    - `recording`, `clock`: the name of the other recording that it is; empty: it is a part of the fitted ones.
+    - `recording`, `clock`: name and times of the other recording that it is; `None`: it is a part of the fitted ones.
     """
 
     problem: ShootingProblem
-    recording: str = ""
+    recording: str | None = None
     clock: Clock = Clock()
 
 

@@ -40,7 +40,7 @@ def predict_held_out(
 
     def scored(values: np.ndarray, noise: LogNoise | None) -> tuple[Predictions, Skill]:
         parameters = values
-        if held_out.recording:  # the mean of those of which each fitted recording has its own
+        if held_out.recording is not None:  # the mean of those of which each fitted recording has its own
             fitted = dict(zip(names, values.tolist(), strict=True))
             each = {n: [fitted[own] for own in fitted if own.rpartition("_")[0] == n] for n in problem.unknowns.names}
             parameters = np.array([fitted[n] if n in fitted else np.mean(each[n]) for n in each])
@@ -62,7 +62,7 @@ def predict_held_out(
 
 def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
     """The problem with all measurements: those that were fitted, and those that were held out of the same flight."""
-    if held_out.recording:
+    if held_out.recording is not None:
         return held_out.problem
     own, others = np.asarray(held_out.problem.flight.states), np.asarray(data.flight.flight.states)
     both = as_float(np.where(np.isnan(own), others, own))
@@ -84,13 +84,13 @@ def vehicle_traces(
     `predicted`: the predictions that the result keeps.
     """
     other = data.held_out
-    problem = answer.problem if other is None or other.recording else _together(data, other)
+    problem = answer.problem if other is None or other.recording is not None else _together(data, other)
     values = np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count]
     found, flight = _traced(data, problem, values, optimum.noise), answer.problem.flight
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
     position = position_of(np.asarray(problem.flight.states, float))
     start = np.zeros(0, int) if predicted is None else predicted.start
-    clock = data.clock if other is None or not other.recording else other.clock
+    clock = data.clock if other is None or other.recording is None else other.clock
     signals = omega, states[:, RATES], states[:, :0], found.disturbance, position
     traces = Traces(data.clock.time, data.clock.log, *signals, clock.time[start], clock.log[start])
     torques = omega**2 @ np.asarray(answer.problem.model.airframe.mixer)[:3].T
@@ -118,7 +118,7 @@ def _regression(problem: ShootingProblem, values: Array, fixed: Numeric) -> Arra
 
 def validate_on(answer: Answer, held_out: HeldOut) -> Validation:
     """How well the parameters explain another flight; only its initial state is fitted."""
-    other, name = eqx.tree_at(lambda p: p.sigma, held_out.problem, answer.problem.sigma), held_out.recording
+    other, name = eqx.tree_at(lambda p: p.sigma, held_out.problem, answer.problem.sigma), held_out.recording or ""
     start, cost, feasible, _ = eqx.filter_jit(fit_start)(padded(other), answer.estimate.parameters)
     if not bool(feasible):
         return Validation(name, None, None)

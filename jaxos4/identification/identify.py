@@ -2,8 +2,8 @@
 
 - recordings -> `Data`, with a likelihood: `prepare_flight` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
   case, which knows the other steps.
-- `Data` -> `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
-- `Answer` -> `Checked`: `case.check`, by checks.py with doubts.py, quantities.py and verdict.py.
+- `Data` -> `Solution`, the data with their `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
+- `Solution` -> `Checked`: `case.check`, by checks.py with doubts.py, quantities.py and verdict.py.
 - `Checked` -> `Identification`: `describe`.
 """
 

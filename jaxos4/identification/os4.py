@@ -90,10 +90,6 @@ def prepare_flight(
         raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(model).__name__}.")
     recording, *others = recordings
     subject = class_name(model, MODELS)
-    if np.any(model.airframe.sensor_rotation):
-        raise InputError(
-            "`sensor_rotation`: the rates of an OS4 flight are along the body's axes; leave it out of the airframe."
-        )
     if others:
         raise InputError(
             f"{others[0].name}: `subject` {subject} explains one flight; use an `Airframe` as `subject` for several."

@@ -68,6 +68,10 @@ def flight_problem(
 
     **Raises:** `InputError`, one line, for arguments out of range and flights that measured too little.
     """
+    if np.any(model.airframe.sensor_rotation):
+        raise InputError(
+            "`sensor_rotation`: the rates of an OS4 flight are along the body's axes; leave it out of the airframe."
+        )
     if initial_state not in ("free", "known"):
         raise InputError(f"`initial_state`: must be free or known, got {initial_state!r}.")
     known = initial_state == "known"

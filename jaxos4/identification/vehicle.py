@@ -123,6 +123,8 @@ def prepare_vehicle(
         )
     if network is not None or isinstance(estimator, Hybrid):
         raise InputError("`network`: a vehicle's network is trained for its own flights; use `estimator` hybrid.")
+    if validate is not None and settings.holdout:
+        raise InputError("`holdout`: `validate` is predicted instead of a part of the flights; leave one of them out.")
     by_default = HOLDOUT if validate is None else 0.0
     holdout = by_default if settings.holdout is None else settings.holdout
     prepared = prepare(
@@ -255,7 +257,7 @@ def _held_out(
         own = dataclasses.replace(model, recordings=other.recordings)
         clock = Clock(np.full(other.time.size, len(recordings)), other.time)
         held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, clock), other.seconds[0]
-        name, remedy, notes = validate.name, "give another flight", notes + other.notes
+        name, remedy, notes = validate.name, "give another flight", (*notes, *other.notes, *map(str, other.doubts))
     elif prepared.tested is not None:
         held_out = HeldOut(dataclasses.replace(fitted, flight=prepared.tested))
     else:

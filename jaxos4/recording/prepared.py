@@ -15,7 +15,7 @@ from ..logs import Recording
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .checks import INERTIAS, Evidence, Finding, different_thrust, findings, opposite_yaw
-from .motion import Ups, measures_velocity, opposite_axes, refused_note, velocity_of
+from .motion import Ups, in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
 from .stretches import Stretch, cut, nothing_usable
 from .windows import averaged, hold_out, joined, whole_windows
@@ -279,7 +279,7 @@ def _sampled(
         length=length,
         available=_available_inputs(everything, flown, airframe),
         level=_level(fitted, ups, float(airframe.gravity)) if ups else None,
-        force_noise=np.min([force_noise(recording, step) for recording in recordings], axis=0),
+        force_noise=np.min([force_noise(in_body_axes(each, airframe), step) for each in recordings], axis=0),
         seconds=(_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
     )
 

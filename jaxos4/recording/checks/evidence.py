@@ -136,7 +136,7 @@ class Evidence:
 
     @functools.cached_property
     def plausible(self) -> Plausible:
-        """The recording without faulty values, along the body's axes. The range of a sensor ends along its own."""
+        """The recording without faulty values, along the body's axes. Clipping is found along those of the sensors."""
         found = plausible(self.logged)
         return found._replace(recording=in_body_axes(found.recording, self.airframe))
 

@@ -14,7 +14,9 @@ from .evidence import INERTIAS, Evidence, Finding
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
     """Gyro turned about the vertical axis: roll torque pitches the vehicle, and the attitude turns about other axes."""
     rotors, attitude = _by_rotors(evidence), _by_attitude(evidence)
-    limits = evidence.limits
+    limits, tilted = evidence.limits, thrust_direction(evidence)
+    if tilted is not None and tilted.name == "force_direction":
+        return None  # the angle about z is known when this is corrected
 
     def turned(angle: tuple[float, float] | None) -> bool:
         return angle is not None and abs(angle[0]) > max(limits.angle, limits.standard_errors * angle[1])
