@@ -171,6 +171,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
         bars.barh(row, value, height=0.5, color=look.color, alpha=0.35)
         bars.errorbar(value, row, xerr=half, color=look.color, capsize=4, marker=look.marker)
     bars.set_yticks(range(3), INERTIAS)
+    bars.tick_params(axis="y", length=0, pad=8)
     bars.set_ylim(2.6, -0.6)
     bars.set_xlim(left=0)
     bars.grid(axis="y", visible=False)
