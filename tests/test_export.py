@@ -183,8 +183,32 @@ def test_an_inertia_that_no_rigid_body_has_is_given_on_demand_and_clamped(run, w
         assert found.vehicle.inertia[2] == pytest.approx(used, rel=1e-6)
         assert not found.draw(1, seed=0)[0].impossible
         (note,) = [note for note in found.notes if note.startswith("Iz: ")]
-        assert note.startswith("Iz: a guess")
+        assert note.startswith("Iz: given, not estimated")
         assert ("allows" in note) == (given != used)
+        assert found.vehicle.drag_coefficient == pytest.approx(AIRFRAME["drag_coefficient"])
+    # No other Iz makes the thrust positive, or mends an Iz that was given.
+    falls = vehicle_result(values | {"thrust_curve": 2.5}, held={"alpha8": held(3.5e4)})
+    write(falls)
+    for option in ((), ("--inertia-z", "3e-5")):
+        code, _, err = run("export", "found.json", "--to", "urdf", *option)
+        assert (code, "thrust_curve" in err, "guess" in err) == (2, True, False)
+
+
+def test_with_another_inertia_the_vehicle_yaws_as_the_flight_showed(write):
+    """Flights show the yaw torque over Iz: the drag coefficient changes with Iz."""
+    path = write(vehicle_result())
+    estimated = read_result(path)
+    found = read_result(path, inertia_z=2.8e-5)
+    factor = 2.8e-5 * VALUES["alpha8"] / VALUES["thrust_gain"]
+    assert factor != pytest.approx(1, rel=0.02)
+    assert found.vehicle.inertia[2] == pytest.approx(2.8e-5)
+    assert found.vehicle.drag_coefficient == pytest.approx(factor * estimated.vehicle.drag_coefficient)
+    (note,) = [note for note in found.notes if note.startswith("Iz: ")]
+    assert f"the drag coefficient is {factor:.4g} times the airframe's" in note
+    # The yaw of samples is as uncertain as the estimate.
+    ours, theirs = (each.draw(1, seed=0)[0] for each in (found, estimated))
+    for name in ("drag_coefficient", "rotor_inertia"):
+        assert getattr(ours, name) / ours.inertia[2] == pytest.approx(getattr(theirs, name) / theirs.inertia[2])
 
 
 def test_an_sdf_is_valid_and_has_the_inertia(write):

@@ -21,8 +21,9 @@ from jaxos4.flight import RATES
 from jaxos4.logs import LogFacts
 from jaxos4.recording.inspection import FULL_SCALE, airframe_draft, inspect_log
 from jaxos4.recording.motion import rotor_signs
-from jaxos4.report import write_log_page
-from jaxos4.report.log_page import amplitude_density, logged
+from jaxos4.report import log_page, write_log_page
+from jaxos4.report.log_page import amplitude_density, fitted, logged
+from jaxos4.report.timeline import thinned
 
 EVIL = "</script><script>alert(1)</script>"
 
@@ -195,7 +196,9 @@ def test_the_page_of_a_log_shows_what_would_be_fitted(tmp_path):
         "jaxos4 inspect",
     ):
         assert said in shown
-    drawn = json.loads(logged(flight, found))
+    text, block = logged(flight, found)
+    assert block == 1  # all samples
+    drawn = json.loads(text)
     panels = drawn["common"][0]["panels"]
     assert [panel["title"] for panel in panels][:3] == ["rate [rad/s]", "motor [rad/s]", "force [m/s²]"]
     middle, step, levels = panels[0]["lines"][0]["values"]
@@ -203,6 +206,40 @@ def test_the_page_of_a_log_shows_what_would_be_fitted(tmp_path):
     np.testing.assert_allclose(middle + step * levels, flight.states[:, RATES[0]], atol=step)
     begin, end = drawn["shaded"][0]
     assert (begin, end) == pytest.approx((found.parts[0].begin, found.parts[0].end))
+
+
+def test_commands_without_full_scale_are_refused_on_the_page_as_by_the_fit():
+    flight = flown(CRAZYFLIE, 0)
+    commands = flight._replace(omega=flight.omega / 4e3, commanded=True)
+    unknown = eqx.tree_at(lambda each: each.max_rotor_speed, CRAZYFLIE, np.asarray(np.inf))
+    assert "the rotor speed of full command is not known; set max_rotor_speed" in fitted(commands, unknown)
+    assert "would be fitted" in fitted(flight._replace(commanded=False), unknown)
+
+
+def test_the_page_of_a_log_uses_plausible_values(tmp_path, monkeypatch):
+    """The spectra and the table of parts are of the same samples."""
+    flight = flown(CRAZYFLIE, 0)
+    states = flight.states.copy()
+    states[1000, RATES[0]] = 1e6
+    seen = []
+    monkeypatch.setattr(log_page, "spectra", lambda parts, *_: seen.extend(parts))
+    broken = flight._replace(states=states)
+    write_log_page(tmp_path / "log.html", broken, CRAZYFLIE)
+    found = [(part.begin, part.end) for part in inspect_log(broken, CRAZYFLIE).parts if part.usable]
+    np.testing.assert_allclose([each.time[[0, -1]] for each in seen], found)
+    assert np.nanmax(np.concatenate([each.states[:, RATES[0]] for each in seen])) < 1e3
+
+
+@given(samples=st.integers(1, 60), most=st.integers(4, 20))
+def test_thinned_signals_keep_extremes_and_the_last_samples(samples, most):
+    time, values = np.arange(samples, dtype=float), np.random.default_rng(samples).normal(size=(samples, 2))
+    values[-1] = [9.0, np.nan]
+    times, fewer, block = thinned(time, values, most)
+    assert len(times) == len(fewer) <= max(most, 2 * (most // 2))
+    assert (np.diff(times) >= 0).all()
+    assert times[-1] >= samples - block
+    assert np.nanmax(fewer[:, 0]) == 9.0
+    assert np.nanmin(fewer[:, 0]) == values[:, 0].min()
 
 
 def test_the_spectrum_of_white_noise_and_of_a_tone():
@@ -213,4 +250,7 @@ def test_the_spectrum_of_white_noise_and_of_a_tone():
     assert frequency[density[:, 1].argmax()] == pytest.approx(60)
     gap = np.where(np.arange(400) % 100 < 50, np.nan, 1.0)[:, None]
     assert np.isfinite(amplitude_density([gap], 0.01)[1]).all()
+    # A channel that was not measured in one part has the spectrum of the other.
+    lost = [noise, np.full((1000, 1), np.nan)]
+    np.testing.assert_array_equal(amplitude_density(lost, 0.002)[1], amplitude_density([noise], 0.002)[1])
     assert np.isnan(amplitude_density([gap[:5]], 0.01)[1]).all()

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log, read_recording
-from jaxos4.logs.compression import _decompressor, check_parts
+from jaxos4.logs.compression import Limits, _decompressor, check_parts, check_sizes
 
 pytest.importorskip("rosbags", reason="reading a ROS bag needs rosbags")
 import lz4.frame  # noqa: E402
@@ -257,22 +257,36 @@ def bomb(kind):
     return "flight.db3.zstd", packed
 
 
-@pytest.mark.parametrize("kind", ["ros1 bz2", "ros1 lz4", "mcap lz4", "mcap zstd", "folder zstd"])
+@pytest.mark.parametrize("kind", ["ros1 bz2", "ros1 lz4", "mcap lz4", "mcap zstd"])
 def test_a_small_file_does_not_fill_the_memory(kind, tmp_path):
     name, content = bomb(kind)
     assert len(content) < 400_000 or "lz4" in kind
     (tmp_path / name).write_bytes(content)
-    path = tmp_path / name
-    if kind.startswith("folder"):
-        path = tmp_path / "metadata.yaml"
-        path.write_text("rosbag2_bagfile_information:\n  version: 5\n")
     tracemalloc.start()
     with pytest.raises(InputError, match="holds a compressed part of more than 268,435,456 bytes"):
-        read_log(path)
+        read_log(tmp_path / name)
     assert tracemalloc.get_traced_memory()[1] < 30 << 20
     tracemalloc.stop()
     # Parts of a usual size are no bomb, and neither is what cannot be decompressed.
     check_parts("bag", [("zstd", zstd.compress(bytes(1 << 20))), ("zstd", b"damaged"), ("", bytes(9)), ("none", b"")])
+
+
+def test_a_file_that_is_compressed_as_a_whole_may_be_larger(tmp_path):
+    """`ros2 bag record --compression-mode file`: 300 MB, in memory a megabyte at a time."""
+    name, content = bomb("folder zstd")
+    (tmp_path / name).write_bytes(content)
+    tracemalloc.start()
+    check_sizes(tmp_path)
+    with pytest.raises(InputError, match=r"has more than 1,048,576 bytes when it is decompressed; record it again"):
+        check_sizes(tmp_path, limits=Limits(file=1 << 20))
+    assert tracemalloc.get_traced_memory()[1] < 30 << 20
+    tracemalloc.stop()
+    # Pieces that end anywhere in a frame are joined.
+    noise = np.random.default_rng(0).bytes(3 << 20)
+    (tmp_path / name).write_bytes(2 * zstd.compress(noise))
+    check_sizes(tmp_path, limits=Limits(file=6 << 20))
+    with pytest.raises(InputError, match="6,291,455"):
+        check_sizes(tmp_path, limits=Limits(file=(6 << 20) - 1))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -100,7 +100,10 @@ def addresses(tmp_path_factory):
         files[name] = folder / f"{name}.html"
         write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")
     files["log"] = folder / "log.html"
-    write_log_page(files["log"], flown(CRAZYFLIE, 0), CRAZYFLIE)
+    flight = flown(CRAZYFLIE, 0)
+    write_log_page(files["log"], flight, CRAZYFLIE)
+    files["late"] = folder / "late.html"
+    write_log_page(files["late"], flight._replace(time=1234.3 + flight.time), CRAZYFLIE)
     long = [identified_vehicle(provenance={"flights": [f"A_flight_with_a_long_name_{i}.csv"]}) for i in range(4)]
     files["comparison"] = folder / "comparison.html"
     write_comparison(files["comparison"], compare_results(long))
@@ -233,6 +236,27 @@ def test_a_range_of_a_log_is_ready_to_copy_and_a_finger_moves_it(opened):
     before, after = (float(x) for x in re.findall(r"[\d.]{3,}", zoomed))
     assert begin > before
     assert end - begin == pytest.approx(after - before, abs=0.02)
+
+
+def test_labels_of_the_time_axis_differ_late_in_a_log(opened):
+    page = opened("late")
+    page.evaluate("""() => {
+        const draw = CanvasRenderingContext2D.prototype.fillText;
+        window.drawn = [];
+        CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+            window.drawn.push([String(this.canvas.getBoundingClientRect().top), text]);
+            return draw.call(this, text, ...place);
+        };
+    }""")
+    for _ in range(3):
+        page.get_by_role("button", name="Zoom in").click()
+        page.wait_for_timeout(200)
+        panel, _ = page.evaluate("() => window.drawn[0]")
+        texts = [text for other, text in page.evaluate("() => window.drawn.splice(0)") if other == panel]
+        labels = [float(text) for text in texts if re.fullmatch(r"12\d\d(\.\d+)?", text)]
+        assert len(labels) > 4
+        np.testing.assert_allclose(np.diff(labels), labels[1] - labels[0], atol=1e-6)
+        assert labels[1] > labels[0]
 
 
 def test_figures_tell_names_and_values_as_tooltips(opened):

@@ -112,6 +112,32 @@ def test_predictions_in_a_file_are_few(tmp_path):
     assert (tmp_path / "found.html").stat().st_size < 6e5
 
 
+def test_channels_that_are_logged_rarely_stay_in_thinned_traces():
+    """Attitude in every tenth sample from sample 3 on, position from sample 5 on; the second log begins in a block."""
+    traces = vehicle_traces(np.arange(100))
+    count, rows = 4010, np.arange(4010)
+    rare = np.where(rows % 10 == 3, rows + 1.0, np.nan)
+    traces = traces._replace(
+        time=0.002 * rows,
+        log=(rows >= 2001).astype(int),
+        rotors=np.tile(rows[:, None] + 1.0, 4),
+        measured=np.tile(rare[:, None], 6),
+        predicted=np.zeros((count, 0)),
+        disturbance=np.full((count, 3), np.nan),
+        position=np.tile(np.where(rows % 10 == 5, rows + 1.0, np.nan)[:, None], 3),
+    )
+    fewer = traces.thinned(401)
+    np.testing.assert_allclose(fewer.time, traces.time[::10])
+    np.testing.assert_allclose(fewer.rotors[:, 0], rows[::10] + 1)
+    expected = rows[3::10] + 1.0
+    expected[200] = np.nan  # only sample 2000 of this block is of the first log
+    np.testing.assert_allclose(fewer.measured[:, 5], expected)
+    np.testing.assert_allclose(fewer.position[:, 2], expected + 2)
+    assert np.isnan(fewer.disturbance).all()
+    # Shorter blocks have a value if one was measured; the last block is not whole.
+    assert np.count_nonzero(np.isfinite(traces.thinned(1003).measured[:, 0])) == 400
+
+
 def shown(path):
     """All that is made of a result's file."""
     found = jaxos4.read_result(path)

@@ -33,12 +33,28 @@ class Traces(NamedTuple):
     start_log: Int[np.ndarray, " starts"]
 
     def thinned(self, most: int = 1200, *, digits: int = 5) -> "Traces":
-        """Every so many samples, `most` at most. Channels and rotors have so many significant `digits`."""
+        """Every so many samples, `most` at most. Channels and rotors have so many significant `digits`.
+
+        Each sample has the first finite value of its block, because some channels are logged more rarely than others.
+        """
         every = -(-self.time.size // most)
-        fewer = {name: values[::every] for name, values in self._asdict().items() if not name.startswith("start")}
-        fewer |= {name: significant(values, digits) for name, values in fewer.items() if values.ndim == 2}
+        blocks = np.arange(self.time.size) // every
+        apart = self.log != self.log[::every][blocks]  # a block has the values of one log
+        fewer = {"log": self.log[::every]}
+        for name, values in self._asdict().items():
+            if values.ndim == 2:
+                fewer[name] = significant(_first_finite(np.where(apart[:, None], np.nan, values), every), digits)
         times = {"time": self.time[::every].round(digits), "start_time": self.start_time.round(digits)}
         return self._replace(**fewer | times)
+
+
+def _first_finite(values: Float[np.ndarray, "samples channels"], every: int) -> Float[np.ndarray, "blocks channels"]:
+    """The first finite value of each block of so many samples; NaN if there is none. The last block may be shorter."""
+    padded = np.pad(values, ((0, -len(values) % every), (0, 0)), constant_values=np.nan)
+    cut = padded.reshape(len(padded) // every, every, values.shape[1])
+    known = np.isfinite(cut)
+    first = np.take_along_axis(cut, known.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return np.where(known.any(axis=1), first, np.nan)
 
 
 def flight_traces(found: Evaluation) -> Traces:

@@ -19,23 +19,9 @@ import typer
 from .._files import check_writable, write_file
 from ..errors import InputError, printable
 
-_ARGUMENTS = (
-    *("angle", "bandwidth", "bracket", "channels", "criterion", "distance", "dt", "duration", "estimator", "fastest"),
-    *(
-        "gust",
-        "holdout",
-        "horizon",
-        "inertia_z",
-        "initial_state",
-        "network",
-        "rate",
-        "sample_time",
-        "samples",
-        "seed",
-        "slew",
-    ),
-    *("slowest", "spacing", "terms", "validate", "velocity", "window"),
-)
+_ARGUMENTS = ("angle", "bandwidth", "bracket", "channels", "criterion", "distance", "dt", "duration", "estimator")
+_ARGUMENTS += ("fastest", "gust", "holdout", "horizon", "inertia_z", "initial_state", "network", "rate", "sample_time")
+_ARGUMENTS += ("samples", "seed", "slew", "slowest", "spacing", "terms", "validate", "velocity", "window")
 OPTIONS = {
     "an `Airframe` as `subject`": "--model flight",
     "`subject`": "--model",

@@ -59,13 +59,24 @@ class Identified(NamedTuple):
         """The vehicle with the estimated parameters."""
         return self._made(self.values)
 
+    @property
+    def identifies_iz(self) -> bool:
+        """Whether the flights show Iz, if the airframe's drag coefficient is right."""
+        return INERTIAS["Iz"] in self.drawn
+
     def _made(self, values: dict[str, float]) -> RigidVehicle:
-        if self.inertia_z is None:
-            return rigid_vehicle(self.airframe, values)
-        gain, (ix, iy) = values.get("thrust_gain", 1.0), rigid_vehicle(self.airframe, values).inertia[:2]
+        estimated = rigid_vehicle(self.airframe, values)
+        ix, iy, iz = estimated.inertia
+        if self.inertia_z is None or (self.identifies_iz and not iz > 0):
+            return estimated
         rounding = 1e-9
         allowed = min(max(self.inertia_z, (1 + rounding) * abs(ix - iy)), (1 - rounding) * (ix + iy))
-        return rigid_vehicle(self.airframe, values | {INERTIAS["Iz"]: gain / allowed})
+        gain = values.get("thrust_gain", 1.0)
+        vehicle = rigid_vehicle(self.airframe, values | {INERTIAS["Iz"]: gain / allowed})
+        if not self.identifies_iz:
+            return vehicle
+        # Flights show the yaw torque over Iz: another Iz means another drag coefficient.
+        return vehicle._replace(drag_coefficient=vehicle.drag_coefficient * allowed / iz)
 
     def draw(self, number: int, *, seed: int, most: int = 1000) -> tuple[RigidVehicle, int]:
         """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
@@ -107,9 +118,7 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
         notes += [f"{name}: came out negative, which is impossible; it is 0 here" for name in negative]
         if not np.isfinite(file.airframe.max_rotor_speed):
             notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
-        drawn = tuple(
-            name for name in estimated if name not in (*negative, *[INERTIAS["Iz"]] * (inertia_z is not None))
-        )
+        drawn = tuple(name for name in estimated if name not in negative)
         places = [list(file.parameters).index(name) for name in drawn]
         found = Identified(
             source=f"{printable(Path(path).name)} ({file.estimator}, {file.model} model, {file.result})",
@@ -123,20 +132,27 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
             inertia_z=inertia_z,
         )
         if inertia_z is not None:
-            used = float(found.vehicle.inertia[2])
-            limit = (
-                ""
-                if math.isclose(used, inertia_z, rel_tol=1e-6)
-                else f": a rigid body with these Ix and Iy allows {used:.4g}"
-            )
             own = tuple(note for note in found.notes if not note.startswith("Iz: "))
-            found = found._replace(notes=(*own, f"Iz: a guess, {inertia_z:.4g} kg m^2 was given{limit}"))
+            found = found._replace(notes=(*own, _given_note(found, inertia_z)))
         if why := found.vehicle.impossible:
-            guess = "; Iz was not identified and is a guess: give `inertia_z`" if INERTIAS["Iz"] not in drawn else ""
+            guessed = inertia_z is None and not found.identifies_iz and why.startswith(tuple(INERTIAS))
+            guess = "; Iz was not identified and is a guess: give `inertia_z`" if guessed else ""
             raise InputError(
                 f"no vehicle is like this: {why}{guess}; correct the airframe, or fly with more excitation."
             )
         return found
+
+
+def _given_note(found: Identified, inertia_z: float) -> str:
+    """How the vehicle differs from the result because the user gave Iz."""
+    vehicle, note = found.vehicle, f"Iz: given, not estimated: {inertia_z:.4g} kg m^2"
+    if not math.isclose(vehicle.inertia[2], inertia_z, rel_tol=1e-6):
+        note += f"; a rigid body with these Ix and Iy allows {vehicle.inertia[2]:.4g}"
+    if found.identifies_iz:
+        estimated = found._replace(inertia_z=None).vehicle
+        factor = vehicle.drag_coefficient / estimated.drag_coefficient
+        note += f"; the drag coefficient is {factor:.4g} times the airframe's, so that it yaws as the flight showed"
+    return note
 
 
 def _clipped(values: dict[str, float]) -> dict[str, float]:

@@ -1,23 +1,37 @@
-"""Compressed parts of a bag, measured before they are decompressed: a small file must not fill the memory."""
+"""Compressed parts of a bag, measured before they are decompressed: a small file must not fill memory or disk."""
 
 import bz2
+import itertools
 import re
 import struct
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path as FilePath
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from .table import Path, opened, refuse
 
-LARGEST = 1 << 28
-"""Bytes of one decompressed part. Recorders write parts of about a megabyte; a bomb has gigabytes."""
+
+class Limits(NamedTuple):
+    """The largest sizes after decompression [bytes].
+
+    - `part`: of a chunk or a message, which is decompressed in memory. Recorders write about a megabyte; a bomb has
+      gigabytes.
+    - `file`: of a file that is compressed as a whole (`ros2 bag record --compression-mode file`), which is decompressed
+      to the disk piece by piece. A bag of an hour has a few gigabytes.
+    """
+
+    part: int = 1 << 28
+    file: int = 1 << 34
+
+
+LIMITS = Limits()
 _STEP = 1 << 20  # bytes that are decompressed at a time
 _CHUNK_OF_MCAP, _CHUNK_OF_ROS1 = 6, b"\x05"
 
 
-def check_sizes(path: Path, *, largest: int = LARGEST) -> None:
-    """Refuse a bag or MCAP file with a part that becomes larger than `largest` when it is decompressed.
+def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
+    """Refuse a bag or MCAP file that is larger than `limits` when it is decompressed.
 
     `path`: a file, or the folder of a bag of ROS 2. What is damaged is left to the reader. Raises `InputError`.
     """
@@ -26,19 +40,21 @@ def check_sizes(path: Path, *, largest: int = LARGEST) -> None:
         with opened(each, "rb") as file:
             begin = file.read(8)
             if begin.startswith(b"\x89MCAP"):
-                parts = _mcap_parts(file)
+                check_parts(path, _mcap_parts(file), limits=limits)
             elif begin == b"#ROSBAG ":
                 file.readline()
-                parts = _ros1_parts(file)
-            else:
-                parts = iter([("zstd", begin + file.read())] if each.suffix == ".zstd" else [])
-            check_parts(path, parts, largest=largest)
+                check_parts(path, _ros1_parts(file), limits=limits)
+            elif each.suffix == ".zstd":
+                pieces = itertools.chain([begin], iter(lambda file=file: file.read(_STEP), b""))
+                if _exceeds("zstd", pieces, limits.file):
+                    what = f"has more than {limits.file:,} bytes when it is decompressed"
+                    refuse(each, f"{what}; record it again in several files (--max-bag-size)")
 
 
-def check_parts(path: Path, parts: Iterable[tuple[str, bytes]], *, largest: int = LARGEST) -> None:
+def check_parts(path: Path, parts: Iterable[tuple[str, bytes]], *, limits: Limits = LIMITS) -> None:
     """The same for parts, each the name of its compression and its content."""
-    if any(_exceeds(kind, content, largest) for kind, content in parts):
-        what = f"holds a compressed part of more than {largest:,} bytes, which no recorder writes"
+    if any(_exceeds(kind, [content], limits.part) for kind, content in parts):
+        what = f"holds a compressed part of more than {limits.part:,} bytes"
         refuse(path, f"{what}; record it again in parts of a few megabytes")
 
 
@@ -66,19 +82,21 @@ def _ros1_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
         yield "" if kind is None else kind[1].decode(), file.read(length)
 
 
-def _exceeds(kind: str, content: bytes, largest: int) -> bool:
+def _exceeds(kind: str, pieces: Iterable[bytes], largest: int) -> bool:
+    """Whether the pieces of one compressed content make more than so many bytes."""
     made = _decompressor(kind)
     if made is None:
         return False
     length, decompressor = 0, made()
     try:
-        while content or not decompressor.needs_input:
-            length += len(decompressor.decompress(content, _STEP))
-            content = b""
-            if length > largest:
-                return True
-            if decompressor.eof:
-                content, decompressor = decompressor.unused_data or b"", made()
+        for content in pieces:
+            while content or not decompressor.needs_input:
+                length += len(decompressor.decompress(content, _STEP))
+                content = b""
+                if length > largest:
+                    return True
+                if decompressor.eof:
+                    content, decompressor = decompressor.unused_data or b"", made()
     except Exception:  # noqa: BLE001 - of a damaged part, a decompressor raises any
         return False
     return False

@@ -1,4 +1,4 @@
-"""The page of an identified vehicle, which needs no other file, and its figures: `jaxos4 estimate --report`."""
+"""The page of an identified vehicle or OS4, which needs no other file, and its figures: `jaxos4 estimate --report`."""
 
 import json
 import math
@@ -70,7 +70,6 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         verdict=verdict(found),
         headline=headline(found.verdicts, found.doubts),
         center=[f"{each.axis} {_plus_minus(1e3 * each.value, 1e3 * each.std)} mm" for each in center],
-        ninety_five=NINETY_FIVE,
         quantities=quantities(found),
         signals=identified_signals(found, look),
         band=f"{100 * BAND:g}",
@@ -172,6 +171,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
         bars.barh(row, value, height=0.5, color=look.color, alpha=0.35)
         bars.errorbar(value, row, xerr=half, color=look.color, capsize=4, marker=look.marker)
     bars.set_yticks(range(3), INERTIAS)
+    bars.tick_params(axis="y", length=0, pad=8)
     bars.set_ylim(2.6, -0.6)
     bars.set_xlim(left=0)
     bars.grid(axis="y", visible=False)

@@ -17,9 +17,10 @@ from ..flight import ANGLES, POSITION, RATES, VELOCITY, Flight
 from ..logs import Recording, Source, as_recording, read_recording
 from ..logs.sampling import filled
 from ..logs.table import counted
+from ..recording.checks import Evidence
 from ..recording.inspection import Inspection, inspect_log
 from ..recording.prepared import prepare
-from ..recording.stretches import usable
+from ..recording.stretches import Stretch, cut
 from .html import draw, render
 from .log_text import unit_of
 from .style import BOUND_DASHES, FAINT, INK, drawing, grid, label, log_axis, style
@@ -80,12 +81,14 @@ def write_log_page(
     recording = as_recording(log) if given else read_recording(log, airframe, full_scale=1.0)
     found = inspect_log(recording, airframe) if found is None else found
     full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
-    flown = usable(recording, airframe)
+    plausible = Evidence(recording, airframe).plausible.recording
+    flown = [cut(plausible, Stretch(part.begin, part.end)) for part in found.parts if part.usable]
     band = None if is_share(recording) or not flown else rotor_band(flown, rules)
     with drawing():
         figures = {"motors": motors(flown, full, rules), "spectra": spectra(flown, band, rules)} if flown else {}
         drawings = {name: draw(figure, name) for name, figure in figures.items() if figure is not None}
     longest = sorted(found.parts, key=lambda part: part.begin - part.end)[: rules.parts]
+    shown, block = logged(recording, found, rules)
     text = render(
         "log.html.j2",
         title=printable(Path(recording.name).name),
@@ -93,8 +96,8 @@ def write_log_page(
         shorter=len(found.parts) - len(longest),
         format=recording.facts.format.label if recording.facts.format else "recording",
         verdict=verdict(found),
-        signals=logged(recording, found, rules),
-        block=2e3 * recording.dt * max(-(-recording.time.size // rules.samples), 1),
+        signals=shown,
+        block=1e3 * recording.dt * block if block > 1 else None,
         fitted=words(fitted(recording, airframe)),
         measured=[
             (name, unit_of(name, recording.commanded and full == 1), one) for name, one in found.measured.items()
@@ -127,8 +130,8 @@ def is_share(recording: Recording) -> bool:
     return recording.commanded and float(np.nanmax(recording.omega, initial=0.0)) <= 1.0
 
 
-def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) -> str:
-    """All signals of a log for the time axis; grey where it is not usable."""
+def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) -> tuple[str, int]:
+    """All signals of a log for the time axis, grey where it is not usable, and the `thinned` samples of a block."""
     columns, panels, width = recording.channels, [], 0
     motor = ("command" if is_share(recording) else "motor [rad/s]", recording.omega, tuple("1234"))
     groups = [(title, columns[:, which], names) for title, which, names in _SIGNALS]
@@ -137,7 +140,7 @@ def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) ->
         groups.append(("battery [V]", recording.voltage[:, None], ("battery",)))
     groups = [group for group in groups if np.isfinite(group[1]).any()]
     every = [bridged(recording.time, column) for _, values, _ in groups for column in values.T]
-    time, values = thinned(recording.time, np.column_stack(every), rules.samples)
+    time, values, block = thinned(recording.time, np.column_stack(every), rules.samples)
     for title, _, names in groups:
         lines = (Line(name, values[:, width + i], style(i)) for i, name in enumerate(names))
         panels.append(Panel(title, [line for line in lines if np.isfinite(line.values).any()]))
@@ -145,7 +148,7 @@ def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) ->
     axis = Axis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
     begin = recording.time[0]
     shaded = [(part.begin - begin, part.end - begin) for part in found.parts if not part.usable]
-    return signals(axis, [View("", time - begin, panels)], shaded=shaded)
+    return signals(axis, [View("", time - begin, panels)], shaded=shaded), block
 
 
 def bridged(
@@ -165,6 +168,9 @@ def fitted(recording: Recording, airframe: Airframe | None) -> str:
     """What `jaxos4 estimate` would fit and hold out, in words."""
     if airframe is None:
         return "Give the airframe (--airframe) to see here what would be fitted, and what held out."
+    if recording.commanded and not airframe.has_full_scale:
+        what = "this log has commands, and the rotor speed of full command is not known"
+        return f"Nothing can be fitted: {what}; set max_rotor_speed [rad/s] in the airframe's file."
     try:
         ready = prepare([recording], airframe)[0]
     except InputError as error:
@@ -233,7 +239,9 @@ def amplitude_density(
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies channels"]]:
     """Frequencies [Hz] and the amplitude spectral density of signals, by Welch's means of overlapping segments.
 
-    A channel that was not measured has NaN. Reference: Welch, IEEE Trans. Audio Electroacoustics 15 (1967).
+    Each channel has the mean over the segments in which it was measured; NaN if there are none.
+
+    Reference: Welch, IEEE Trans. Audio Electroacoustics 15 (1967).
     """
     size = max(round(rules.segment / dt), 8)
     window = np.hanning(size)[:, None]
@@ -247,5 +255,7 @@ def amplitude_density(
     kept = frequency >= rules.slowest
     if not powers:
         return frequency[kept], np.full((np.count_nonzero(kept), parts[0].shape[1]), np.nan)
-    density = 2 * dt * np.mean(powers, axis=0) / np.square(window).sum()
+    measured = np.isfinite(powers).sum(axis=0)
+    power = np.where(measured, np.nansum(powers, axis=0) / np.maximum(measured, 1), np.nan)
+    density = 2 * dt * power / np.square(window).sum()
     return frequency[kept], np.sqrt(density[kept])

@@ -13,6 +13,12 @@
   const values = ([middle, step, text]) =>
     Array.from(new Int16Array(bytes(text)), (level) => (level === -32768 ? null : middle + step * level));
   const text = (value) => (value == null ? "–" : String(Number(value.toPrecision(4))));
+  // Labels have as many decimals as the distance of the ticks.
+  function labels(places, step) {
+    let digits = 0;
+    while (digits < 9 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits++;
+    return places.map((x) => String(Number(own(x).toFixed(digits))));
+  }
   // How a line is dashed, for readers who see no colours.
   const mark = (dash) => (dash.length === 0 ? "—" : dash.length > 2 ? "- ·" : dash[0] > 4 ? "- -" : "···");
   const color = (name) => {
@@ -95,7 +101,7 @@
       cursor: { sync: { key: "time", scales: ["x", null] }, bind: { dblclick: () => () => zoom(...whole) } },
       scales: { x: { time: false } },
       axes: [
-        { ...axis, size: 28, splits: ticks, values: (_, at) => at.map((x) => text(own(x))) },
+        { ...axis, size: 28, splits: ticks, values: (_, at, axis, space, step) => labels(at, step) },
         { ...axis, label: title, size: 52, labelSize: 20, space: height < 120 ? 14 : 22 },
       ],
       series: [{ label: "time [s]", value: (_, x) => (x == null ? "–" : own(x).toFixed(3)) }, ...series],

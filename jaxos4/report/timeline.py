@@ -90,17 +90,22 @@ def spans(time: Float[np.ndarray, " samples"], marked: Bool[np.ndarray, " sample
 
 def thinned(
     time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples channels"], most: int
-) -> tuple[Float[np.ndarray, " fewer"], Float[np.ndarray, "fewer channels"]]:
-    """At most `most` samples that draw the same lines: the least and the largest value of each block, in turn."""
-    block = -(-2 * time.size // most)
+) -> tuple[Float[np.ndarray, " fewer"], Float[np.ndarray, "fewer channels"], int]:
+    """At most `most` samples that draw the same lines: the least and the largest value of each block, in turn.
+
+    **Returns:** their times and values, and the number of samples in a block; 1: all samples, as they were given.
+    """
+    block = -(-time.size // (most // 2))
     if block <= 2:
-        return time, values
-    count = time.size // block
-    cut = values[: count * block].reshape(count, block, values.shape[1])
+        return time, values, 1
+    begin = np.arange(0, time.size, block)
+    padded = np.pad(values, ((0, -len(values) % block), (0, 0)), constant_values=np.nan)
+    cut = padded.reshape(begin.size, block, values.shape[1])
     known = np.isfinite(cut)
     ends = np.where(known, cut, np.inf).min(axis=1), np.where(known, cut, -np.inf).max(axis=1)
-    both = np.where(np.asarray(known.any(axis=1))[:, None], np.stack(ends, axis=1), np.nan).reshape(2 * count, -1)
-    return time[: count * block].reshape(count, block)[:, [0, block // 2]].ravel(), both
+    both = np.where(np.asarray(known.any(axis=1))[:, None], np.stack(ends, axis=1), np.nan)
+    places = np.minimum(begin[:, None] + [0, block // 2], time.size - 1)
+    return time[places].ravel(), both.reshape(2 * begin.size, -1), block
 
 
 def signals(
