@@ -13,7 +13,7 @@ from lanes import names
 import jaxos4
 from jaxos4.identification import uncertainty
 from jaxos4.identification.checks import check_vehicle
-from jaxos4.identification.data import Data
+from jaxos4.identification.data import Clock, Data
 from jaxos4.identification.results import Provenance
 from jaxos4.identification.sample_time import sample_time_of
 from jaxos4.identification.search import search
@@ -217,7 +217,7 @@ def poorly_known():
     problem, recording = first_problem(1.0)
     nothing = dict.fromkeys(("airframe", "version", "jax", "device", "precision"), "")
     provenance = Provenance(sample_time=PERIOD, fitted_seconds=60.0, **nothing)
-    data = Data(problem, problem.problem, recording, provenance)
+    data = Data(problem, problem.problem, Clock(recording, PERIOD * np.arange(recording.size)), provenance)
     return data, fitted(problem, recording)
 
 

@@ -47,21 +47,19 @@ class Data(Generic[L]):
 
     - `likelihood`: with its bracket; that of a vehicle is padded.
     - `flight`: the flight and its model.
-    - `recording`: the number of the recording of each sample.
+    - `clock`: of each sample of a vehicle's logs; empty for an OS4.
     - `provenance`: data, settings and versions.
     - `held_out`: what is not fitted, if there is anything.
     - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
-    - `clock`: of a vehicle's logs.
     """
 
     likelihood: L
     flight: ShootingProblem
-    recording: Int[np.ndarray, " samples"]
+    clock: Clock
     provenance: Provenance
     held_out: HeldOut | None = None
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
-    clock: Clock = Clock()
 
     @property
     def room(self) -> int:

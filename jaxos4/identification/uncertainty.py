@@ -127,7 +127,7 @@ def at_lowest(
     A search that did not converge has no profile.
     """
     for left in reversed(range(rules.minima)):
-        answer, factors, lower = corrected(optimum, data.flight, data.recording), {}, None
+        answer, factors, lower = corrected(optimum, data.flight, data.clock.log), {}, None
         if not optimum.converged:
             return answer
         poor = optimum.std > rules.well_known * np.abs(optimum.values[: optimum.whole.count])
@@ -140,7 +140,7 @@ def at_lowest(
                 break
             factors[optimum.whole.names[place]] = max(reach / NINETY_FIVE, 1.0)
         if lower is None:
-            return corrected(optimum, data.flight, data.recording, factors)
+            return corrected(optimum, data.flight, data.clock.log, factors)
         if not left:
             break
         progress("fitting again where the cost is lower")
@@ -151,7 +151,7 @@ def at_lowest(
         optimum = optimum._replace(rollouts=rollouts)
         if not is_lower:
             break
-    return corrected(optimum._replace(is_lowest=False), data.flight, data.recording)
+    return corrected(optimum._replace(is_lowest=False), data.flight, data.clock.log)
 
 
 def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> tuple[float, Optimum]:

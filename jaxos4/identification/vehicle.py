@@ -82,7 +82,7 @@ class VehicleCase:
         solver, is_default = FilterError(tolerance=LIKELIHOODS.tolerance), self.estimator == DEFAULT
         compared = self.data if is_default or len(self.data) > 1 else ()
         optima = search_sample_times(compared, solver, progress=progress)
-        answers = [corrected(x, data.flight, data.recording) for x, data in zip(optima, compared, strict=True)]
+        answers = [corrected(x, data.flight, data.clock.log) for x, data in zip(optima, compared, strict=True)]
         rows = [sample_time_of(answer) for answer in answers]
         place = shortest(rows) if self.choose and rows else 0
         data = self.data[place]
@@ -176,16 +176,14 @@ def _data(
         notes=list(notes),
         **versions(shooting),
     )
-    recording = np.asarray(prepared.recordings)[number]
     return Data(
         likelihood=_innovations(shooting, prepared, room),
         flight=shooting,
-        recording=recording,
         provenance=provenance,
         held_out=held_out,
         findings=prepared.doubts,
         log_step=prepared.log_step,
-        clock=Clock(recording, prepared.time),
+        clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),
     )
 
 
