@@ -172,7 +172,7 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     data = data_of(flown(), 2 * DT)
     (optimum,) = search_sample_times([data], SOLVER)
-    answer = corrected(optimum, data.flight, data.recording)
+    answer = corrected(optimum, data.flight, data.clock.log)
     assert set(sample_time_of(answer).constants) == {"Ix", "Iy", "Iz"}
     place = answer.problem.model.parameter_names.index("thrust_gain")
     unknown = np.asarray(answer.estimate.covariance).copy()
@@ -193,7 +193,7 @@ def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeyp
     several = [data_of(flown(), DT * length) for length in (2, 4)]
     monkeypatch.setattr(sample_time, "start_of", lambda likelihood, found: np.full(found.parameters.size, 1e9))
     optima = search_sample_times(several, SOLVER)
-    answers = [corrected(x, data.flight, data.recording) for x, data in zip(optima, several, strict=True)]
+    answers = [corrected(x, data.flight, data.clock.log) for x, data in zip(optima, several, strict=True)]
     rows = [sample_time_of(answer) for answer in answers]
     assert [set(row.constants) for row in rows] == [{"Ix", "Iy", "Iz"}] * 2
     assert shortest(rows) == 0
