@@ -1,7 +1,7 @@
 """The physical constants of a quadrotor: presets, TOML files, and the conversion between inertia and alpha."""
 
 import math
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -58,15 +58,7 @@ class Airframe(eqx.Module):
 
         The matrix turns what they measure into the body's axes.
         """
-        xp = np if isinstance(self.sensor_rotation, np.ndarray) else jnp
-        angles = xp.deg2rad(self.sensor_rotation)
-        (sx, cx), (sy, cy), (sz, cz) = zip(xp.sin(angles), xp.cos(angles), strict=True)
-        rows = (
-            (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
-            (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
-            (-sy, cy * sx, cy * cx),
-        )
-        return xp.stack([xp.stack(row) for row in rows])
+        return rotation(self.sensor_rotation * (math.pi / 180))
 
     @property
     def mixer(self) -> Float[Numeric, "4 4"]:
@@ -95,6 +87,18 @@ class Airframe(eqx.Module):
     def hover_squares(self) -> Float[np.ndarray, "4"]:
         """The squared rotor speeds [rad^2/s^2] that carry the weight without torque; negative if none do."""
         return np.linalg.solve(np.asarray(self.mixer), [0.0, 0.0, 0.0, float(self.mass) * float(self.gravity)])
+
+
+def rotation(angles: Float[Numeric, "3 *samples"]) -> Float[Numeric, "3 3 *samples"]:
+    """R_z(psi) R_y(theta) R_x(phi) of the angles phi, theta, psi [rad]."""
+    xp = np if isinstance(angles, np.ndarray) else jnp
+    (sx, cx), (sy, cy), (sz, cz) = zip(xp.sin(angles), xp.cos(angles), strict=True)
+    rows = (
+        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+        (-sy, cy * sx, cy * cx),
+    )
+    return xp.stack([xp.stack(row) for row in rows])
 
 
 def plus_layout(arm: float) -> list[tuple[float, float]]:
@@ -159,13 +163,12 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
 _VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,), "sensor_rotation": (3,)}
 _SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
-_REQUIRED = tuple(name for name in _SHAPES if name not in ("gravity", "max_rotor_speed", "sensor_rotation"))
+_REQUIRED = tuple(field.name for field in fields(Airframe) if field.default is MISSING)
 _REPLACES = {"arm": "rotor_positions", "hover_speed": "thrust_coefficient"}
 _GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
 # The least and the largest value, if they are not those of the other constants.
 _SIZES = {"rotor_positions": (-1e3, 1e3), "rotor_spins": (-1e3, 1e3), "rotor_inertia": (0.0, 1e3)}
-_SIZES["sensor_rotation"] = (-360.0, 360.0)  # degrees
-_SIZES |= {"max_rotor_speed": (1e-15, math.inf), "hover_speed": (1e-3, 1e6)}
+_SIZES |= {"max_rotor_speed": (1e-15, math.inf), "hover_speed": (1e-3, 1e6), "sensor_rotation": (-360.0, 360.0)}
 
 
 def airframe_from_table(table: dict[str, Any]) -> Airframe:

@@ -3,17 +3,16 @@
 The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.
 """
 
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, continued, fill, print_table
+from experiments.monte_carlo import Row, continued, fill, interval, print_table
 from experiments.public_flights.run import FITTED, PREDICTED
+from experiments.real_flight.run import disagreements
 from experiments.sample_times.run import VEHICLE as CINERAT
 from experiments.shared import flight_files
 from jaxos4.errors import InputError
@@ -40,7 +39,7 @@ def judged(path: Path, airframe: jaxos4.Airframe) -> Row:
         status = found.result if verdict is None else verdict.status
         row[name] = {"status": status, "reasons": [] if verdict is None else list(verdict.reasons)}
         if value is not None:
-            row[name] |= {"estimate": value.estimate, "half_width": NINETY_FIVE * value.std}
+            row[name] |= {"estimate": value.estimate, "std": value.std}
     return row
 
 
@@ -55,7 +54,7 @@ def cells(rows: list[Row]) -> Iterator[tuple[str, ...]]:
         for name in JUDGED:
             if name in row:
                 one = row[name]
-                value = f"{1e5 * one['estimate']:.3g} +- {1e5 * one['half_width']:.2g}" if "estimate" in one else ""
+                value = interval(one if "estimate" in one else None, 1e5, "3g", "2g")
                 yield row["flight"], name, value, one["status"], "; ".join(one["reasons"])
         if "why" in row:
             yield row["flight"], "", "", "refused", row["why"]
@@ -64,16 +63,17 @@ def cells(rows: list[Row]) -> Iterator[tuple[str, ...]]:
 def pairs(rows: list[Row]) -> Iterator[tuple[str, ...]]:
     """Pairs of identified flights of one vehicle: how many differences lie inside their 95 %, and the largest."""
     for vehicle in dict.fromkeys(map(flown_by, rows)):
-        for name in JUDGED:
-            known = [row[name] for row in rows if flown_by(row) == vehicle and name in row]
-            known = [one for one in known if one["status"].startswith("identified") and "estimate" in one]
-            apart = [
-                abs(a["estimate"] - b["estimate"]) / np.hypot(a["half_width"], b["half_width"])
-                for a, b in itertools.combinations(known, 2)
-            ]
-            if apart:
-                inside = sum(each <= 1 for each in apart)
-                yield vehicle, name, str(len(known)), f"{inside} of {len(apart)}", f"{NINETY_FIVE * max(apart):.2f}"
+        flown = {row["flight"]: {"constants": identified(row)} for row in rows if flown_by(row) == vehicle}
+        for name, apart in disagreements(flown).items():
+            known = sum(name in each["constants"] for each in flown.values())
+            inside = sum(z <= NINETY_FIVE for z in apart.values())
+            yield vehicle, name, str(known), f"{inside} of {len(apart)}", f"{max(apart.values()):.2f}"
+
+
+def identified(row: Row) -> Row:
+    """The quantities of a flight that are identified, with or without a reservation."""
+    known = {name: row[name] for name in JUDGED if "estimate" in row.get(name, {})}
+    return {name: one for name, one in known.items() if one["status"].startswith("identified")}
 
 
 def main(

@@ -115,12 +115,12 @@ def noisy(recording: Recording, size: float) -> Recording:
 
 def shortened(recording: Recording, seconds: float) -> Recording:
     """The first seconds of a flight."""
-    return some(recording, recording.time <= recording.time[0] + seconds)
+    return recording.rows(recording.time <= recording.time[0] + seconds)
 
 
 def without_rows(recording: Recording, lost: float) -> Recording:
     """This share of the rows is missing, at random."""
-    return some(recording, np.random.default_rng(0).uniform(size=recording.time.size) >= lost)
+    return recording.rows(np.random.default_rng(0).uniform(size=recording.time.size) >= lost)
 
 
 def two_vehicles(recording: Recording, size: float) -> list[Recording]:
@@ -129,15 +129,8 @@ def two_vehicles(recording: Recording, size: float) -> list[Recording]:
     With rotor speeds that are smaller by the root, it flies the same path.
     """
     first = recording.time <= (recording.time[0] + recording.time[-1]) / 2
-    second = some(recording, ~first)
-    return [some(recording, first), second._replace(omega=second.omega / np.sqrt(size), name="second flight")]
-
-
-def some(recording: Recording, rows: np.ndarray) -> Recording:
-    """The recording of these rows."""
-    force = None if recording.specific_force is None else recording.specific_force[rows]
-    time, omega, states = (x[rows] for x in (recording.time, recording.omega, recording.states))
-    return recording._replace(time=time, omega=omega, states=states, specific_force=force)
+    second = recording.rows(~first)
+    return [recording.rows(first), second._replace(omega=second.omega / np.sqrt(size), name="second flight")]
 
 
 def thinned(recording: Recording, every: float) -> Recording:
@@ -225,11 +218,9 @@ def share(part: int, whole: int) -> str:
     return f"{100 * part / whole:.3g} +- {100 * np.sqrt(p * (1 - p) / whole):.1f}"
 
 
-def errors_of(groups: dict[str, list[Row]], good: list[Row]) -> Iterator[tuple[str, ...]]:
+def errors_of(groups: dict[str, list[Row]]) -> Iterator[tuple[str, ...]]:
     """For each group of good flights: mean errors, and shares of the 95 % intervals that hold the truth."""
     for name, some in groups.items():
-        if not some or any(row not in good for row in some):
-            continue
         cells = []
         for inertia in INERTIAS:
             known = [row[inertia] for row in some if inertia in row]
@@ -248,20 +239,27 @@ def print_tables(rows: list[Row]) -> None:
     Unreserved: identified without a reservation; far: off by more than three standard deviations or 12 %.
     """
     good = [row for row in rows if CASES[row["case"]][1] is None]
+    spoiled = [row for row in rows if CASES[row["case"]][1] is not None]
     groups = {name: [row for row in rows if row["case"] == name] for name in CASES}
-    groups |= {"good flights": good, "spoiled flights": [row for row in rows if row not in good]}
+    groups |= {"good flights": good, "spoiled flights": spoiled}
+    groups = {name: some for name, some in groups.items() if some}
+    unspoiled = {name: some for name, some in groups.items() if CASES[some[0]["case"]][1] is None}
     lines = []
     for name, some in groups.items():
-        if some:
-            n, known = counts(some), [r["named"] for r in some if r["named"] is not None]
-            shares = [share(n[each], n["answers"]) for each in ("identified", "unreserved", "identified and wrong")]
-            shares += [share(n["far"], n["unreserved"]), share(n["refused and right"], n["answers"])]
-            lines.append((name, str(len(some)), *shares, share(sum(known), len(known))))
+        n, known = counts(some), [r["named"] for r in some if r["named"] is not None]
+        shares = [share(n[each], n["answers"]) for each in ("identified", "unreserved", "identified and wrong")]
+        shares += [share(n["far"], n["unreserved"]), share(n["refused and right"], n["answers"])]
+        lines.append((name, str(len(some)), *shares, share(sum(known), len(known))))
     headings = "flights", "identified [%]", "unreserved [%]", "beyond 3 std [%]"
     headings += "of unreserved far [%]", "refused, right [%]", "named [%]"
     print_table("verdicts of Ix and Iy", ("case", *headings), lines, width=140)
     headings = (f"{name} {what} [%]" for name in INERTIAS for what in ("mean error", "intervals that hold"))
-    print_table("errors of good flights", ("case", *headings), errors_of(groups, good), width=160)
+    print_table(
+        "errors of good flights",
+        ("case", *headings),
+        errors_of(unspoiled),
+        width=160,
+    )
     lines = []
     for axis in ("roll", "pitch", "yaw"):
         every = [r["response"][axis] for r in good if axis in r.get("response", {})]

@@ -44,9 +44,9 @@ def predict_held_out(
             fitted = dict(zip(names, values.tolist(), strict=True))
             each = {n: [fitted[own] for own in fitted if own.rpartition("_")[0] == n] for n in problem.unknowns.names}
             parameters = np.array([fitted[n] if n in fitted else np.mean(each[n]) for n in each])
-        seen, known = _together(data, held_out), None
+        known = None
         if noise is not None:
-            known = _traced(data, seen, parameters, noise).disturbance
+            known = _traced(data, _together(data, held_out), parameters, noise).disturbance
         predicted = predictions(problem, as_float(parameters), disturbance=known, noise=noise)
         return predicted, skill(predicted)
 

@@ -8,7 +8,7 @@ from typing import IO, Any, NamedTuple, NoReturn, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..errors import InputError, printable, shortened
 from ..flight import Flight, with_force
@@ -191,7 +191,7 @@ class Recording(NamedTuple):
         """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
         return with_force(self.states, self.specific_force, np)
 
-    def rows(self, which: slice) -> "Recording":
+    def rows(self, which: slice | Bool[np.ndarray, " samples"]) -> "Recording":
         """Some samples of the recording; their time stays as recorded."""
         return self._replace(**{f: x[which] for f in _ARRAYS if (x := getattr(self, f)) is not None})
 

@@ -132,9 +132,7 @@ class FlightModel(AbstractModel):
             [names.index(name if name in names else f"{name}_{i + 1}") for name in one.parameter_names]
             for i in range(max(self.recordings) + 1)
         ]
-        known = isinstance(stretch, np.ndarray)  # what is known needs no compiled program
-        numbers = np.asarray(self.recordings) if known else jnp.asarray(self.recordings)
-        return ByRecording(one, np.array(places), numbers[(np if known else jnp).minimum(stretch, numbers.size - 1)])
+        return ByRecording(one, np.array(places), of_stretches(self.recordings, stretch))
 
     @property
     def gyroscopic_factor(self) -> Scalar:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import RotorSpeeds, Scalar
+from .._custom_types import Numeric, RotorSpeeds, Scalar
 from ..flight import Inputs
 
 Speed = Float[Array, "*samples"]
@@ -16,9 +16,10 @@ Commands = Callable[[Int[Array, "*rows"]], Float[Array, "*rows 4"]]
 """The commands [rad/s] at the samples with these numbers."""
 
 
-def of_stretches(recordings: tuple[int, ...], stretch: Int[Array, " samples"]) -> Int[Array, " samples"]:
+def of_stretches(recordings: tuple[int, ...], stretch: Int[Numeric, " samples"]) -> Int[Numeric, " samples"]:
     """The recordings of these stretches; the last of `recordings` is that of all stretches that follow."""
-    return jnp.asarray(recordings)[jnp.minimum(stretch, len(recordings) - 1)]
+    xp = np if isinstance(stretch, np.ndarray) else jnp  # what is known needs no compiled program
+    return xp.asarray(recordings)[xp.minimum(stretch, len(recordings) - 1)]
 
 
 class Grid(NamedTuple):
@@ -30,7 +31,7 @@ class Grid(NamedTuple):
     """
 
     dt: Scalar
-    recording: Int[Array, " samples"]
+    recording: Int[Numeric, " samples"]
     first: Int[Array, " samples"]
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]

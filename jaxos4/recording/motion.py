@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..airframe import GRAVITY, Airframe
+from ..airframe import GRAVITY, Airframe, rotation
 from ..excitation import AXES
 from ..flight import ANGLES, RATES, VELOCITY, Flight
 from ..logs import Recording, as_recording
@@ -286,13 +286,7 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
 
 def rotations_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> Float[np.ndarray, "samples 3 3"]:
     """The rotations from the earth frame, the inverse of R_z(psi) R_y(theta) R_x(phi)."""
-    (sx, cx), (sy, cy), (sz, cz) = ((np.sin(angle), np.cos(angle)) for angle in (phi, theta, psi))
-    rows = (
-        (cz * cy, sz * cy, -sy),
-        (cz * sy * sx - sz * cx, sz * sy * sx + cz * cx, cy * sx),
-        (cz * sy * cx + sz * sx, sz * sy * cx - cz * sx, cy * cx),
-    )
-    return np.moveaxis(np.array(rows), -1, 0)
+    return np.asarray(rotation(np.stack([phi, theta, psi]))).T
 
 
 def _dead_reckoned(
