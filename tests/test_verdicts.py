@@ -62,6 +62,31 @@ def test_a_doubt_counts_by_how_far_it_moves_a_quantity(move, result, status):
     assert any("moves nothing" in line for line in said) or any(doubt.cause in line for line in said)
 
 
+@pytest.mark.parametrize(
+    ("moves", "results", "status", "result"),
+    [
+        ([(0.09, 0.8), (0.2, 0.9)], ["implausible", "successful"], CONTRADICTED, "implausible"),
+        ([(0.2, 0.9), (0.04, 1.3)], ["no_skill", "implausible"], CONTRADICTED, "no_skill"),
+        ([(0.09, 0.4), (0.2, 0.5)], ["implausible", "successful"], RESERVED, "successful"),
+        # Nothing impossible, a note, and a doubt of unknown size do not count.
+        ([(0.09, 0.8), (0.2, 5.0)], ["successful", "successful"], RESERVED, "successful"),
+        ([(0.09, 0.8), (0.04, 0.9)], ["implausible", "successful"], RESERVED, "successful"),
+        ([(0.09, 0.8), None], ["implausible", "successful"], RESERVED, "successful"),
+    ],
+)
+def test_reservations_add_up_beside_an_impossible_parameter(moves, results, status, result):
+    sized = [None if move is None else Move(*move) for move in moves]
+    doubts = [
+        Doubt(name, f"cause {i}", "b", {"Ix": move}) for i, (name, move) in enumerate(zip(results, sized, strict=True))
+    ]
+    for order in (doubts, doubts[::-1]):
+        found = verdict_of("Ix", Quantity(), order)
+        assert found.status == status
+        assert verdict_of("Iy", Quantity(), order).status == IDENTIFIED
+    assert outcome("successful", ["Ix"], {"Ix": found}, doubts) == result
+    assert status == RESERVED or len(found.reasons) == 2
+
+
 def test_a_quantity_that_is_hardly_known_is_not_identified():
     statuses = [verdict_of("Ix", Quantity(spread=spread), []).status for spread in (0.1, 0.3, 0.5)]
     assert statuses == [IDENTIFIED, RESERVED, MISSING]

@@ -1,15 +1,15 @@
 """Which verdicts are right? Good flights with the effects of real ones, and flights that are spoiled as real logs are.
 
-The good flights, and the airframe that is given, are those of `closed_loop/effects.py`. Each fault spoils the flights
-`gusts` in three sizes, alone. Ix and Iy are judged. A quantity is *identified* with or without a reservation. It is
-*wrong* if it is off by more than three standard deviations, or, without a reservation, by more than 12 %. An answer is
-*right* if its 95 % interval holds the truth. A cause is right if the faults of the table below are named as they are,
-wherever the answer says so.
+The good flights, and the airframe that is given, are those of `closed_loop/effects.py`, and those of `rotorpy`, which
+needs RotorPy to be installed. Each fault spoils the flights `gusts` in three sizes, alone. Ix and Iy are judged. A
+quantity is *identified* with or without a reservation. It is *wrong* if it is off by more than three standard
+deviations, or, without a reservation, by more than 12 %. An answer is *right* if its 95 % interval holds the truth. A
+cause is right if the faults of the table below are named as they are, wherever the answer says so.
 """
 
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -157,17 +157,29 @@ FAULTS = {
     "two vehicles": Fault(two_vehicles, (1.1, 1.2, 1.3), "of different mass or thrust"),
     "rare motors": Fault(thinned, (5.0, 10.0, 20.0), "more rarely"),
 }
-CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL)}
+ROTORPY = {"RotorPy calm": 0.0, "RotorPy gusts": 1.5}  # [m/s]
+CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL, *ROTORPY)}
 CASES |= {f"{name} {size:g}": ("gusts", fault, size) for name, fault in FAULTS.items() for size in fault.sizes}
 
 
-def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> Row:
+def good_flights(
+    kind: str, count: int, duration: float, seed: int
+) -> tuple[jaxos4.Airframe, Sequence[jaxos4.Flight | None]]:
+    """The vehicle, and its flights with an effect; `None`: one that turned over."""
+    if kind not in ROTORPY:
+        return VEHICLE, flights_of(kind, count, duration, seed)
+    from experiments.rotorpy import flights
+
+    return flights.VEHICLE, [flights.fly(ROTORPY[kind], duration, 1000 * seed + i) for i in range(count)]
+
+
+def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> Row:
     """The row of one flight. Errors and standard deviations are shares of the truth."""
     begin, recording = time.perf_counter(), Recording.of(flight, "flight")
     row: Row = {"result": "refused"}
     try:
         found = jaxos4.identify(
-            recording if fault is None else fault.spoil(recording, size), given_airframe(VEHICLE, i)
+            recording if fault is None else fault.spoil(recording, size), given_airframe(vehicle, i)
         )
     except InputError as error:
         causes = [str(error)]
@@ -175,7 +187,7 @@ def judged(flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> R
         row["result"], constants = found.result, found.rigid_body.constants
         causes = [*map(str, found.doubts), *(r for v in found.verdicts.values() for r in v.reasons)]
         causes += found.provenance.notes
-        for name, truth in zip(INERTIAS, VEHICLE.inertia.tolist(), strict=True):
+        for name, truth in zip(INERTIAS, np.asarray(vehicle.inertia).tolist(), strict=True):
             if name in constants:
                 value = constants[name]
                 row[name] = {"error": value.estimate / truth - 1, "std": value.std / truth}
@@ -282,14 +294,14 @@ def main(
     """Count right and wrong verdicts for each effect, and for each fault in three sizes."""
     report = continued(out, {"duration": duration, "seed": seed}, "rows")
     numbers = {name: flights if CASES[name][1] is None else spoiled for name in cases}
-    flown = functools.cache(lambda kind: flights_of(kind, max(numbers.values()), duration, seed))
+    flown = functools.cache(lambda kind: good_flights(kind, max(numbers.values()), duration, seed))
     # An interrupted report has about as many flights of each case.
     trials = ({"case": name, "flight": i} for i in range(max(numbers.values())) for name in cases if i < numbers[name])
 
     def row_of(case: str, flight: int) -> Row:
         kind, fault, size = CASES[case]
-        recorded = flown(kind)[flight]
-        return {"result": LOST} if recorded is None else judged(recorded, flight, fault, size)
+        vehicle, recorded = flown(kind)[0], flown(kind)[1][flight]
+        return {"result": LOST} if recorded is None else judged(vehicle, recorded, flight, fault, size)
 
     fill(out, report, report["rows"], trials, row_of)
     print_tables([row for row in report["rows"] if row["result"] != LOST])

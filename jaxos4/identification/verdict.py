@@ -16,6 +16,7 @@ MISSING = "not identified"
 CONTRADICTED = "contradicted"
 STATUSES = (IDENTIFIED, RESERVED, MISSING, CONTRADICTED)
 """From the best to the worst."""
+_TRUSTED = (IDENTIFIED, RESERVED)
 
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 
@@ -55,7 +56,7 @@ class Tolerance(msgspec.Struct, frozen=True):
 
     - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, by more than one of them
       makes a reservation, by less is a note. Errors of discretisation reach 3 %, and an interval allows for one
-      standard deviation.
+      standard deviation. Moves of reservations add up; see `weights`.
     - `vague`, `unknown`: half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a
       reservation, or is not identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
     - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
@@ -94,7 +95,7 @@ class Verdict(msgspec.Struct, frozen=True):
     @property
     def trusted(self) -> bool:
         """Whether the quantity is identified, with or without a reservation."""
-        return self.status in (IDENTIFIED, RESERVED)
+        return self.status in _TRUSTED
 
 
 class Quantity(NamedTuple):
@@ -111,22 +112,41 @@ class Quantity(NamedTuple):
     reservations: tuple[str, ...] = ()
 
 
-def weight(doubt: Doubt, name: str, tolerance: Tolerance = TOLERANCE) -> str:
-    """The status that a doubt leaves to a quantity that has this name."""
+def weights(doubts: Sequence[Doubt], name: str, tolerance: Tolerance = TOLERANCE) -> list[str]:
+    """The status that each doubt leaves to a quantity that has this name.
+
+    Reservations of known size add up. If one of them is impossible, and together they exceed what one doubt may move,
+    they contradict the quantity: an impossible parameter shows that the model errs, and another doubt by how much.
+    """
+    alone = [_weight(doubt, name, tolerance) for doubt in doubts]
+    moves = {i: doubts[i].moves[name] for i, status in enumerate(alone) if status == RESERVED}
+    sized = {i: move for i, move in moves.items() if move is not None}
+    total = Move(sum(move.share for move in sized.values()), sum(move.deviations for move in sized.values()))
+    if all(doubts[i].result == "successful" for i in sized) or _far(total, tolerance) < 2:
+        return alone
+    return [CONTRADICTED if i in sized else status for i, status in enumerate(alone)]
+
+
+def _weight(doubt: Doubt, name: str, tolerance: Tolerance) -> str:
     if name not in doubt.moves:
         return IDENTIFIED
     move = doubt.moves[name]
     if move is None:
         return {"successful": RESERVED, "implausible": CONTRADICTED}.get(doubt.result, MISSING)
-    far = (move.share > tolerance.share) + (move.deviations > tolerance.deviations)
-    return (IDENTIFIED, RESERVED, RESERVED if doubt.result == "successful" else CONTRADICTED)[far]
+    worst = RESERVED if doubt.result == "successful" else CONTRADICTED
+    return (IDENTIFIED, RESERVED, worst)[_far(move, tolerance)]
+
+
+def _far(move: Move, tolerance: Tolerance) -> int:
+    """How many of the two limits a move exceeds."""
+    return (move.share > tolerance.share) + (move.deviations > tolerance.deviations)
 
 
 def verdict_of(name: str, quantity: Quantity, doubts: Sequence[Doubt], tolerance: Tolerance = TOLERANCE) -> Verdict:
     """The verdict for a quantity. `doubts`: all of the identification."""
     causes: dict[str, list[str]] = {status: [] for status in STATUSES}
-    for doubt in doubts:
-        causes[weight(doubt, name, tolerance)].append(_reason(doubt, name))
+    for doubt, status in zip(doubts, weights(doubts, name, tolerance), strict=True):
+        causes[status].append(_reason(doubt, name))
     causes[RESERVED] += quantity.reservations
     if quantity.missing and not causes[MISSING]:
         causes[MISSING].append(quantity.missing)
@@ -174,10 +194,13 @@ def reasons(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
         for name, verdict in verdicts.items():
             for reason in verdict.reasons if verdict.status == status else ():
                 concerned.setdefault(reason, []).append(name)
-    notes = [doubt for doubt in doubts if all(weight(doubt, name) == IDENTIFIED for name in verdicts)]
+    statuses_of = zip(*(weights(doubts, name) for name in verdicts), strict=True)
+    notes = (
+        [doubt for doubt, own in zip(doubts, statuses_of, strict=True) if {*own} == {IDENTIFIED}] if verdicts else []
+    )
     return [
         *(f"{', '.join(names)}: {reason}." for reason, names in concerned.items()),
-        *(f"note: {doubt}. It moves nothing." for doubt in notes if verdicts),
+        *(f"note: {doubt}. It moves nothing." for doubt in notes),
     ]
 
 
@@ -189,5 +212,7 @@ def outcome(search: str, required: Sequence[str], verdicts: dict[str, Verdict], 
     refused = [name for name in required if not verdicts[name].trusted]
     if not refused:
         return "successful"
-    decided = (x.result for x in doubts for name in refused if weight(x, name) in (MISSING, CONTRADICTED))
+    decisive = {i for name in refused for i, status in enumerate(weights(doubts, name)) if status not in _TRUSTED}
+    # A reservation that contradicts together with another decides nothing by itself.
+    decided = (doubts[i].result for i in sorted(decisive) if doubts[i].result != "successful")
     return next(decided, search if search != "successful" else "unidentifiable")
