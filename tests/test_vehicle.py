@@ -216,7 +216,7 @@ def poorly_known():
     """The data of a flight that says little about alpha8, and the answer without a profile."""
     problem, recording = first_problem(1.0)
     nothing = dict.fromkeys(("airframe", "version", "jax", "device", "precision"), "")
-    provenance = Provenance(sample_time=PERIOD, fitted_seconds=60.0, **nothing)
+    provenance = Provenance(sample_time=PERIOD, **nothing)
     data = Data(problem, problem.problem, Clock(recording, PERIOD * np.arange(recording.size)), provenance)
     return data, fitted(problem, recording)
 

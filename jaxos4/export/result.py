@@ -3,7 +3,6 @@
 import itertools
 import math
 import os
-import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from ..airframe import Airframe
 from ..errors import InputError, named, printable
 from ..identification.results import Identification
 from ..linalg import covariance_root
+from ..models.flight_model import without_recording
 from ..result_file import vehicle_result
 from .vehicle import CARRIED, INERTIAS, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
@@ -160,11 +160,6 @@ def _clipped(values: dict[str, float]) -> dict[str, float]:
     return {name: max(value, 0.0) if name in NOT_NEGATIVE else value for name, value in values.items()}
 
 
-def _vehicles_own(name: str) -> str:
-    """The name of a parameter without the number of its recording."""
-    return re.sub(r"_\d+$", "", name)
-
-
 def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str, float], list[str], list[str]]:
     """Values by name, the names of those that were estimated, and notes.
 
@@ -189,15 +184,15 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
         if name not in found:
             notes.append(f"{moment}: not identified; a guess, from the airframe or from the bracket")
     for names, why in _NOT_CARRIED.items():
-        some = [name for name in found if _vehicles_own(name) in names]
+        some = [name for name in found if without_recording(name) in names]
         if some:
             notes.append(f"{', '.join(some)}: {why}")
     noted = {"alpha2", "alpha5", *CARRIED, *itertools.chain(*_NOT_CARRIED)}
-    if lost := [name for name in rows if _vehicles_own(name) not in noted]:
+    if lost := [name for name in rows if without_recording(name) not in noted]:
         notes.append(f"{', '.join(lost)}: not carried: an exported vehicle of this version has no such parameters")
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
-    fixed = [name for name in values.keys() - found.keys() if _vehicles_own(name) in CARRIED]
+    fixed = [name for name in values.keys() - found.keys() if without_recording(name) in CARRIED]
     if fixed:
         notes.append(f"do not vary in samples, because the flights do not identify them: {', '.join(sorted(fixed))}")
     zero = [name for name in (*INERTIAS.values(), "thrust_gain") if values.get(name) == 0]

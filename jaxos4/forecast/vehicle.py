@@ -1,7 +1,6 @@
 """The vehicle of a result: its model, its parameters with their covariance, and the noise that the fit found."""
 
 import os
-import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from ..errors import InputError, named, printable, shortened
 from ..flight import FORCE_NAMES
 from ..identification.results import Identification
 from ..linalg import covariance_root
-from ..models.flight_model import FlightModel
+from ..models.flight_model import FlightModel, without_recording
 from ..models.terms import TERMS
 from ..result_file import vehicle_result
 from ..shooting.gains import LogNoise
@@ -73,7 +72,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
         # Each parameter is the mean of its rows: one, or one for each recording.
         shares, values, missing, guessed = np.zeros((len(center), len(rows))), [], [], []
         for place, each in enumerate(center):
-            own = [row for row in listed if re.fullmatch(rf"{each}(_\d+)?", row)]
+            own = [row for row in listed if without_recording(row) == each]
             estimated = [row for row in own if row in known]
             if not own:
                 missing.append(each)

@@ -141,7 +141,7 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
         still = (*still, *({"yaw"} - {*still}))
     doubts = [
         *doubts_of_log(data.findings),
-        *few_parts(data.provenance.fitted_seconds or 0.0),
+        *few_parts(data.seconds),
         *_doubts_of_weak_axes(weak),
         *_doubts_of_answer(data, answer, optimum, trusted, body.constants, skill, still),
         *_doubts_of_sample_time(answer, sample_times, body.constants),

@@ -2,17 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._version import __version__
-from ..airframe import PRESETS, Airframe
 from ..recording.checks import Finding
 from ..shooting import InnovationsProblem, ShootingProblem
-from .results import Provenance
+from .provenance import Provenance
 
 Progress = Callable[[str], None]
 L = TypeVar("L", ShootingProblem, InnovationsProblem)
@@ -48,7 +45,7 @@ class Data(Generic[L]):
     - `likelihood`: with its bracket; that of a vehicle is padded.
     - `flight`: the flight and its model.
     - `clock`: of each sample of a vehicle's logs; empty for an OS4.
-    - `provenance`: data, settings and versions.
+    - `provenance`: data, settings and versions. `seconds`: how long the fitted measurements of a vehicle last [s].
     - `held_out`: what is not fitted, if there is anything.
     - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
     """
@@ -57,6 +54,7 @@ class Data(Generic[L]):
     flight: ShootingProblem
     clock: Clock
     provenance: Provenance
+    seconds: float = 0.0
     held_out: HeldOut | None = None
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
@@ -65,18 +63,3 @@ class Data(Generic[L]):
     def room(self) -> int:
         """The number of samples of a padded flight: checks at all sample times share their programs."""
         return self.likelihood.flight.time.shape[0]
-
-
-def versions(problem: ShootingProblem) -> dict[str, Any]:
-    """Versions, device and precision."""
-    return {
-        "version": __version__,
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-        "precision": str(problem.flight.time.dtype),
-    }
-
-
-def airframe_name(airframe: Airframe) -> str:
-    """The name of a preset, or "custom"."""
-    return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")

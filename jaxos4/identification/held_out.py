@@ -17,6 +17,7 @@ from ..analysis.traces import Traces, position_of
 from ..estimate import fit_start
 from ..estimators import EquationError
 from ..flight import RATES
+from ..models.flight_model import without_recording
 from ..shooting import ShootingProblem, padded, with_room
 from ..shooting.gains import LogNoise
 from .answers import Answer, channel_fits
@@ -41,9 +42,8 @@ def predict_held_out(
     def scored(values: np.ndarray, noise: LogNoise | None) -> tuple[Predictions, Skill]:
         parameters = values
         if held_out.recording is not None:  # the mean of those of which each fitted recording has its own
-            fitted = dict(zip(names, values.tolist(), strict=True))
-            each = {n: [fitted[own] for own in fitted if own.rpartition("_")[0] == n] for n in problem.unknowns.names}
-            parameters = np.array([fitted[n] if n in fitted else np.mean(each[n]) for n in each])
+            shared = np.array([without_recording(name) for name in names])
+            parameters = np.array([values[shared == name].mean() for name in problem.unknowns.names])
         known = None
         if noise is not None:
             known = _traced(data, _together(data, held_out), parameters, noise).disturbance

@@ -27,9 +27,10 @@ from ..results import RESULTS
 from ..shooting import ShootingProblem, padded
 from .answers import Answer, Solution
 from .checks import Checked, check_flight
-from .data import Clock, Data, HeldOut, Progress, airframe_name, silent, versions
+from .data import Clock, Data, HeldOut, Progress, silent
 from .problem import Intervals, bracket_of, flight_problem
-from .results import COLOURED, Provenance, has_answer
+from .provenance import Provenance, airframe_name, versions
+from .results import COLOURED, has_answer
 from .settings import FlightSettings, class_name, name_and_class
 
 
@@ -130,7 +131,7 @@ def prepare_flight(
         **versions(problem),
     )
     findings = self_checks(recording, model.airframe, checks=KINEMATIC)
-    data = Data(problem, problem, Clock(), provenance, held_out, findings)
+    data = Data(problem, problem, Clock(), provenance, held_out=held_out, findings=findings)
     method = estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
     return FlightCase(data, method, name, subject)
 

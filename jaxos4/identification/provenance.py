@@ -2,7 +2,12 @@
 
 from typing import Any
 
+import jax
 import msgspec
+
+from .._version import __version__
+from ..airframe import PRESETS, Airframe
+from ..shooting import ShootingProblem
 
 
 class Provenance(msgspec.Struct, frozen=True, kw_only=True):
@@ -37,3 +42,18 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
     jax: str
     device: str
     precision: str
+
+
+def versions(problem: ShootingProblem) -> dict[str, Any]:
+    """Versions, device and precision."""
+    return {
+        "version": __version__,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "precision": str(problem.flight.time.dtype),
+    }
+
+
+def airframe_name(airframe: Airframe) -> str:
+    """The name of a preset, or "custom"."""
+    return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")

@@ -25,9 +25,9 @@ from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_o
 from ..shooting.feedthrough import input_innovations
 from .answers import Solution
 from .checks import Checked, check_vehicle
-from .data import Clock, Data, HeldOut, Progress, airframe_name, versions
+from .data import Clock, Data, HeldOut, Progress
 from .problem import Intervals, bracket_of
-from .results import Provenance
+from .provenance import Provenance, airframe_name, versions
 from .sample_time import sample_time_of, search_sample_times, shortest
 from .search import search
 from .settings import VehicleSettings, name_and_class
@@ -180,6 +180,7 @@ def _data(
         likelihood=_innovations(shooting, prepared, room),
         flight=shooting,
         provenance=provenance,
+        seconds=prepared.seconds[0],
         held_out=held_out,
         findings=prepared.doubts,
         log_step=prepared.log_step,

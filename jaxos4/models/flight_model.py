@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -333,6 +334,11 @@ class FlightModel(AbstractModel):
         if not needed or forcing.velocity is not None or attitude is None or t is None:
             return forcing
         return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
+
+
+def without_recording(name: str) -> str:
+    """The name of a parameter without the number of its recording."""
+    return re.sub(r"_\d+$", "", name)
 
 
 @functools.cache
