@@ -2,6 +2,7 @@
 
 import bz2
 import shutil
+import sqlite3
 import struct
 import tracemalloc
 from importlib import import_module
@@ -297,3 +298,13 @@ def test_a_damaged_bag(kind, bagged, tmp_path):
         return read_log(path, columns={"columns": MAP})
 
     survives_damage(read, tmp_path / "damaged", content, examples=40)
+
+
+@pytest.mark.parametrize("cell", [b"\x17", "soon", "9" * 400])
+def test_a_time_of_another_type_in_a_database_is_refused(bagged, tmp_path, cell):
+    path = Path(shutil.copy(bagged["db3"], tmp_path / "flight.db3"))
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE messages SET timestamp = ? WHERE id = 9", (cell,))
+    with pytest.raises(InputError) as refused:
+        read_log(path, columns={"columns": MAP, "time": "recorded"})
+    assert str(refused.value).isprintable()

@@ -43,7 +43,7 @@ _NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag r
 class _Topic(NamedTuple):
     """The messages of a topic: when they were recorded and their own stamps [ns], and the fields of columns."""
 
-    recorded: list[int]
+    recorded: list[float]
     stamps: list[int]
     fields: dict[str, list[float]]
 
@@ -144,7 +144,7 @@ def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
             if number > MAX_ROWS:
                 refuse(path, f"has more than {MAX_ROWS:,} messages of these topics; cut it into flights")
             message, topic = decode(content, connection.msgtype), found[connection.topic]
-            topic.recorded.append(recorded)
+            topic.recorded.append(float(recorded))  # in SQLite, a cell can be of any type
             topic.stamps.append(_stamp(message))
             for append, get in getters[connection.topic]:
                 append(get(message))
