@@ -27,7 +27,7 @@ class Limits(NamedTuple):
 
 LIMITS = Limits()
 _STEP = 1 << 20  # bytes that are decompressed at a time
-_CHUNK_OF_MCAP, _CHUNK_OF_ROS1 = 6, b"\x05"
+_MCAP, _CHUNK_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, b"\x05"
 
 
 def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
@@ -39,7 +39,7 @@ def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
     for each in sorted(file for file in place.iterdir() if file.is_file()) if place.is_dir() else [place]:
         with opened(each, "rb") as file:
             begin = file.read(8)
-            if begin.startswith(b"\x89MCAP"):
+            if begin.startswith(_MCAP):
                 check_parts(path, _mcap_parts(file), limits=limits)
             elif begin == b"#ROSBAG ":
                 file.readline()
@@ -49,6 +49,7 @@ def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
                 if _exceeds("zstd", pieces, limits.file):
                     what = f"has more than {limits.file:,} bytes when it is decompressed"
                     refuse(each, f"{what}; record it again in several files (--max-bag-size)")
+                check_parts(path, _parts_inside(each), limits=limits)
 
 
 def check_parts(path: Path, parts: Iterable[tuple[str, bytes]], *, limits: Limits = LIMITS) -> None:
@@ -59,15 +60,26 @@ def check_parts(path: Path, parts: Iterable[tuple[str, bytes]], *, limits: Limit
 
 
 def _mcap_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
-    """The compression and the content of each chunk."""
+    """The compression and the content of each chunk of a file that is open behind its first eight bytes."""
     while len(head := file.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
         if kind != _CHUNK_OF_MCAP:
             file.seek(min(length, 1 << 62), 1)
             continue
-        chunk = file.read(min(length, 1 << 31))
+        chunk = file.read(min(length, 1 << 29))
+        file.seek(min(length, 1 << 62) - len(chunk), 1)
         (size,) = struct.unpack_from("<I", chunk.ljust(32), 28)
         yield chunk[32 : 32 + size].decode(errors="replace"), chunk[40 + size :]
+
+
+def _parts_inside(path: FilePath) -> Iterator[tuple[str, bytes]]:
+    """The same of an MCAP file that is compressed as a whole."""
+    with _zstd().ZstdFile(path) as file:
+        try:
+            if file.read(8).startswith(_MCAP):
+                yield from _mcap_parts(file)
+        except Exception:  # noqa: BLE001 - of a damaged file, a decompressor raises any
+            return
 
 
 def _ros1_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
@@ -108,9 +120,12 @@ def _decompressor(kind: str) -> Any:
         return bz2.BZ2Decompressor
     if kind == "lz4":
         return import_module("lz4.frame").LZ4FrameDecompressor
-    if kind != "zstd":
-        return None
+    return _zstd().ZstdDecompressor if kind == "zstd" else None
+
+
+def _zstd() -> Any:
+    """The module that reads Zstandard: Python's own, from 3.14 on."""
     try:
-        return import_module("compression.zstd").ZstdDecompressor
+        return import_module("compression.zstd")
     except ImportError:
-        return import_module("backports.zstd").ZstdDecompressor
+        return import_module("backports.zstd")
