@@ -82,10 +82,7 @@ def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
-    """`path` with links resolved, checked before a long computation.
-
-    **Raises:** `OSError` that names `path` if its folder does not exist or is not writable, or if `path` is a folder.
-    """
+    """`path` with links resolved. Raises `OSError` if it is a folder, or its folder is missing or not writable."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         return Path(path)  # a pipe or a device, to which a link may lead that is no path
     target = Path(os.path.realpath(path))
@@ -131,10 +128,7 @@ def _read_text(
 
 
 def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST) -> None:
-    """Refuse, at any depth, a text that is not one printable line, and a number beyond `largest`.
-
-    By default, infinity and NaN are allowed.
-    """
+    """Refuse, at any depth, a text that is not one printable line, and a number beyond `largest`, by default none."""
     pending = [("", value)]
     while pending:
         place, each = pending.pop()

@@ -12,10 +12,7 @@ from .errors import printable
 
 
 def templates(package: str, escape: Callable[[str], str] | None = None) -> jinja2.Environment:
-    """The templates in a package's folder.
-
-    `escape`: makes a text harmless: `printable` in a comment of Python or TOML, `in_xml`. By default as HTML.
-    """
+    """The templates in a package's folder. `escape`: makes text harmless: `printable`, `in_xml`; by default as HTML."""
 
     def finalize(value: Any) -> Any:
         return value if escape is None or isinstance(value, Markup) else Markup(escape(str(value)))  # noqa: S704

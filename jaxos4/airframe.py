@@ -54,10 +54,7 @@ class Airframe(eqx.Module):
 
     @property
     def sensor_axes(self) -> Float[Numeric, "3 3"]:
-        """The axes of the gyro and the accelerometer in the body, as columns: R_z(yaw) R_y(pitch) R_x(roll).
-
-        The matrix turns what they measure into the body's axes.
-        """
+        """The axes of gyro and accelerometer in the body, as columns: R_z(yaw) R_y(pitch) R_x(roll)."""
         return rotation(self.sensor_rotation * (math.pi / 180))
 
     @property

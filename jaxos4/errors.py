@@ -5,10 +5,7 @@ from collections.abc import Iterator
 
 
 class InputError(ValueError):
-    """A file or an argument cannot be used. The message is one printable line, whatever a file put into it.
-
-    `longest`: in characters; a path alone may have 4096.
-    """
+    """A file or an argument cannot be used. The message is one printable line of at most `longest` characters."""
 
     longest = 5000
 

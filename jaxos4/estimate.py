@@ -221,11 +221,7 @@ class AbstractEstimator(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, problem: Any, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight, in the problem's own bracket or in another.
-
-        `problem`: a `ShootingProblem`, or any other `AbstractProblem`. For a batch use `eqx.filter_vmap`: a lane that
-        fails does not change the others.
-        """
+        """Identifies one flight, in the problem's own bracket or in another. For a batch use `eqx.filter_vmap`."""
 
 
 class AbstractRecursion(AbstractEstimator):
@@ -238,8 +234,7 @@ class AbstractRecursion(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
-        windows, or a model with rotor lag, delay, thrust curve or sensor terms.
+        **Raises:** `ValueError` for a wrong bracket, windows, or a model with rotor or sensor terms.
         """
         if problem.windows > 1:
             remedy = f"got {problem.windows}: use an estimator that shoots"

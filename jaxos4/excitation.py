@@ -128,10 +128,7 @@ def _about_axes(airframe, shape: np.ndarray, intervals: int, amplitude, dt: floa
 
 
 def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> RotorSpeeds:
-    """Rotor speeds [rad/s] that produce these angular accelerations [rad/s^2] and carry the weight.
-
-    Raises `ValueError` for squared speeds outside of 0 to `max_rotor_speed`^2, and says which amplitude can fly.
-    """
+    """Rotor speeds [rad/s] for angular accelerations [rad/s^2] in hover. `ValueError` says which amplitude can fly."""
     torque = np.asarray(airframe.inertia, dtype=np.float64) * acceleration
     hover, fastest = airframe.hover_squares, float(airframe.max_rotor_speed)
     change = np.linalg.solve(np.asarray(airframe.mixer, dtype=np.float64), np.pad(torque, ((0, 0), (0, 1))).T).T
@@ -180,10 +177,7 @@ def in_turn(shapes: Sequence[np.ndarray], samples: int, columns: int, slots: Seq
 
 
 def sweep(samples: int, span: float, frequencies: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """A sine whose frequency rises linearly in `span` seconds; and the frequency at each sample.
-
-    It is faded in and out over a fifth of the time each.
-    """
+    """A sine that sweeps two frequencies in `span` [s], faded in and out in a fifth of it; and its frequency."""
     share, (first, last) = np.linspace(0, 1, samples), frequencies
     phase = 2 * math.pi * span * (first * share + (last - first) * share**2 / 2)
     fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / 0.2, 0, 1)) ** 2

@@ -19,10 +19,7 @@ PerWindow = Float[Array, "windows n"]
 
 
 class JointFactor(NamedTuple):
-    """A factor A of the information A A^T of each window, and its `basis` A^-T.
-
-    The columns of `basis` are directions of unit information. The covariance of the unknowns is basis basis^T.
-    """
+    """A factor A of the information A A^T of each window, and its `basis` A^-T: directions of unit information."""
 
     factor: Float[Array, "windows n n"]
     basis: Float[Array, "windows n n"]

@@ -82,10 +82,7 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
 
 
 def vehicle_result(found: Identification | str | os.PathLike[str]) -> Identification:
-    """The result of a vehicle with an estimate: this one, or the one in a file, as `read_result` reads it.
-
-    **Raises:** `InputError`, one line, if it has no vehicle or no estimate; errors of `read_result`.
-    """
+    """The result of a vehicle, given or read, with an estimate. Raises `InputError`, one line; as `read_result`."""
     given = isinstance(found, Identification)
     own = found if given else read_result(found)
     with named("" if given else found):

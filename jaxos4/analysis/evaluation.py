@@ -94,10 +94,7 @@ class Evaluation(NamedTuple):
 def evaluate(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Evaluation:
-    """Simulate a flight with all first derivatives. `initial_state` defaults to the measured one.
-
-    **Raises:** `ValueError` for wrong shapes.
-    """
+    """Simulate a flight with all first derivatives; `initial_state`: by default as measured. Raises `ValueError`."""
     for name, value, length in (
         ("parameters", parameters, len(problem.model.parameter_names)),
         ("initial_state", initial_state, problem.windows * problem.size),
@@ -193,8 +190,7 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
 def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
     """The covariance for stationary noise: R(t, s) depends on t - s only. The first axis of all arrays is time.
 
-    Residuals are taken as correlated over lags up to a tenth of the flight. Bartlett's weights make the sum over lags
-    positive. Sums over lags are products of spectra.
+    Lags reach to a tenth of the flight, with Bartlett's weights. Sums over lags are products of spectra.
     """
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
@@ -215,8 +211,7 @@ def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> 
 def _window_by_window(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
     """The covariance for many windows: the residuals of the windows are draws of one random vector.
 
-    The initial state of a window absorbs some slow noise, more at its ends than in its middle, so residuals are not
-    stationary. The covariance of the vector, and of the vector with its successor, is the mean over the windows.
+    Residuals are not stationary: the initial state of a window absorbs slow noise, more at its ends.
     """
 
     def contribution(apart: int) -> Spread:
@@ -232,10 +227,7 @@ def _window_by_window(errors: np.ndarray, measured: np.ndarray, moves: np.ndarra
 
 
 def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
-    """The inverse of symmetric positive semidefinite matrices, whatever the units of their rows.
-
-    A direction without information gets a variance that is huge, but neither infinite nor negative.
-    """
+    """The inverse of symmetric positive semidefinite matrices in any units; huge, but finite, without information."""
     scale, values, vectors = unit_eigen(information)
     inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return inverse / scale[..., :, None] / scale[..., None, :]
@@ -244,10 +236,7 @@ def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "
 def unit_eigen(
     matrix: Float[np.ndarray, "*batch n n"],
 ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n n"]]:
-    """The scale that makes the diagonal 1, and the eigenvalues and eigenvectors of the scaled matrix.
-
-    An eigenvalue below the rounding errors counts as large as these.
-    """
+    """The scale that makes the diagonal 1, and the eigenvalues, at least the rounding errors, and eigenvectors then."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where((diagonal > 0) & np.isfinite(diagonal), diagonal, 1.0))
     unit = matrix / scale[..., :, None] / scale[..., None, :]

@@ -55,10 +55,7 @@ def _jaxos4(
 
 
 def main() -> None:
-    """Runs the command line.
-
-    Exit code 0: done, 1: the computation failed, 2: unusable arguments or input, 130: interrupted.
-    """
+    """Runs the command line. Exit code 0: done, 1: failed, 2: unusable arguments or input, 130: interrupted."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may hold what no encoding can print

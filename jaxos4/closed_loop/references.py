@@ -1,7 +1,4 @@
-"""References for a controller: random steps, or the shapes of the standard excitations.
-
-They are roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample.
-"""
+"""References for a controller in each sample: angles of roll, pitch and yaw [rad], vertical acceleration [m/s^2]."""
 
 import functools
 import math
@@ -47,10 +44,7 @@ def random_references(
 
 @functools.partial(jax.jit, static_argnums=2)
 def _levels(key: Key, steps: Int[Array, "samples 4"], count: int, amplitude: References) -> References:
-    """The level of each reference in each of its steps, of which there are at most `count`.
-
-    Every second acceleration is the one before it with the opposite sign.
-    """
+    """Random levels in each step of the references. A second acceleration is the one before it with the other sign."""
     levels = jax.random.uniform(key, (count, 4), minval=-1, maxval=1)
     step = np.arange(count)
     levels = levels.at[:, 3].set(levels[step - step % 2, 3] * (1 - 2 * (step % 2)))

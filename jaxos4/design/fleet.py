@@ -65,8 +65,7 @@ def fly_batch(
 ) -> Flight:
     """Fly a batch. Velocity and position are integrals of measured attitude and specific force.
 
-    `substeps`: of the physics in a sample, twice as many as `fly_closed_loop` takes by default. How the sensors are
-    mounted changes no design: they measure along the body's axes.
+    `substeps`: of the physics in a sample. Sensors measure along the body's axes: no design depends on this.
     """
 
     def one(loop: ClosedLoop, references: References, key: Key) -> Flight:
@@ -161,10 +160,9 @@ class Fleet(eqx.Module):
     def informations(
         self, flights: Flight
     ) -> tuple[Float[Array, "flights n n"], Float[Array, "flights channels parameters parameters"]]:
-        """The Fisher information of each flight's innovations. All that the design knows of filter error is here.
+        """The Fisher information of each flight's innovations: all that the design knows of filter error.
 
-        **Returns:** the information about the parameters and then the noise of each channel, with its weak prior; and
-        that of each channel about the parameters. A controller answers gusts, so the errors of both are correlated.
+        **Returns:** that about parameters and noise, with its weak prior; that of each channel about the parameters.
         """
         loop, count = self.loop, self.parameters.shape[0]
         strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), self.least_gust)

@@ -34,10 +34,7 @@ class Tones(NamedTuple):
 
     @classmethod
     def up_to(cls, bandwidth: float, samples: int, dt: float) -> "Tones":
-        """As many as fit into a batch, up to a bandwidth [Hz]: the references of a long flight repeat.
-
-        At least eight flights of the batch hover in gusts instead.
-        """
+        """As many as fit into a batch beside eight hovering flights, up to a bandwidth [Hz]; the references repeat."""
         most = (LANES - 1 - 8) // 2
         period = (samples - 1) // max(math.ceil(samples * dt * bandwidth / most), 1)
         return cls(period, max(min(math.floor(bandwidth * period * dt + 1e-9), most), 1))

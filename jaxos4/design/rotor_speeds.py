@@ -191,10 +191,7 @@ class RotorSpeedTask(task.AbstractTask):
         return jax.lax.scan(add, jnp.zeros((slopes.shape[-1],) * 2, dtype=float), slopes)[1]
 
     def _sense(self, omega: RotorSpeeds, parameters: Parameters) -> Float[Array, "samples sensors unknowns"]:
-        """The derivatives of the weighted outputs of a flight from rest, by forward Euler; fast in reverse mode.
-
-        The unknowns are the parameters and, if the start is not known, the initial state of the measured channels.
-        """
+        """The derivatives of the weighted outputs of a flight from rest, in the parameters and an unknown start."""
         count, sensors = parameters.shape[0], self.weights.shape[0]
         unknowns = count + (0 if self.start_is_known else sensors)
         identity, scalars = np.eye(unknowns), tuple(parameters)

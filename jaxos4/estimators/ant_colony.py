@@ -149,8 +149,7 @@ class AntColony(AbstractSolver[Colony]):
 def _directions(differences: Points, key: Key) -> Float[Array, "unknowns unknowns"]:
     """An orthonormal basis, one direction in each row, drawn from the differences of the archive from a point.
 
-    Each direction is a difference, less its part along the directions before it (Gram-Schmidt). A remaining difference
-    of length d is drawn with a probability in proportion to d^4. If none remains, the other directions are 0.
+    Gram-Schmidt: a remaining difference of length d is drawn with a probability in proportion to d^4; without any: 0.
     """
     rounding = ROUNDING * jnp.finfo(differences.dtype).eps
     floor = jnp.square(rounding) * jnp.square(differences).sum(axis=1).max()

@@ -68,10 +68,9 @@ class Regression(NamedTuple):
         return self.problem.sigma[RATES]
 
     def rows(self) -> tuple[RegressionRows, Callable[[RegressionRows], Float[Array, "samples 3"]]]:
-        """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
+        """Regressors, then the output: a row of unit noise for p, q and r at every sample, 0 for a missing one.
 
-        Missing samples get rows of zeros. The function turns the slope of a number in the rows into its slope in the
-        measured rates.
+        The function turns the slope of a number in the rows into its slope in the measured rates.
         """
         rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
         return rows, lambda slope: back(slope)[0]
@@ -264,8 +263,7 @@ class EquationError(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
-        linear in those that are not fixed. Inside `jit`, where it is not known which are fixed, all must be linear.
+        **Raises:** `ValueError` for a wrong bracket, or a model that is not linear in its free parameters.
         """
         mask, parameters = problem.unknowns.free, problem.model.parameters
         free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
@@ -285,10 +283,7 @@ class EquationError(AbstractEstimator):
 
     @eqx.filter_jit
     def solution(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Parameters:
-        """The least-squares solution alone, without its covariance and without a simulation.
-
-        Parameters in which the rate equations are not linear stay at the center of their bracket.
-        """
+        """The least-squares solution alone. Parameters in which the equations are not linear stay at their center."""
         data = Regression.of(problem.within(bracket), self)
         return data.center + data.half_width * solve(*normal_equations(data.rows()[0]))[0]
 

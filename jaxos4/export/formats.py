@@ -1,8 +1,4 @@
-"""From a result to the texts of files for a simulator.
-
-A new simulator has a template in this folder, and a line in `TARGETS`. The notes in a template say what the simulator
-does not have.
-"""
+"""From a result to the texts of files for a simulator: each has a template in this folder and a line in `TARGETS`."""
 
 import functools
 import math
@@ -45,11 +41,7 @@ _ASSUMED = Assumed()
 
 
 class Target(NamedTuple):
-    """A simulator's format.
-
-    - `label`: the name of the format. `suffix`: the suffix of its files.
-    - `values`: what its template needs besides the vehicle.
-    """
+    """A simulator's format: its name, the suffix of its files, and what its template needs besides the vehicle."""
 
     label: str
     suffix: str

@@ -148,10 +148,7 @@ class FlightPrediction(NamedTuple):
         return xr.Dataset(variables, coords=coordinates, attrs=about | {"notes": "\n".join(self.notes)})
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write netCDF (`.nc`) or CSV (`.csv`), one row for each start and horizon; completely or not at all.
-
-        **Raises:** `InputError` for another suffix; `OSError` if the file cannot be written.
-        """
+        """Write netCDF (`.nc`) or CSV (`.csv`), a row for each start and horizon. Raises `InputError` or `OSError`."""
         check_suffix(path, ".nc", ".csv")
         if Path(path).suffix == ".nc":
             write_netcdf(path, self.to_dataset(), 1)

@@ -114,8 +114,7 @@ def regressed(
 ) -> Float[np.ndarray, "starts steps 13"] | None:
     """The states by a regression, one step after another; `None` if the flight `trained` measured too little.
 
-    Changes of the rates, and the specific force, are linear in rates, velocity and squared rotor speeds. If no velocity
-    was measured, it stays constant.
+    It is linear in rates, velocity and squared rotor speeds. A velocity that was not measured stays constant.
     """
     moves = trained.has("velocity")
     features, targets = _features(trained.states, trained.omega, moves), trained.accelerations(gravity)

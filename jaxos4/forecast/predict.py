@@ -175,8 +175,7 @@ def _fly(
 ]:
     """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures.
 
-    A position that was not measured is 0. If no velocity is measured, it is that of dead reckoning, and the specific
-    force has no offset.
+    A position that was not measured is 0, a velocity that of dead reckoning, without an offset of the force.
     """
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, problem.flight.dt
     draws, chunk = tuning.draws, tuning.chunk

@@ -51,10 +51,7 @@ class Vehicle(NamedTuple):
 
 
 def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
-    """The vehicle of an identification, or of the file that `jaxos4 estimate --out` wrote.
-
-    **Raises:** `InputError`, one line, if the result has no vehicle or no estimate; `OSError` if it cannot be read.
-    """
+    """The vehicle of an identification or a file of `jaxos4 estimate --out`. Raises `InputError` or `OSError`."""
     file = vehicle_result(found)
     given = isinstance(found, Identification)
     name = f"{file.estimator}, {file.model} model" if given else printable(Path(found).name)

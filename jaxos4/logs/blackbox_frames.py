@@ -108,10 +108,7 @@ def _whole(text: str | None, default: int) -> int:
 
 
 class Numbers:
-    """Reads numbers from `data`: few bits for small ones. `at`: the number of bytes read.
-
-    Raises `IndexError` at the end of the data.
-    """
+    """Reads numbers from `data`; `at`: the number of bytes read. Raises `IndexError` at the end of the data."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
@@ -210,10 +207,7 @@ class _Stream:
         self.steps: dict[int, int] = {}
 
     def frames(self) -> Iterator[list[int]]:
-        """The values of each main frame that can be trusted.
-
-        Frames are trusted when the next complete one follows the last of them: else one was lost among them.
-        """
+        """The values of each main frame that can be trusted: no frame was lost before the next complete one."""
         data, size = self.data, len(self.data)
         run: list[list[int]] = []  # a complete frame, and the differences after it
         intact = False  # no difference can be trusted before the first complete frame

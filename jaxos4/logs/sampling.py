@@ -33,7 +33,7 @@ class Series(NamedTuple):
 
 
 def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Columns]:
-    """The integral of each column from the first sample, as a function of the time. Before the first sample it is 0.
+    """The integral of each column from the first sample, as a function of the time; 0 before the first sample.
 
     A value is held until the next one, and the last one for ever. If `linear`, values are interpolated instead.
     """
@@ -127,12 +127,10 @@ def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Calla
 def at_rows(rows: RowPositions, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
     """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
 
-    Values are interpolated linearly to the time of the row, but not across a gap: between neighbours more than 1.5
-    steps of the sensor apart. A sensor that is faster than the rows is averaged over the time from half a step before
-    the row to half a step after it. Angles must be unwrapped.
+    Values are interpolated linearly, but not across a gap: between neighbours more than 1.5 steps of the sensor apart.
+    A sensor that is faster than the rows is averaged over a step around the row. Angles must be unwrapped.
 
-    `step`: the rows are a uniform grid of this step [s]. Every row between neighbours within 1.5 steps then gets a
-    value, and nothing is averaged.
+    `step`: of a uniform grid [s]: all rows between neighbours within 1.5 steps get a value, and nothing is averaged.
     """
     own = step or median_step(rows)
     out = np.full((rows.size, series.values.shape[1]), np.nan)
@@ -173,9 +171,8 @@ def resample(t: Times, omega: Rotors, channels: Columns, dt: float, *, held: boo
     """Bring rows at uneven times [s] to the grid t_0, t_0 + dt, ...
 
     `omega` is `held` until the next row, or interpolated (`root_mean_square`); `channels` are interpolated linearly
-    (`at_rows`), with an error of second order in dt. A gap is NaN, except for samples within 1 % of dt of a time of the
-    grid. If all rows are within 1 % of a step of a uniform grid, their values stay, and so do times that are off by
-    rounding only.
+    (`at_rows`). A gap is NaN, except for samples within 1 % of dt of a time of the grid. If all rows are within 1 % of
+    a step of a uniform grid, their values stay, and so do times that are off by rounding only.
 
     **Returns:** time, rotor speeds, channels, and a note with the figures of the resampling, if there was any.
     """
@@ -230,10 +227,7 @@ def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"
 
 
 def logged_rate(t: Times, *, pause: float = 0.9) -> float:
-    """How often samples at the times `t` [s] were written [Hz]. For half of the time, samples come at least this often.
-
-    A burst is no high rate. A longer time than `pause` [s] does not count, unless there is nothing else.
-    """
+    """How often samples at the times `t` [s] were written [Hz], for half of the time at least; without any `pause` [s]."""
     steps = np.diff(t)
     steps = np.sort(steps[(steps > 0) & (steps <= pause)] if (steps <= pause).any() else steps)
     total = np.cumsum(steps)
@@ -243,10 +237,7 @@ def logged_rate(t: Times, *, pause: float = 0.9) -> float:
 
 
 def held_regularly(t: Times, *, fewest: int = 20, regular: float = 0.6) -> bool:
-    """Whether values that change at the times `t` [s] were written at a fixed rate and held in between.
-
-    That is so for at least the `fewest` steps, most of which are equal up to the share `regular`.
-    """
+    """Whether values that change at the times `t` [s] were written at a fixed rate: `fewest` steps, nearly equal."""
     steps = np.diff(t)
     if steps.size < fewest:
         return False

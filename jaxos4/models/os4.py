@@ -20,10 +20,7 @@ from .state import Attitude, Forcing, Rates, State, Translation, attitude_rates,
 
 
 class AbstractOS4(AbstractModel):
-    """The common part of the two OS4 models: their parameters are alpha_1..8, and their sensors show the states.
-
-    `gyroscopic_unit`: the unit of alpha2 and alpha5.
-    """
+    """The common part of the OS4 models, of alpha_1..8. `gyroscopic_unit`: the unit of alpha2 and alpha5."""
 
     gyroscopic_unit: ClassVar[str]
 

@@ -177,10 +177,7 @@ class Motor(NamedTuple):
         return 2 * command / jnp.maximum(self.curve + root, self.least)
 
     def step(self, omega: Speed, command: Speed, dt: Scalar, steps: int = 2) -> Speed:
-        """The speed after a time `dt` [s], by so many exponential Euler steps.
-
-        They are exact for a first-order system, stable for any `dt`, and of second order.
-        """
+        """The speed after `dt` [s], by stable exponential Euler steps of second order, exact for a first-order system."""
         w, u, lag = omega / self.full, command / self.full, jnp.maximum(self.lag, self.shortest_lag * dt)
         for _ in range(steps):
             x, load = u - self.curve * w, (1 - self.curve) * w

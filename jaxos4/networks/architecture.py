@@ -41,10 +41,9 @@ class Scaling(eqx.Module):
 
 
 class GatedPerceptron(eqx.Module):
-    """A multilayer perceptron whose last hidden layer multiplies a linear map of the inputs.
+    """A multilayer perceptron whose last hidden layer multiplies a linear map of the inputs (GLU; Dauphin et al. 2017).
 
-    The output is a linear map of the inputs with coefficients that depend on the inputs. Parameters act on a flight in
-    products, so that such a map needs fewer neurons than a perceptron (GLU; Dauphin et al. 2017).
+    Parameters act on a flight in products, so that such a map needs fewer neurons than a perceptron.
     """
 
     hidden: eqx.nn.MLP
@@ -168,10 +167,7 @@ def first_regressor(
 
 
 def compress(x: Float[Array, "*batch features"], linear: float = 4.0) -> Float[Array, "*batch features"]:
-    """Features as the network takes them: linear up to the size `linear`, logarithmic beyond.
-
-    Flights that nearly diverge have huge features.
-    """
+    """Features as the network takes them: linear up to the size `linear`, logarithmic beyond, as some are huge."""
     size = jnp.abs(x)
     return jnp.where(size < linear, x, jnp.sign(x) * (linear + jnp.log1p(jnp.maximum(size - linear, 0))))
 
@@ -219,8 +215,5 @@ class ErrorTable(NamedTuple):
 
 
 def calibrated_scales(noise: tuple[float, float], count: int = 9) -> Float[Array, " scales"]:
-    """The noise scales at which a network is calibrated, from the lowest to the highest of its training.
-
-    There are `count`, evenly spaced in the logarithm; one if the lowest is the highest.
-    """
+    """The `count` noise scales of a calibration, evenly spaced in the logarithm; one if the lowest is the highest."""
     return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else count))

@@ -1,7 +1,4 @@
-"""The paper's neural network (ANN): settings, training, and the trained network as an estimator.
-
-The paper does not describe its network; architecture, features and training are our choice.
-"""
+"""The paper's neural network (ANN): settings, training, and estimator. The paper does not describe it."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar

@@ -151,10 +151,9 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
 
 
 def _hover(flown: Sequence[Recording]) -> tuple[float, bool] | None:
-    """The rotor speed at which thrust is as large as the weight, in the unit of the flight, and whether it was felt.
+    """The rotor speed that carries the weight, in the unit of the flight, and whether an accelerometer felt it.
 
-    It is felt by an accelerometer with a median of half to twice gravity in flight. If there is none, the median thrust
-    in flight counts as the weight.
+    Without one, or if its median is not half to twice gravity, the median thrust in flight counts as the weight.
     """
     if not flown:
         return None

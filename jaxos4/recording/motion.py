@@ -1,7 +1,4 @@
-"""The motion of a vehicle: how much each axis is excited, whether it follows the rotors, and its velocity.
-
-The signs of the answer to the rotors also show where the rotors of an X are, and how they turn.
-"""
+"""The motion of a vehicle: how much each axis is excited, whether and how it follows the rotors, its velocity."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -296,10 +293,7 @@ def _dead_reckoned(
     dt: float,
     forgets: float,
 ) -> Float[np.ndarray, "samples 3"]:
-    """The velocity; each sample uses measurements until then, and the accelerometer's mean error.
-
-    Plain numbers: in a loop of few operations they are ten times faster than arrays.
-    """
+    """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays."""
     push = force - GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
     kept, (vx, vy, vz), velocities = math.exp(-dt / forgets), (0.0, 0.0, 0.0), []
@@ -316,10 +310,7 @@ def _dead_reckoned(
 def _upright(
     rates: Float[np.ndarray, "samples 3"], force: Float[np.ndarray, "samples 3"], dt: float, level: float
 ) -> Float[np.ndarray, "samples 3"]:
-    """The upright direction: fixed in the earth, so it turns against the body; slowly drawn to the specific force.
-
-    `level`: the time constant of this [s].
-    """
+    """The upright direction: fixed in the earth, and drawn to the specific force with the time constant `level` [s]."""
     x, y, z, turn, directions = 0.0, 0.0, 1.0, dt / level, []
     drawn = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-3)
     for (p, q, r), (ax, ay, az) in zip(rates.tolist(), drawn.tolist(), strict=True):

@@ -79,8 +79,7 @@ def without_noise(
 ) -> tuple[list[Recording], float, float]:
     """The stretches of one recording with the expected rotor speeds. Commands have no noise.
 
-    **Returns:** also the standard deviation of the noise [rad/s], and the share of its power in the changes from sample
-    to sample.
+    **Returns:** also the noise's standard deviation [rad/s], and its share of the power of changes between samples.
     """
     if any(each.commanded for each in stretches):
         return list(stretches), 0.0, 0.0

@@ -198,10 +198,7 @@ def at_limit(recording: Recording, airframe: Airframe, rules: Preparation = RULE
 def _usable(
     evidence: Evidence, begin: float | None, end: float | None, slow: str, *, predicted: bool
 ) -> tuple[list[Recording], list[str]]:
-    """The usable stretches, or what `begin` and `end` ask for; and notes about the stretches that are not used.
-
-    `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
-    """
+    """The usable stretches, or those from `begin` to `end`; notes on the others. `slow`: why the log is too slow."""
     recording = evidence.plausible.recording
     name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
     if begin is not None or end is not None:

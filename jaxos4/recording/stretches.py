@@ -27,10 +27,7 @@ Samples = Bool[np.ndarray, " samples"]
 
 
 class Stretch(NamedTuple):
-    """A stretch of a flight, from the sample at `begin` to the sample at `end` [s].
-
-    `reason`: why it is not usable; empty if it is.
-    """
+    """A stretch of a flight from the sample at `begin` to that at `end` [s]. `reason`: why it is not usable, or ""."""
 
     begin: float
     end: float
@@ -147,10 +144,7 @@ def nothing_usable(every: Sequence[Stretch]) -> str:
 
 
 def cut(flight: Recording, stretch: Stretch) -> Recording:
-    """The samples of a flight from `stretch.begin` to `stretch.end`; their time stays as recorded.
-
-    **Raises:** `InputError` if there are fewer than two samples.
-    """
+    """The samples from `stretch.begin` to `stretch.end`; times stay. Raises `InputError` for fewer than two."""
     time, half = flight.time, flight.dt / 2
     inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
     if inside.size < 2:

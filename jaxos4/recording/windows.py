@@ -68,10 +68,7 @@ def whole_windows(recording: Recording, length: int) -> Recording:
 
 
 def joined(stretches: Sequence[Recording]) -> Recording:
-    """Stretches of recordings one after the other; time becomes a count of samples from 0.
-
-    **Raises:** `ValueError` if the sample times differ.
-    """
+    """Stretches one after the other; time counts samples from 0. Raises `ValueError` if the sample times differ."""
     steps = [stretch.dt for stretch in stretches]
     if np.ptp(steps) > _SAME * steps[0]:
         raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")

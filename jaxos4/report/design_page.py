@@ -73,8 +73,7 @@ def _lengths(found: Design, accuracy: float) -> str:
 def write_design(found: Design, accuracy: float, out: Path) -> None:
     """Write the figure as SVG: above what to fly, below the bound of each target against the time of flight.
 
-    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds). The inputs are drawn
-    for two periods. Bounds that fall with the root of the duration are drawn up to ten times the flight.
+    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds).
     """
     from .style import INK, drawing, grid, label, log_axis, styles, svg  # a second that the table does not need
 

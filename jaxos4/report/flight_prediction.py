@@ -38,10 +38,9 @@ def print_prediction(console: Console, found: FlightPrediction) -> None:
 
 
 def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction, *, most: float = 10.0) -> None:
-    """Writes a figure as SVG. Raises `OSError` if it cannot be written.
+    """Writes measured lines, and predictions with their band from starts one horizon apart, as SVG. Raises `OSError`.
 
-    It shows measured lines, and predictions with their band from starts that are one horizon apart; `most`: the
-    longest time that it shows [s], but two horizons at least.
+    `most`: the longest time that it shows [s], but two horizons at least.
     """
     from .style import BOUND_DASHES, INK, drawing, grid, style, svg  # a second that the table does not need
 

@@ -124,10 +124,9 @@ def correlations(found: Identification) -> Float[np.ndarray, "parameters paramet
 
 
 def correlation_matrix(found: Identification, *, least: float = 0.05, most: int = 400) -> Markup:
-    """The correlations of the parameters as an SVG: a square for each pair, as large as the correlation.
+    """The correlations of the parameters as an SVG: a square for each pair, hollow if negative.
 
-    Filled: positive; hollow: negative. Correlations below `least` are left out; if there are more than `most`, the
-    smallest too.
+    Those below `least` are left out; if there are more than `most`, the smallest too.
     """
     names, cell, matrix = list(found.parameters), 18, correlations(found)
     room = 10 + 7 * max(map(len, names))

@@ -88,10 +88,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
 
 
 def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
-    """The cells of each physical quantity, and a note: what must be right, and what is wrong.
-
-    A moment of inertia that was not identified is in the table too.
-    """
+    """The cells of each quantity, and of each moment of inertia even if it was not identified; and a note on each."""
     every, rows = physical_quantities(found), []
     for row, cells, note in zip(every, *quantity_rows(every), strict=True):
         own = found.parameters.get(row.name.replace(" ", "_"))
@@ -180,10 +177,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
 
 
 def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
-    """Gain, phase and coherence of roll, pitch and yaw, with 95 % bands; dashed: the model.
-
-    A frequency without a clear response is drawn faintly.
-    """
+    """Gain, phase and coherence of each axis with 95 % bands, faint where they are not clear; dashed: the model."""
     figure, panels = grid(9, columns=3, height=1.9)
     top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
     for row, (name, axis) in enumerate(found._asdict().items()):
@@ -208,10 +202,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
 
 
 def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: Style) -> Figure:
-    """Ix, Iy and Iz at each sample time with 95 % intervals. Lines: the chosen one, and its moments of inertia.
-
-    **Arguments:** `chosen`: the sample time of the estimate [s].
-    """
+    """Ix, Iy, Iz at each sample time with 95 % intervals. Lines: the `chosen` one [s], and its moments of inertia."""
     figure, panels = grid(3, columns=3, height=2.4)
     ticks = [1e3 * each.sample_time for each in answers]
     for panel, name in zip(panels, INERTIAS, strict=True):

@@ -49,10 +49,7 @@ def draw_response(
 
 
 class Plots(NamedTuple):
-    """Figures of an identification. Each method draws on `ax`, by default on a new one, and returns it.
-
-    **Raises:** `InputError` if the result does not hold what a figure shows.
-    """
+    """Figures of an identification. Each method draws on `ax`, or a new one, and returns it, or raises `InputError`."""
 
     found: Identification
 

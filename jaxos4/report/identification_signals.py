@@ -24,10 +24,7 @@ Times = Float[np.ndarray, " samples"]
 
 
 def identified_signals(found: Identification, look: Style) -> str:
-    """What the page of a result draws over time, as JSON; empty if it has no signals.
-
-    A vehicle has a view for each horizon of its predictions, an OS4 one for each group of channels.
-    """
+    """The signals of a result's page as JSON, or "": views by horizon (vehicle), or by group of channels (OS4)."""
     traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
     if traces is None:
         return ""

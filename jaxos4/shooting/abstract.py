@@ -79,20 +79,14 @@ class Unknowns(eqx.Module):
         return len(self.names)
 
     def within(self, bracket: Bracket) -> "Unknowns":
-        """The same unknowns, looked for in another bracket. A fixed unknown keeps its value.
-
-        **Raises:** `ValueError` for a bracket of another length.
-        """
+        """The unknowns in another bracket; a fixed one keeps its value. Raises `ValueError` for another length."""
         if bracket.lower.shape != (self.count,):
             raise ValueError(f"`bracket` must hold {self.count} parameters, got {bracket.lower.shape[0]}.")
         center = bracket.center if _all(self.free) else jnp.where(self.free, bracket.center, self.center)
         return dataclasses.replace(self, center=center, half_width=bracket.half_width)
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
-        """The same unknowns, some of them fixed at known values.
-
-        **Raises:** `ValueError` for a name that is no unknown, or if no unknown remains free.
-        """
+        """The same unknowns, some fixed at known values. Raises `ValueError` for a strange name, or if none is free."""
         strangers = [name for name in values if name not in self.names]
         if strangers:
             raise ValueError(f"`values`: {strangers[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
@@ -111,10 +105,7 @@ class Unknowns(eqx.Module):
 
     @property
     def usable(self) -> "Unknowns":
-        """The unknowns themselves if they are valid; otherwise 0 +- 1, so that a batch stays finite.
-
-        The half-width of a fixed unknown is 1 if it was 0.
-        """
+        """The unknowns if they are valid, else 0 +- 1, so that a batch stays finite. No half-width is 0, but 1."""
         center = jnp.where(self.valid, self.center, 0.0)
         half_width = jnp.where(self.valid & (self.half_width > 0), self.half_width, 1.0)
         return dataclasses.replace(self, center=center, half_width=half_width)
@@ -135,10 +126,7 @@ class Unknowns(eqx.Module):
         return jnp.maximum(lower, self.lowest), jnp.minimum(upper, self.highest)
 
     def identifiable(self, std: Float[Array, " unknowns"], prior: float | None = None) -> Bool[Array, " unknowns"]:
-        """Whether each unknown is identifiable, see `jaxos4.bracket.is_identifiable`; fixed ones count as known.
-
-        `prior`: how an estimator used the bracket; by default as the cost does.
-        """
+        """Whether each is identifiable, or fixed. `prior`: how an estimator used the bracket; by default as the cost does."""
         return jnp.asarray(is_identifiable(std, self.half_width, self.prior if prior is None else prior)) | ~self.free
 
 
@@ -326,8 +314,7 @@ class AbstractProblem(eqx.Module):
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The likelihood in stages.
 
-        `shares`: before the whole, a likelihood that simulates fits the body rates to these shares of the flight, one
-        after the other. By default it is fitted as a whole.
+        `shares`: of the flight, to which a likelihood that simulates fits the body rates first, one after the other.
         """
 
     def hold(self: Problem, values: Mapping[str, Float[ArrayLike, ""]]) -> Problem:

@@ -33,10 +33,7 @@ _NODES = 8
 
 
 class Window(NamedTuple):
-    """The part of a sample over which a measurement is averaged [s].
-
-    `begin`: after the beginning of the sample. `length`: 0 for an instant.
-    """
+    """The part of a sample over which a measurement is averaged, from `begin` in it on [s]; `length` 0: an instant."""
 
     begin: Scalar | float = 0.0
     length: Scalar | float = 0.0

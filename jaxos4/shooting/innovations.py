@@ -204,10 +204,7 @@ class InnovationsProblem(AbstractProblem):
         return lambda unknowns: at(unknowns, passed)
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
-        """The whole problem: filters follow the measurements, so that errors do not grow with time.
-
-        What feedthroughs explain is counted as noise in a second stage, by the feedthroughs that were found before.
-        """
+        """The whole problem; in a second stage, what feedthroughs that were found before explain counts as noise."""
         del shares
         number, at = 2 if self.passed.size else 1, self._local_model()
         is_known = ~jnp.isnan(self.passed).any()

@@ -40,10 +40,7 @@ class NoiseUnknowns(NamedTuple):
         dt: Scalar,
         least_noise: Float[Array, " channels"],
     ) -> Unknowns:
-        """The parameters, and then the noise and the feedthroughs of each channel.
-
-        The brackets of the noise follow from differences of measurements. `least_noise`: see `InnovationsProblem`.
-        """
+        """The parameters, then noise and feedthroughs of each channel, in brackets from differences of measurements."""
         first = jnp.stack(first_noise(measured, dt, self.times[0]), axis=1)
         lowest, highest = first - np.log(self.reach), first + np.log(self.reach)
         shortest = jnp.where(is_rate(first.shape[0]), jnp.log(self.shortest * dt), np.log(self.shortest_of_force))

@@ -204,10 +204,7 @@ class ShootingProblem(AbstractProblem):
         return jnp.concatenate([repeated, self.split(initial_state)[:, : self.free_size]], axis=1)
 
     def first_state(self) -> tuple[InitialStates, InitialStates]:
-        """The initial state at which a search starts, and how far off it may be.
-
-        It is the known state, or the first measurement of each channel in each window, or 0 if there is none.
-        """
+        """The known state, or each window's first measurement of each channel, or 0; and how far off it may be."""
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
@@ -220,8 +217,7 @@ class ShootingProblem(AbstractProblem):
     def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
 
-        Infinite, with an undefined derivative, if the trajectory diverges or reaches theta = +-90 degrees.
-        `initial_state` defaults to `first_state`.
+        Infinite if the trajectory diverges or reaches theta = +-90 degrees. `initial_state`: or `first_state`.
         """
         start = self.first_state()[0] if initial_state is None else initial_state
         cost, feasible = self.shots(parameters, start)

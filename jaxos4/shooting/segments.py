@@ -1,8 +1,4 @@
-"""A flight cut into segments, in which Kalman filters run in parallel.
-
-A filter that starts in the middle of a flight does not know the disturbance, and the controller does: the first samples
-of a segment settle the filter.
-"""
+"""A flight cut into segments, in which Kalman filters run in parallel: each has to settle before it counts."""
 
 from typing import NamedTuple
 

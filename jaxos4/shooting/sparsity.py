@@ -20,10 +20,7 @@ Panel = tuple[int, int, tuple[int, ...]]
 
 
 def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results arguments"]:
-    """Which leaves of a function's result depend on which leaves of its arguments, from the operations that it traces.
-
-    All results of an inner function count as dependent on all of its arguments.
-    """
+    """Which leaves of a result depend on which leaves of the arguments; all that an inner function gives, on all it takes."""
     program = jax.make_jaxpr(function)(*arguments).jaxpr
     nothing = np.zeros(len(program.invars), dtype=bool)
     known = dict(zip(program.invars, np.eye(nothing.size, dtype=bool), strict=True))

@@ -1,7 +1,6 @@
 """The plan of a search in stages: the body rates of a short part of the flight first, then more.
 
-Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, so the cost of a long
-flight has other minima, into one of which `CorrectedOS4` falls in a fifth of all cases: the first stages are short.
+Rates do not depend on the others. Errors grow with time, and so does the number of minima of the cost.
 """
 
 from typing import NamedTuple

@@ -131,10 +131,7 @@ def accuracy(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def accuracy_interval(dataset: xr.Dataset) -> xr.Dataset:
-    """`accuracy` by scale and estimator, with the Monte-Carlo interval of one parameter: a conservative one.
-
-    The mean of several parameters varies less, by how much their errors correlate.
-    """
+    """`accuracy` by scale and estimator, with the conservative Monte-Carlo interval of one parameter."""
     found, value = efficiency(dataset), accuracy(dataset)
     low, high = (value * (found[end] / found["efficiency"]).mean("parameter").fillna(1) for end in ("low", "high"))
     return xr.Dataset({"accuracy": value, "low": low, "high": high}).transpose("scale", "estimator")

@@ -1,8 +1,4 @@
-"""Runs a study from its specification to its Dataset: in this process, or on a Dask cluster.
-
-The results are the same bit for bit. Workers of a cluster need only this package. If a worker is lost, another worker
-repeats its tasks.
-"""
+"""Runs a study from its specification to its Dataset, here or on a Dask cluster: with the same results, bit for bit."""
 
 import functools
 import io
@@ -132,10 +128,7 @@ def _run(
 
 
 def train(study: Study, job: Scenario) -> bytes | str:
-    """The bytes of a network's file, or a message that says why there is none. It serves all noises and scales.
-
-    The numbers are the same bit for bit only on the same number of cores, which share the products of matrices.
-    """
+    """A network's file, which serves all noises and scales, or why there is none. Its bits depend on the cores."""
     scales = [scale or 1.0 for scale in study.scales]
     try:
         with jax.enable_x64(True):

@@ -188,10 +188,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         return as_float(speeds)
 
     def job(self, scenario: Scenario) -> Scenario | None:
-        """The scenario for which to train the network that an estimator needs; `None` if it needs none.
-
-        One network serves all methods, noises and scales. The `channels` are those that it looks at.
-        """
+        """The scenario of the network that an estimator needs, or `None`. It serves all methods, noises and scales."""
         kind = ESTIMATORS[scenario.estimator]
         channels = self.seed_channels(scenario) if kind.shoots else scenario.seen
         shared = {"method": self.fit_method, "noise": self.noises[0], "scale": 1.0, "estimator": "network"}
