@@ -39,13 +39,10 @@ _LARGEST = sys.float_info.max  # of a number: a longer integer has no float, and
 
 @contextlib.contextmanager
 def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yields a temporary path in the folder of `path`, and renames it to `path` when the block ends.
+    """Yields a temporary path beside `path`, with its suffix, and renames it to `path` when the block ends.
 
-    If the block raises, the temporary file is removed and an older `path` does not change. The temporary name keeps the
-    suffix. Links are followed, and the mode of an older file is kept. A pipe or a device cannot be replaced by a
-    rename: `path` itself is yielded.
-
-    **Raises:** `OSError` that names `path` if it is a folder, or its own folder does not exist.
+    If the block raises, an older `path` does not change. Links are followed, and the mode of an older file is kept. A
+    pipe or a device is yielded itself. Raises `OSError` that names `path`.
     """
     target = check_writable(path)
     if target.exists() and not target.is_file():

@@ -126,7 +126,7 @@ def _names(results: Sequence[Source], every: Sequence[Identification]) -> tuple[
 
 
 def _notes(names: Sequence[str], every: Sequence[Identification], *, same: float = 1e-3) -> list[str]:
-    """What makes the results hard to compare. `same`: constants of airframes that differ by less are equal."""
+    """Reasons why results are hard to compare. `same`: constants of airframes that differ by less are equal."""
     notes, first = [], every[0].airframe
     for constant, why in (("mass", "are proportional to it"), ("rotor_positions", "depend on them")):
         values = [np.asarray(getattr(each.airframe, constant), dtype=float) for each in every]

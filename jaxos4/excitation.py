@@ -1,8 +1,7 @@
 """Inputs that excite the parameters: rotor speeds that turn a hovering quadrotor about its axes.
 
-Each function designs angular accelerations. The torque is inertia x acceleration, the thrust is the weight, and Eqs.
-(10)-(13) are solved for the rotor speeds. The rates follow the design except for the gyroscopic coupling. The functions
-compute in NumPy's double precision and cannot be traced by JAX. The paper does not state its inputs.
+Angular accelerations are designed, and Eqs. (10)-(13) solved for the rotor speeds that make them, by NumPy. The paper
+does not state its inputs.
 """
 
 import math
@@ -83,11 +82,8 @@ def chirp(
 ) -> RotorSpeeds:
     """A sweep from 0.6 to 3 Hz about one axis after another, faded in and out. The axes share the duration equally.
 
-    As with `doublet`, alpha1, alpha4 and alpha7 are not excited.
-
-    **Arguments:** those of `multisine`. The yaw rate is half the others, because the yaw torque of rotors is small.
-
-    **Raises:** as `multisine`, and if an axis gets less than one cycle.
+    As with `doublet`, alpha1, alpha4 and alpha7 are not excited. Arguments and errors are those of `multisine`; an axis
+    needs one cycle. The yaw rate is half the others, because the yaw torque of rotors is small.
     """
     intervals = _intervals(duration, dt)
     ends = 0.6, 3.0  # [Hz]

@@ -46,13 +46,10 @@ _File = msgspec.defstruct(
 
 
 def read_result(path: str | os.PathLike[str]) -> Identification:
-    """Read a file that `jaxos4 estimate --out` wrote.
+    """Read a file of `jaxos4 estimate --out`: the result of `jaxos4.identify`, without `estimate` and `problem`.
 
-    The result is that of `jaxos4.identify`, without `estimate` and `problem`. Files of older versions lack
-    `predictions` and `response`.
-
-    **Raises:** `InputError`, one line, if the file is no result, also for texts, numbers and correlations that no
-    result has; `OSError` if it cannot be read.
+    **Raises:** `InputError`, one line, if it is none, also for texts, numbers and correlations that no result has;
+    `OSError`.
     """
     value = read_json(path, _REMEDY, _LARGEST)
     with named(path):

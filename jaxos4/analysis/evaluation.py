@@ -1,8 +1,7 @@
 """A flight simulated at the answer of a fit, with all first derivatives: what every check of a fit is computed from.
 
-The simulation is one compiled program. What follows from it is small, and NumPy computes it: bounds, identifiability,
-diagnostics and noise levels need no program of their own. The covariance of a fit is the Cramer-Rao bound. If residuals
-are coloured, or not as large as sigma says, it is the sandwich covariance.
+The simulation is one compiled program, and NumPy computes the rest. The covariance of a fit is the Cramer-Rao bound,
+or the sandwich covariance if residuals are coloured, or not as large as sigma says.
 """
 
 from typing import NamedTuple
@@ -145,9 +144,8 @@ def cramer_rao_bound(
 ) -> Covariance:
     """The smallest covariance that an unbiased estimate can have: the inverse of the Fisher information J^T W^2 J.
 
-    J is the Jacobian at `parameters`, W the weights 1 / sigma. A free initial state is unknown too. `initial_state` is
-    where J is computed, by default the measured one; it is ignored if the problem's initial state is known. A parameter
-    that is not excited has a huge variance, but not an infinite one.
+    J is the Jacobian at `parameters` and a free `initial_state`, by default as measured, W the weights 1 / sigma. A
+    parameter that is not excited has a huge variance, but not an infinite one.
     """
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     information = problem.local_model(problem.join(as_float(parameters), start)).information

@@ -172,5 +172,5 @@ def decisive_horizon(
     *,
     wanted: float = 0.25,
 ) -> int:
-    """The place of the `known` horizon nearest to `wanted` [s]: long enough to show a wrong model, too short for gusts."""
+    """The place of the `known` horizon nearest to `wanted` [s]: it shows a wrong model, and gusts do not decide it."""
     return int(np.argmin(np.where(known, np.abs(np.asarray(horizons) - wanted), np.inf)))

@@ -1,4 +1,4 @@
-"""What a result keeps of its flights, so that its page can be drawn again: signals over time."""
+"""Signals over time that a result keeps of its flights, so that its page can be drawn again."""
 
 from typing import NamedTuple
 

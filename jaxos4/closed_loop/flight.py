@@ -137,7 +137,7 @@ class _Drawn(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """What a run of the controller leaves to the next. Row k + 1 of `commands` is that of run k."""
+    """The state between two runs of the controller. Row k + 1 of `commands` is that of run k."""
 
     motion: BodyMotion
     speeds: Float[Array, "4"]

@@ -70,14 +70,10 @@ class AbstractSolver(AbstractEstimator, Generic[State]):
         *,
         start: Float[Array, " unknowns"] | None = None,
     ) -> Estimate:
-        """Identifies one flight.
-
-        **Arguments:**
+        """Identifies one flight. Raises `ValueError` for a bracket or a start of another length than the unknowns.
 
         - `problem`, `bracket`: see `AbstractEstimator`. The parameters may turn out to lie outside of the bracket.
         - `start`: where the search begins, unless it is NaN; by default the problem's `initial_guess`.
-
-        **Raises:** `ValueError` for a bracket or a start of another length than the unknowns.
         """
         return in_blocks(solve, self, problem.within(bracket), start)
 

@@ -20,12 +20,12 @@ _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. R
 
 
 class Assumed(NamedTuple):
-    """What simulators need and no flight shows.
+    """Constants that simulators need and no flight shows.
 
     - `lag`: for RotorPy and Gazebo, which need one: too short to notice [s].
-    - `radius`, `thickness`: of a drawn rotor, in arms.
+    - `radius`, `thickness`: of a drawn rotor, in arms. `rotor_mass`: of its link in Gazebo, as a share of the
+      vehicle's.
     - `shortest`: MuJoCo keeps enough past controls for the delay in scenes with time steps down to this [s].
-    - `rotor_mass`: of the link of a rotor in Gazebo, as a share of the vehicle's: links need a mass.
     - `slowdown`: links of rotors in Gazebo turn this many times slower than the rotors, for long time steps.
     """
 
@@ -51,11 +51,9 @@ class Target(NamedTuple):
 class Exported(NamedTuple):
     """Files for a simulator, as texts.
 
-    - `text`: the estimated vehicle.
-    - `samples`: vehicles drawn from the uncertainty of the estimate.
+    - `text`: the estimated vehicle. `samples`: vehicles drawn from its uncertainty.
     - `impossible`: the number of impossible draws, which were repeated.
-    - `notes`: the effects that the simulator does not have, or has differently; one line each. They stand in the file
-      too, and each sample has its own.
+    - `notes`: the effects that the simulator does not have, or has differently, as in each file; one line each.
     """
 
     text: str

@@ -32,12 +32,10 @@ _AXES = {"attitude": ("component", ["w", "x", "y", "z"]), "rates": ("rate", ["p"
 
 
 class Quality(NamedTuple):
-    """The mean absolute error of one quantity by horizon, in its unit, over all starts.
+    """The mean absolute error of one quantity by horizon, in its unit, over all starts. NaN: nothing was measured.
 
-    The error of a start is the length of the vector of the error, and of the attitude the geodesic angle. NaN: nothing
-    was measured.
-
-    - `error`: of the prediction. `unaware`: of the prediction that knows no disturbance at the start.
+    - `error`: the length of the error's vector, of the attitude the angle. `unaware`: without the disturbance at the
+      start.
     - `constant`: if velocity and body rates stay constant. `regression`: of the regression; NaN if there is none.
     - `coverage`: the share of measured components inside the 95 % band.
     """

@@ -55,7 +55,7 @@ class Motion(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What is known at each sample, or at one.
+    """The knowledge at each sample, or at one.
 
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: of the filters [rad/s], [rad/s^2; m/s^2].

@@ -1,11 +1,9 @@
 """The frames of a blackbox session: numbers of few bits, most of them as differences from a prediction.
 
-A frame begins with a letter: "I" (complete), "P" (differences from the frames before), "S", "G", "H" (slow values, GPS,
-home) or "E" (an event). The settings give the fields of each kind with their encodings and predictors. If a frame is
-damaged, all differences after it are wrong up to the next complete frame: they are left out.
+A frame begins with a letter: "I" (complete), "P" (differences), "S", "G", "H" (slow values, GPS, home) or "E" (event).
+The settings give the fields of each kind. After a damaged frame, all are left out up to the next complete one.
 
-Reference: the description of the format by Nicholas Sherlock ("Blackbox internals", Cleanflight), and the sources of
-Betaflight and INAV for the encodings that came later.
+Reference: Nicholas Sherlock, "Blackbox internals", Cleanflight; later encodings: sources of Betaflight and INAV.
 """
 
 import array

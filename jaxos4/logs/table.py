@@ -137,12 +137,10 @@ _ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocit
 class Recording(NamedTuple):
     """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
 
-    The arrays, `commanded`, `held` and `averaging_time` are as in `Flight`, in SI units. A recording is cleaned, cut
-    and joined as it is, and becomes a `Flight` once, at the end.
+    Fields are as in `Flight`, in SI units. A recording is cleaned, cut and joined, and becomes a `Flight` at the end.
 
     - `name`: in messages and in the provenance. Usually the path of the file.
-    - `notes`: what the reader changed in the data, one line each.
-    - `facts`: what the log says beside the flight, such as how often motors and gyro were written.
+    - `notes`: what the reader changed in the data, one line each. `facts`: what the log says beside the flight.
     """
 
     time: Float[np.ndarray, " samples"]

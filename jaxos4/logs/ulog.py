@@ -48,11 +48,7 @@ _REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 
 
 class _Protocol(NamedTuple):
-    """How the outputs of motors are coded: idle and full speed by default, and parameters that hold others.
-
-    - `possible`: the smallest and the largest value of such a parameter.
-    - `parameters`: the beginnings of their names, before MIN or MAX.
-    """
+    """The coding of motors' outputs: idle and full speed, and parameters that hold others within `possible`."""
 
     name: str
     ends: tuple[float, float]

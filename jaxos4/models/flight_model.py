@@ -152,7 +152,7 @@ class FlightModel(AbstractModel):
         return not any(term.gyro or term.accelerometer for term in self._terms)
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The chain from commands to torque and thrust: each term acts at its place. Padding has 0 and takes no time."""
+        """The chain from commands to torque and thrust: each term acts at its place. Padding takes no time."""
         if inputs.within is None:
             return self._beside(inputs, self._rotors(inputs, parameters))
         samples, parts, _ = inputs.within.shape

@@ -1,8 +1,7 @@
 """The state of a quadrotor as a cascade, and the forcing: rotors -> torque -> rates -> attitude -> translation.
 
-The parameters enter only the forcing and the rate equations, and no level feeds back. So a `State` may stop at any
-level: a level that is `None` is not simulated. States are separate scalars because a batch of scalars vectorises and a
-batch of 12-vectors does not.
+Parameters enter the forcing and the rates alone, and no level feeds back: a `State` may stop at any level, and what
+is `None` is not simulated. States are scalars, because a batch of scalars vectorises.
 """
 
 from typing import NamedTuple

@@ -95,7 +95,7 @@ class Term:
 
 
 def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
-    """A fifth of the hover torque of a pair of rotors (yaw: of a fifth of it) over the inertia [rad/s^2], over `per`."""
+    """A fifth of the hover torque of two rotors (in yaw a fifth of it) over the inertia [rad/s^2], divided by `per`."""
 
     def share(airframe: Airframe) -> Scalar:
         arm = jnp.abs(jnp.asarray(airframe.rotor_positions)).mean()

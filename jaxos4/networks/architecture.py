@@ -177,9 +177,8 @@ def loss(
 ) -> Scalar:
     """The loss of one flight: weighted square error in units of `Scaling.bound`, plus the likelihood of the spread.
 
-    Some flights cannot be identified well. The weight 1 / spread keeps their errors from hiding the others. With the
-    likelihood's weight, 1 / spread^2, training could settle at a bad answer with a large spread (beta-NLL; Seitzer et
-    al. 2022). The likelihood trains the spread alone.
+    The weight 1 / spread keeps flights that cannot be identified from hiding the others (beta-NLL; Seitzer et al.
+    2022). The likelihood trains the spread alone.
     """
     found, log_spread = regressor(features, scale, scaling)
     error = (found - u) / scaling.bound(scale)

@@ -143,9 +143,8 @@ def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: 
 class TrainedNetwork(AbstractEstimator):
     """A network that identifies flights of the inputs that it was trained for. Made by `NetworkEstimator.fit`.
 
-    Its intervals contain the truth in the share of flights that their level gives, even if the network is bad: they
-    are calibrated on simulated flights that training did not use (split-conformal prediction). The share is an average
-    over flights that do not diverge, with parameters and initial states uniform in the bracket of training.
+    Its intervals are calibrated on simulated flights that training did not use (split-conformal prediction): they hold
+    the truth in the share of their level, over flights that do not diverge, uniform in the bracket of training.
 
     - `largest_inflation`: if missing samples enlarge a standard deviation by more, the problem is another one.
     - `same`: relative tolerance of equal numbers, because files round them.

@@ -69,12 +69,7 @@ class Inspection(msgspec.Struct, frozen=True):
 
 
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
-    """Describe a log. Without an airframe, torques are unknown.
-
-    **Arguments:**
-
-    - `recording`: of a file, read with the same `airframe`, and with `full_scale=1.0`.
-    """
+    """Describe a log that was read with this airframe and `full_scale=1.0`. Without one, torques are unknown."""
     evidence, flown, parts = Evidence(recording, airframe), [], []
     for stretch in evidence.every:
         if not stretch.reason:
@@ -119,11 +114,9 @@ def _measured(recording: Recording) -> dict[str, Channel]:
 def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     """Begin the file of an airframe with what a log knows: spins, hover speed, sometimes the rotors' positions.
 
-    What must be weighed or measured is a comment, so that `load_airframe` names the first of these keys as missing.
-
     **Arguments:** `recording`: read without an airframe, and with `full_scale=1.0`.
 
-    **Returns:** the text, and the keys that must be filled in before it can be used.
+    **Returns:** the text, in which what must be weighed or measured is a comment, and the keys that are missing.
     """
     facts, full = recording.facts, FULL_SCALE if recording.commanded else 1.0
     flown = usable(recording)

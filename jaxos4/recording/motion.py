@@ -109,12 +109,10 @@ def excitation(
 
 
 def opposite_axes(flown: Sequence[Recording], airframe: Airframe, *, signs: SignRules = SIGNS) -> dict[str, float]:
-    """The axes about which the vehicle turns against the torque that the airframe gives to its rotors.
+    """The axes about which vehicles turn against the torque that the airframe gives to the rotors, in usable stretches.
 
     For each, the correlation of torque and angular acceleration with the opposite sign. Axes without clear motion and
     torque are not judged. The clocks of motors and gyro may be shifted.
-
-    **Arguments:** usable stretches of flights, each of one vehicle.
     """
     mixer = np.asarray(airframe.mixer, dtype=float)[:3]
     found = np.diagonal(_correlations(flown, mixer, signs.shifted, signs), axis1=1, axis2=2)
@@ -140,8 +138,6 @@ def refused_note(axes: Mapping[str, float]) -> str:
 def rotor_signs(flown: Sequence[Recording], *, signs: SignRules = SIGNS) -> tuple[Signs, Signs, Signs | None] | None:
     """The places and spins of four rotors in an X, by how the vehicle turns after each pair of rotors speeds up.
 
-    **Arguments:** usable stretches of flights, each of one vehicle, with motors and gyro logged fast.
-
     **Returns:** the signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from
     above; `None`: the vehicle hardly yawed). `None`: the flight does not show it, or the rotors are no X.
     """
@@ -162,10 +158,8 @@ def _correlations(
 ) -> Float[np.ndarray, "delays rows 3"]:
     """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
 
-    A controller that answers gusts does not change the sign. One number for each delay, each row of `mixer` (the weight
-    of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion.
-
-    **Arguments:** `between`: the first and the last delay of the gyro after the motors [s].
+    By delay of the gyro, `between` two [s], by row of `mixer`, and by axis; NaN: no clear motion. A controller that
+    answers gusts does not change the sign.
     """
     step = max([signs.step, *(each.dt for each in flown)])
     pairs = [_response(each, mixer, step, signs) for each in flown if np.ptp(each.time) > 2 * signs.slow * step]

@@ -115,11 +115,10 @@ def _power(signals: Sequence[Float[np.ndarray, "samples 4"]], dt: float, setting
 
 
 def _noise(power: Changes, settings: SpeedNoise) -> Float[np.ndarray, " frequencies"]:
-    """The power of the noise in the changes of each direction.
+    """The power of the noise in the changes of each direction, by frequency.
 
-    Motors follow their commands with a lag, so the power of the changes of true speeds does not grow with frequency: it
-    is taken as a constant and a part that falls with the square, for each direction. That of white noise grows, and
-    falls again near the highest frequency if the speeds were interpolated between packets.
+    The changes of true speeds do not grow with frequency, because of the motors' lag: a constant, and a part that falls
+    with the square. Those of white noise grow, and fall again if the speeds were interpolated between packets.
     """
     from scipy.optimize import nnls  # slow to import
 

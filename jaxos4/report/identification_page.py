@@ -36,12 +36,9 @@ _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 
 
 
 def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
-    """Writes the page of an identification, completely or not at all.
+    """Writes the page of an identification, fresh or read, completely or not at all. Raises `OSError`.
 
-    It shows what the result's file holds, so that a result that was read makes the same page. `title`: by default the
-    names of the logs.
-
-    **Raises:** `OSError` if the page cannot be written.
+    `title`: by default the names of the logs.
     """
     check_writable(path)
     look, used = styles([found.estimator])[found.estimator], found.provenance

@@ -24,7 +24,7 @@ Times = Float[np.ndarray, " samples"]
 
 
 def identified_signals(found: Identification, look: Style) -> str:
-    """The signals of a result's page as JSON, or "": views by horizon (vehicle), or by group of channels (OS4)."""
+    """The signals of a result's page as JSON, or "": a vehicle's by horizon, an OS4's by group of channels."""
     traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
     if traces is None:
         return ""

@@ -28,14 +28,12 @@ from .timeline import Axis, Line, Panel, View, signals, spans, thinned
 
 
 class PageRules(NamedTuple):
-    """What the page of a log shows.
+    """The content of the page of a log.
 
     - `samples`: of each signal at most; a page then has less than 600 kB.
     - `parts`: rows of the table of parts at most, the longest parts.
-    - `segment`: of which the spectra are means [s].
-    - `slowest`: the lowest frequency of a spectrum [Hz].
-    - `bins`: of the motors' speeds.
-    - `usual`: the share of the time in which the rotors' speeds lie in the band of the spectra.
+    - `segment`: of which the spectra are means [s]. `slowest`: the lowest frequency of a spectrum [Hz].
+    - `bins`: of the motors' speeds. `usual`: the share of the time of the speeds in the band of the spectra.
     """
 
     samples: int = 5000
@@ -165,7 +163,7 @@ def bridged(
 
 
 def fitted(recording: Recording, airframe: Airframe | None) -> str:
-    """What `jaxos4 estimate` would fit and hold out, in words."""
+    """The parts that `jaxos4 estimate` would fit and hold out, in words."""
     if airframe is None:
         return "Give the airframe (--airframe) to see here what would be fitted, and what held out."
     if recording.commanded and not airframe.has_full_scale:
@@ -239,9 +237,7 @@ def amplitude_density(
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies channels"]]:
     """Frequencies [Hz] and the amplitude spectral density of signals, by Welch's means of overlapping segments.
 
-    Each channel has the mean over the segments in which it was measured; NaN if there are none.
-
-    Reference: Welch, IEEE Trans. Audio Electroacoustics 15 (1967).
+    A channel has the mean over the segments in which it was measured, or NaN. Reference: Welch 1967, IEEE Trans. AU 15.
     """
     size = max(round(rules.segment / dt), 8)
     window = np.hanning(size)[:, None]

@@ -117,13 +117,10 @@ def signals(
     shaded: Sequence[tuple[float, float]] = (),
     names: Sequence[str] = (),
 ) -> str:
-    """What `timeline.js` draws, as JSON.
-
-    **Arguments:**
+    """The content of `timeline.js`, as JSON.
 
     - `common`: views below the chosen one of `views`. `shown`: the number of the first that is chosen.
-    - `shaded`: from when to when the background is grey, on the axis.
-    - `names`: of the logs, shown if there are several.
+    - `shaded`: from when to when the background is grey, on the axis. `names`: of the logs, if there are several.
     """
     several = np.ptp(axis.log) > 0
     pieces = [[*(float(x) for x in row[:3]), names[int(row[3])] if several else ""] for row in zip(*axis, strict=True)]

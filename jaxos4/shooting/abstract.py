@@ -126,7 +126,7 @@ class Unknowns(eqx.Module):
         return jnp.maximum(lower, self.lowest), jnp.minimum(upper, self.highest)
 
     def identifiable(self, std: Float[Array, " unknowns"], prior: float | None = None) -> Bool[Array, " unknowns"]:
-        """Whether each is identifiable, or fixed. `prior`: how an estimator used the bracket; by default as the cost does."""
+        """Whether each is identifiable or fixed. `prior`: of an estimator; by default as the cost uses the bracket."""
         return jnp.asarray(is_identifiable(std, self.half_width, self.prior if prior is None else prior)) | ~self.free
 
 
@@ -143,12 +143,9 @@ def _fixed(
 
 
 class Shot(NamedTuple):
-    """One simulated window.
+    """One simulated window: the cost of the samples before it fails, and whether it is `feasible`.
 
-    - `cost`: of the samples before the trajectory fails.
-    - `feasible`: whether no sample fails, by a pitch angle beyond +-90 degrees or a body rate above `FASTEST` in
-      `scans.py`. The cost of a failed shot means nothing, but its derivative still points back to feasible
-      trajectories.
+    It fails at a pitch of 90 degrees or a rate above `FASTEST`. The derivative still points back to feasible ones.
     """
 
     cost: Scalar
@@ -278,11 +275,10 @@ class Stages(NamedTuple):
 
 
 class AbstractProblem(eqx.Module):
-    """The negative log-likelihood of a flight.
+    """The negative log-likelihood of a flight, which may be cut into windows.
 
-    A flight may be cut into windows. All windows share the unknowns in `unknowns`; in addition, each window may have a
-    free initial state of its own. The unknowns of all windows are one array: a row for each window, which holds the
-    shared unknowns and then the window's own. The number of rows and columns is that of the `initial_guess`.
+    Windows share the unknowns in `unknowns`; each may have a free initial state too. The unknowns of all windows are
+    one array: a row for each window, with the shared unknowns first. `initial_guess` has its shape.
     """
 
     unknowns: eqx.AbstractVar[Unknowns]
@@ -302,11 +298,9 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def fix(self: Problem, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> Problem:
-        """The same likelihood, with some unknowns fixed at known values: `problem.fix({"rotor_lag": 0.06})`.
+        """The same likelihood, with some unknowns fixed at known values. `bracket`: where the others are looked for.
 
-        `bracket`: where the parameters are looked for instead.
-
-        **Raises:** `ValueError` for a name that is no unknown, if no unknown remains free, or for a bracket of another
+        **Raises:** `ValueError` for a name that is no unknown, if none remains free, or for a bracket of another
         length.
         """
 

@@ -1,8 +1,7 @@
 """A batch of flights in lanes: how `jax.vmap` computes what takes long.
 
-By itself, `jax.vmap` computes all flights of a batch together, with the batch along the first axis. Its loops then
-take as long as the slowest flight, its arrays do not fit the cache, and the processor's vectors hold the unknowns of
-one flight instead of one unknown of several flights.
+By itself, `jax.vmap` has the batch along the first axis: its loops take as long as the slowest flight, its arrays do
+not fit the cache, and vectors hold the unknowns of one flight instead of one unknown of several.
 """
 
 import functools
@@ -30,9 +29,8 @@ _CHUNK = 4 * _BLOCK
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
     """`function(*arguments)`, of which `jax.vmap` computes a batch by `of_batch`.
 
-    `of_batch` receives the number of lanes, the arguments that differ between the lanes, with the lanes along their
-    first axis, and the arguments that the lanes share. Each is `None` in the place of the other. It returns the results
-    with the lanes along their first axis.
+    `of_batch` takes the number of lanes, the arguments that differ between lanes, with the lanes first, and those that
+    they share, each `None` in the place of the other. It returns the results with the lanes first.
     """
     arrays, settings = eqx.partition(arguments, eqx.is_array)
 

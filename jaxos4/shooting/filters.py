@@ -59,7 +59,7 @@ class _Row(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What the filters know at the beginning of a sample: rates and disturbances."""
+    """The knowledge of the filters at the beginning of a sample: rates and disturbances."""
 
     rates: Rates
     disturbance: tuple[Segments, ...]

@@ -72,7 +72,7 @@ class Observed(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """What a unit of innovation adds, and the variance of the innovation.
+    """The effect of a unit of innovation, and the variance of the innovation.
 
     - `rate`, `disturbance`: at the beginning of the sample.
     - `rate_later`: at the end, besides `rate`. `disturbance_later`: at the end.

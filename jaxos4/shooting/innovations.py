@@ -1,9 +1,8 @@
 """A problem of innovations: the likelihood of a flight with disturbances that the model does not contain.
 
-A real vehicle flies under a controller, which answers gusts and everything else that a model lacks. So the input and
-the disturbance correlate. A likelihood that treats the disturbance as noise of the sensors is then biased, however long
-the flight. Here the disturbance is a part of the model. A Kalman filter estimates it from the past, and only the
-innovations are compared: the part of a measurement that the past cannot predict.
+A controller answers gusts and whatever a model lacks, so input and disturbance correlate, and a likelihood that takes
+the disturbance for noise of the sensors is biased, however long the flight. Here a Kalman filter estimates it from the
+past, and only the innovations are compared: the part of a measurement that the past cannot predict.
 
 References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, System Identification, ch. 7 and 13.
 """

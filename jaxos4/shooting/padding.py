@@ -14,12 +14,9 @@ _CAPACITIES = (4096, 16384, 65536)
 
 
 def padded(problem: ShootingProblem) -> ShootingProblem:
-    """The problem with a padded flight.
+    """The problem with a padded flight, unless it is cut into windows. Derivatives are then forward-mode only.
 
-    Padding is not simulated: it costs memory and no time. Results change by rounding errors only. Derivatives
-    are forward-mode only.
-
-    A flight in windows is not padded.
+    Padding is not simulated: it costs memory and no time. Results change by rounding errors only.
     """
     samples = problem.flight.time.shape[0]
     capacity = capacity_of(samples)

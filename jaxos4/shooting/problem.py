@@ -301,9 +301,9 @@ class ShootingProblem(AbstractProblem):
     def reweighted(self, residuals: Float[ArrayLike, "..."]) -> "ShootingProblem":
         """The problem with each channel's sigma estimated from the weighted `residuals` of a fit, by NumPy.
 
-        Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
-        freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. No sigma falls below the
-        rounding errors that add up over a flight.
+        Alternating this with the fit is maximum likelihood with unknown noise, corrected for degrees of freedom. A
+        channel with fewer than two measurements keeps its sigma. No sigma falls below the rounding errors that add up
+        over a flight.
         """
         columns, before = self.columns, np.asarray(self.sigma)
         measured, squares = self.recorded(), np.square(np.reshape(residuals, (-1, columns.size))).sum(axis=0)

@@ -61,9 +61,8 @@ class Segments(NamedTuple):
 def observe_in_segments(problem: ShootingProblem, segments: Segments, settling: int) -> Observed:
     """The measurements in segments, where filters restart, and which innovations count.
 
-    A filter restarts in a gap, and where another stretch begins. Until it has settled its innovations do not count:
-    the controller knew the disturbance then, and the filter does not. At the beginning of a flight in one piece
-    they count: a simulation begins at rest.
+    A filter restarts in a gap, and where a stretch begins. Until it has settled its innovations do not count, except at
+    the beginning of a flight in one piece: a simulation begins at rest.
     """
     flight, index, samples = problem.flight, jnp.asarray(segments.place), problem.flight.time.shape[0]
     exists, place = ((index >= 0) & (index < samples)).T, jnp.minimum(index, samples - 1)

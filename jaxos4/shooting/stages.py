@@ -45,12 +45,9 @@ class Plan(NamedTuple):
     ) -> "Plan":
         """The plan of a flight, whose last stage is the whole.
 
-        **Arguments:**
-
         - `channels`: that are compared. `shares`: of the flight, to which the body rates are fitted first.
         - `measured`: states in cascade order, then specific force, which all stages compare. `sigma`: of their noise.
-        - `samples`: how many count; the others are padding.
-        - `windows`: of the flight. One of several windows is short enough as a whole.
+        - `samples`: how many count. `windows`: of the flight; one of several is short enough as a whole.
         """
         wanted = (share for share in shares if share == 1 or windows == 1)
         rates = tuple(("rates", share) for share in wanted if (channels, share) != ("rates", 1))
