@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float, integer, setting
 from ..airframe import alpha_scalars
+from ..excitation import References, random_references
 from ..flight import Flight
 from ..linalg import invert
 from ..models.os4 import CorrectedOS4
@@ -17,7 +18,6 @@ from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
-from .references import References, random_references
 from .sensors import BodyMotion, Sense, Signals, log
 from .settings import ClosedLoop, PerAxis
 

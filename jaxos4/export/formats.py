@@ -6,10 +6,9 @@ import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jinja2
 import numpy as np
 
-from .._templates import in_xml, templates
+from .._files import in_xml, templates
 from .._version import __version__
 from ..errors import InputError, printable
 from ..results import meaning
@@ -142,7 +141,7 @@ def _drone_models(vehicle: RigidVehicle) -> dict[str, Any]:
 
 
 @functools.cache
-def _templates(suffix: str) -> jinja2.Environment:
+def _templates(suffix: str) -> Any:
     made = templates("jaxos4.export", printable if suffix in (".py", ".toml") else in_xml)
     made.filters["short"] = lambda values: ", ".join(f"{value:.3g}" for value in np.atleast_1d(values))
     made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}

@@ -23,12 +23,21 @@ from ..identification.results import Constant, Identification, SampleTime
 from ..identification.verdict import RIGID_BODY, headline, reasons
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
-from .identification_figures import correlation_matrix, path_in_space, priors, residual_figure, strongest
-from .identification_plots import GAINS, INERTIAS, draw_response, gain_band
-from .identification_signals import BAND, identified_signals
+from .identification_figures import (
+    GAINS,
+    INERTIAS,
+    correlation_matrix,
+    draw_response,
+    gain_band,
+    path_in_space,
+    priors,
+    residual_figure,
+    strongest,
+)
 from .identification_text import quantity_rows
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
+from .timeline import BAND, identified_signals
 
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
