@@ -10,7 +10,8 @@ class InputError(ValueError):
     longest = 5000
 
     def __init__(self, message: str):
-        super().__init__(_middle_cut(printable(message), self.longest))
+        text, half = printable(message), (self.longest - 3) // 2
+        super().__init__(text if len(text) <= self.longest else f"{text[:half]}...{text[-half:]}")
 
 
 class TrainingError(RuntimeError):
@@ -20,12 +21,6 @@ class TrainingError(RuntimeError):
 def printable(text: str) -> str:
     """`text` on one line, with unprintable characters escaped: line breaks, controls, bytes that are not UTF-8."""
     return text if text.isprintable() else "".join(x if x.isprintable() else repr(x)[1:-1] for x in text)
-
-
-def _middle_cut(text: str, most: int) -> str:
-    """The text, with its beginning and its end if it is longer than `most` characters."""
-    half = (most - 3) // 2
-    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
 
 
 def shortened(text: str, most: int) -> str:

@@ -60,20 +60,18 @@ class Identifiability(eqx.Module):
             if not self.excited[i]:
                 return "not identifiable: not excited"
             if not self.identifiable[i]:
-                return f"not identifiable: only together with {', '.join(names[j] for j in self._partners(i))}"
+                vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
+                weakest = np.abs(vectors[:, np.argmax(np.abs(vectors[i]))])
+                share = weakest / weakest.max()  # that changes together with least effect on the flight
+                partners = np.flatnonzero((share > self.partner) & (np.arange(share.size) != i)).tolist()
+                partners = partners or [int(np.argsort(share)[-2])]
+                return f"not identifiable: only together with {', '.join(names[j] for j in partners)}"
             if self.noise_limit[i] < 1 and self.nominal[i] != 0:
                 limit = f"{self.noise_limit[i]:.2g} times this noise"
                 return f"below the noise floor: can be distinguished from 0 below {limit}"
             return ""
 
         return {name: text for i, name in enumerate(names) if (text := note(i))}
-
-    def _partners(self, i: int) -> list[int]:
-        """The parameters that can change together with parameter `i` with the least effect on the flight."""
-        vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
-        weakest = vectors[:, np.argmax(np.abs(vectors[i]))]
-        share = np.abs(weakest) / np.abs(weakest).max()
-        return [j for j in range(len(share)) if j != i and share[j] > self.partner] or [int(np.argsort(share)[-2])]
 
 
 def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability:

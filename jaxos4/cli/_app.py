@@ -8,7 +8,7 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -122,14 +122,10 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # what all errors of the parser have, in every version of typer
             raise
-        typer.echo(_parser_message(error), err=True)
+        mistake: Any = error
+        message, ctx = mistake.format_message().removesuffix(".").replace("Value error, ", ""), mistake.ctx
+        if "\n" not in message:  # else it is the help, because there are no arguments
+            message = f"jaxos4: {message}; see `{ctx.command_path if ctx else 'jaxos4'} --help`."
+        typer.echo(message, err=True)
         raise SystemExit(2) from None
     raise SystemExit(code)
-
-
-def _parser_message(error: Any) -> str:
-    """A mistake in the arguments in one line. If there are no arguments: the help."""
-    message = error.format_message().removesuffix(".").replace("Value error, ", "")
-    if "\n" in message:
-        return message
-    return f"jaxos4: {message}; see `{error.ctx.command_path if error.ctx else 'jaxos4'} --help`."

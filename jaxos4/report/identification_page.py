@@ -34,8 +34,8 @@ from .identification_figures import (
     residual_figure,
     strongest,
 )
-from .identification_text import quantity_rows
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
+from .terminal import quantity_rows
 from .text import MISSING, plain
 from .timeline import BAND, identified_signals
 
@@ -75,7 +75,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         found=found,
         verdict=verdict(found),
         headline=headline(found.verdicts, found.doubts),
-        center=[f"{each.axis} {_plus_minus(1e3 * each.value, 1e3 * each.std)} mm" for each in center],
+        center=[f"{x.axis} {plain(1e3 * x.value)} ± {plain(NINETY_FIVE * (1e3 * x.std), 2)} mm" for x in center],
         quantities=quantities(found),
         signals=identified_signals(found, look),
         band=f"{100 * BAND:g}",
@@ -134,14 +134,8 @@ def _joined(words: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _plus_minus(value: float, std: float) -> str:
-    return f"{plain(value)} ± {plain(NINETY_FIVE * std, 2)}"
-
-
 def _text(x: Any) -> str:
-    if isinstance(x, str):
-        return x
-    return MISSING if x is None else json.dumps(x, ensure_ascii=False)
+    return x if isinstance(x, str) else MISSING if x is None else json.dumps(x, ensure_ascii=False)
 
 
 def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:

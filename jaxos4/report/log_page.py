@@ -22,8 +22,8 @@ from ..recording.inspection import Inspection, inspect_log
 from ..recording.prepared import prepare
 from ..recording.stretches import Stretch, cut
 from .html import draw, render
-from .log_text import unit_of
 from .style import BOUND_DASHES, FAINT, INK, drawing, grid, label, log_axis, style
+from .terminal import unit_of
 from .timeline import Axis, Line, Panel, View, signals, spans, thinned
 
 

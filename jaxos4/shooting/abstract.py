@@ -82,7 +82,8 @@ class Unknowns(eqx.Module):
         """The unknowns in another bracket; a fixed one keeps its value. Raises `ValueError` for another length."""
         if bracket.lower.shape != (self.count,):
             raise ValueError(f"`bracket` must hold {self.count} parameters, got {bracket.lower.shape[0]}.")
-        center = bracket.center if _all(self.free) else jnp.where(self.free, bracket.center, self.center)
+        known_free = not isinstance(self.free, Tracer) and bool(np.asarray(self.free).all())
+        center = bracket.center if known_free else jnp.where(self.free, bracket.center, self.center)
         return dataclasses.replace(self, center=center, half_width=bracket.half_width)
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
@@ -128,11 +129,6 @@ class Unknowns(eqx.Module):
     def identifiable(self, std: Float[Array, " unknowns"], prior: float | None = None) -> Bool[Array, " unknowns"]:
         """Whether each is identifiable or fixed. `prior`: of an estimator; by default as the cost uses the bracket."""
         return jnp.asarray(is_identifiable(std, self.half_width, self.prior if prior is None else prior)) | ~self.free
-
-
-def _all(mask: Bool[Array, "..."]) -> bool:
-    """Whether all values are true and known while a program is traced."""
-    return not isinstance(mask, Tracer) and bool(np.asarray(mask).all())
 
 
 @eqx.filter_jit  # one compiled program instead of one for each operation

@@ -75,6 +75,11 @@ class _Feedback(NamedTuple):
     reach: tuple[Segments, ...]
     kept: tuple[Segments, ...]
 
+    @classmethod
+    def of(cls, gains: Gains, step: Step) -> "_Feedback":
+        fields = gains.rate, gains.rate_later, gains.disturbance_later, step.seen, step.reach, step.kept
+        return cls(*map(tuple, fields))
+
 
 def _advance(
     functions: tuple[Callable, ...], known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
@@ -272,10 +277,6 @@ def _filter_rows(
     scalars, own = tuple(parameters), parameters.shape[1:]
     units = tuple(np.eye(count, dtype=parameters.dtype))
 
-    def feedback(gains: Gains, step: Step) -> _Feedback:
-        fields = gains.rate, gains.rate_later, gains.disturbance_later, step.seen, step.reach, step.kept
-        return _Feedback(*map(tuple, fields))
-
     def body(carry, rows):
         (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry
         forcing, tangents, row = rows
@@ -285,10 +286,10 @@ def _filter_rows(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
-        fed = feedback(gains, steps[0])
+        fed = _Feedback.of(gains, steps[0])
         # The noise acts by the feedback alone, and the parameters do not act on it.
         _, push = jax.linearize(lambda known, fed: advance(known, forcing, scalars, fed, row), known, fed)
-        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, jax.vmap(feedback)(gain_slopes, steps[1]))
+        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, jax.vmap(_Feedback.of)(gain_slopes, steps[1]))
 
         def filtered(known: _Known, scalars: tuple, forcing: Forcing = forcing):
             return advance(known, forcing, scalars, fed, row)
