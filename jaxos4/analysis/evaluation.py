@@ -156,15 +156,9 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
-    too. The residuals are taken as the noise. They lack slow noise that the fit explained as motion. A flight must
-    therefore be many times longer than the correlation time of the noise.
-
-    The noise is taken as stationary. With at least 20 windows of at most 4,000 residuals each, all windows are taken
-    instead as having noise of one covariance.
-
-    **Arguments:** the flight, evaluated at the answer of a fit.
-
-    **Returns:** the covariance; infinite if the trajectory diverges or nothing was measured.
+    too. The residuals are taken as the noise, and lack slow noise that the fit explained as motion: a flight must be
+    many times longer than the noise's correlation time. The noise is stationary, or, with 20 windows or more of at most
+    4,000 residuals each, of one covariance in all windows. Infinite if the trajectory diverges or nothing was measured.
 
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """

@@ -30,8 +30,6 @@ def open_loop(
 ) -> Motion:
     """The motion after each step. Nothing is measured any more, and the disturbance fades.
 
-    **Arguments:**
-
     - `advance(motion, row, added)`: the motion after one step, to which disturbances add `added`.
     - `disturbance`: of each channel at the start, as filters know it.
     - `rows`: the forcing of each step.

@@ -84,18 +84,15 @@ def fly_batch(
 class Fleet(eqx.Module):
     """A vehicle in gusts, and vehicles with moments of inertia that are drawn from a bracket, and gusts of their own.
 
-    - `loop`: the vehicle of the airframe. `loops`: the drawn ones, as a batch. All have the controller of the airframe.
-      Some fly in still air. Only they show velocity and distance.
+    - `loop`: the vehicle of the airframe. `loops`: the drawn ones, as a batch, all with its controller.
     - `model`, `parameters`: of the filters, which know the true parameters, gusts and noise of `loop`.
     - `prior`: the information of the bracket, of which the half-widths are standard deviations.
 
     The same for all fleets:
 
-    - `still`: so many vehicles fly in still air, because gusts carry a vehicle without a position controller away,
-      whatever its references.
+    - `still`: so many vehicles fly in still air, and show velocity and distance: gusts carry the others away.
     - `least_gust`: disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2].
-    - `slowest`, `fastest`: rotors turn at least with this share of the speed in hover, and at most with this multiple
-      if no maximum is known.
+    - `slowest`, `fastest`: speeds of rotors, as shares of that in hover, if no maximum is known.
     - `gust_share`: gusts alone use at most this share of a limit that is not given.
     """
 

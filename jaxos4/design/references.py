@@ -206,10 +206,8 @@ def design_references(
     """Design the references with which filter error identifies the moments of inertia of a vehicle most accurately.
 
     Each reference is a sum of tones, which repeats. The simulator flies each tone once; the search for the amplitudes
-    and phases is then algebra. At the end 64 vehicles with moments of inertia from the bracket fly the references
-    through gusts, and the references are reduced until all of them stay within the limits.
-
-    **Arguments:**
+    and phases is then algebra. At the end 64 vehicles from the bracket fly the references through gusts, and the
+    references are reduced until all of them stay within the limits.
 
     - `loop`: the vehicle, its controller, its gusts and its sensors.
     - `angle`: the largest reference of roll, pitch and yaw [rad], at most 1. `acceleration`: the largest vertical one

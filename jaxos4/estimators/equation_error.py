@@ -1,12 +1,9 @@
 """Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares.
 
-`EquationError` uses all samples in one step, `RecursiveLeastSquares` one sample after the other, with forgetting.
-
 Between two samples the rates change by the integral of the rate equations, which are linear in the parameters. The
-noise of measured rates makes their differences coloured. Integrating again whitens them exactly:
-y_k = w_0 + sum_{j<k} T Phi_j alpha + e_k, with white noise e and an unknown w_0. `Regression.rows` eliminates w_0
-recursively (it subtracts the mean of all rows before each row, the Helmert transform). Every row then has white noise,
-unit variance, and no unknown but the parameters.
+noise of measured rates makes their differences coloured. Integrating again whitens them exactly: y_k = w_0 + sum_{j<k}
+T Phi_j alpha + e_k, with white noise e and an unknown w_0, which `Regression.rows` eliminates (it subtracts the mean of
+all rows before each row, the Helmert transform). Rows then have white noise, unit variance, and no other unknowns.
 """
 
 from collections.abc import Callable
@@ -235,8 +232,6 @@ class EquationError(AbstractEstimator):
     measured rates, are the regressors. Only the body rates are used, but the estimate's cost counts all of the
     problem's channels. A free initial state is fitted to the parameters afterwards.
 
-    **Arguments:**
-
     - `memory`: how the rates are differentiated, from 0 to 1. The mean of the earlier samples is subtracted, in which
       each sample weighs `memory` times its successor. 0 gives plain forward differences (ordinary least squares); 1
       gives the integrated regression, generalised least squares for white noise of the rates. 1 has the smallest
@@ -293,8 +288,6 @@ class RecursiveLeastSquares(AbstractRecursion):
 
     The recursion carries the normal matrix and its right-hand side, which stay symmetric and positive in single
     precision. A parameter stays at the bracket's center until it is excited.
-
-    **Arguments:**
 
     - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1. The estimate describes the
       last 1 / (1 - forgetting) samples or so, and follows parameters that change within this time. With the default of

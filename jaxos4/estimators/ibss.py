@@ -51,8 +51,6 @@ class IBSS(AbstractSolver[State]):
     separable along them, so a sweep bisects all together. Parameters are bisected on the sum of all windows' slopes,
     initial states on those of their own window.
 
-    **Arguments:**
-
     - `halvings`: the shots of a sweep that narrow the brackets.
     - `max_sweeps`: the most sweeps of a stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each

@@ -51,8 +51,6 @@ class State(NamedTuple):
 class LevenbergMarquardt(AbstractSolver[State]):
     """Gauss-Newton steps, which are damped more after a step that failed, and less after one that succeeded.
 
-    **Arguments:**
-
     - `step_tolerance`: a stage ends with a step that changes no unknown by more, in the unit of how far off its initial
       guess may be. Cost and covariance are those before this step. 0: no step is short enough.
     - `coarse`: `step_tolerance` of all stages but the last, at least.
@@ -177,8 +175,6 @@ class FilterError(AbstractEstimator):
     It compares the body rates, and specific force if the model predicts it. The disturbance and the sensor's noise of
     each channel are estimated too, see `InnovationsProblem`. The bracket is a Gaussian prior, whose standard deviation
     is the bracket's half-width.
-
-    **Arguments:**
 
     - `tolerance`: the search ends with a step that promises to lower the cost by less. An error of one standard
       deviation costs 0.5.

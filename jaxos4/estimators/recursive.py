@@ -55,8 +55,6 @@ class _Filter(NamedTuple):
 class SVSF(AbstractRecursion):
     """Smooth Variable Structure Filter of the body rates and the parameters.
 
-    **Arguments:**
-
     - `rates_layer`: boundary layer of the rates, in multiples of the problem's sigma.
     - `parameter_layer`: boundary layer of the parameters, in multiples of the noise of w from one sample.
     - `damping`: of the pseudo-inverse, in multiples of a parameter's root mean square influence. Phi12 maps 3 errors
@@ -192,8 +190,6 @@ _product = functools.partial(jnp.matmul, precision="highest")
 
 class JointEKF(AbstractRecursion):
     """Joint extended Kalman filter: states and constant parameters from one recursion over the flight.
-
-    **Arguments:**
 
     - `passes`: the most passes over the flight. The first pass linearises the model around its own running estimate:
       the textbook filter. Each later pass starts from the same prior and linearises around the trajectory of the

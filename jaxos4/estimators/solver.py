@@ -92,8 +92,6 @@ def solve(
     The first stage is searched from each start of the problem. Equal starts count once. A later start begins with the
     parameters that are the best so far. The other stages are searched from the best answer of all starts.
 
-    **Arguments:**
-
     - `start`: where to start instead, unless it is NaN or the unknown is fixed. Shared unknowns, or those of each
       window.
     - `spread`: the covariance of the first unknowns of each window at the start; by default that of the initial guess.

@@ -67,8 +67,6 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
         found = jaxos4.export.read_result("found.json")
         jaxos4.export.export_vehicle(found, "mujoco").text
 
-    **Arguments:**
-
     - `found`: a result, from `read_result`.
     - `to`: the simulator, a name in `TARGETS`.
     - `samples`: the number of vehicles to draw from the covariance of the estimate. Constants that were not estimated,

@@ -227,8 +227,6 @@ def known_at_samples(
 
     The velocity is left out of the forcing: it will be that of the prediction.
 
-    **Arguments:**
-
     - `length`: the samples of the flight that are no padding.
     - `measured`: states, accelerations and the white noise of velocity: see `jaxos4.forecast.measured.Measured`.
     - `noise`: of the filters. `prior`: the standard deviation of each offset before the flight.

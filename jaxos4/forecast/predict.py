@@ -130,26 +130,20 @@ def predict(
 ) -> FlightPrediction:
     """Predict position, velocity, attitude and body rates from many starts of a flight, with its rotor speeds.
 
-        prediction = jaxos4.predict("found.json", "flight.csv")
-        prediction.quality["attitude"].error       # by horizon [rad]
+    prediction = jaxos4.predict("found.json", "flight.csv") prediction.quality["attitude"].error       # by horizon
+    [rad]
 
     A prediction begins with the measured position, velocity and attitude, and with the rates and disturbances that
     Kalman filters know from the measurements until then. After that it knows rotor speeds or commands, and the
-    battery's voltage if the model needs it, and nothing else that was measured.
+    battery's voltage if the model needs it. The 95 % band holds what will be measured: it comes from 64 futures, of
+    parameters, starts and disturbances, and from how far position, velocity and attitude are from dead reckoning.
 
-    The 95 % band holds what will be measured. It comes from 64 futures: parameters drawn from their covariance, errors
-    of the rates at the start, and disturbances drawn as the fit found them. The band also contains the disagreement of
-    the sensors: how far position, velocity and attitude are from dead reckoning.
-
-    **Arguments:**
-
-    - `found`: the identification of a vehicle, or the file that `jaxos4 estimate --out` wrote, or what
-      `jaxos4.forecast.vehicle_of` makes of one of these.
+    - `found`: the identification of a vehicle, the file that `jaxos4 estimate --out` wrote, or its
+      `jaxos4.forecast.vehicle_of`.
     - `flight`: or the path of a log. It has body rates and attitude at least. Without a velocity, predictions begin
       with that of dead reckoning, or at rest; what was not measured is not compared.
-    - `horizon`: how far ahead [s].
+    - `horizon`: how far ahead [s]. `spacing`: the time between two starts [s]; 0: at each sample.
     - `sample_time`: the log is averaged to it [s]. Default: that of the fit.
-    - `spacing`: the time between two starts [s]; 0: at each sample.
     - `seed`: of the draws.
 
     The regression for comparison is fitted to the flight of an identification, or else to the first half of `flight`.

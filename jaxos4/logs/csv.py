@@ -56,8 +56,6 @@ def read_table(
 
     The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored.
 
-    **Arguments:**
-
     - `skip`: number of lines before the header.
     - `missing`: cells that mean "not measured", in addition to the empty cell.
     - `lines_at_once`: for the memory; it changes no number.

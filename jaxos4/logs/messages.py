@@ -113,15 +113,10 @@ class Messages:
     def table(
         self, rates: Series, rotors: Series, others: Mapping[Names, Series | None], **facts: Any
     ) -> tuple[RowPositions, Table]:
-        """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
+        """The gyro's samples as rows, at 1 kHz at most, with rotors and `others` brought to them, without impossible samples.
 
-        Impossible samples are taken out before, so that no row takes a share of them. A gyro that is faster than 1 kHz
-        is averaged to 1 kHz. Rotor speeds are measured if `omega1` has a name, and else commands [0..1].
-
-        **Arguments:**
-
-        - `others`: the other sensors, by the names of their columns; `None`: not logged.
-        - `facts`: more fields of `LogFacts`.
+        Series are in our units and frame. Rotor speeds are measured if `omega1` has a name, and else commands [0..1].
+        `others`: by the names of their columns; `None`: not logged. `facts`: more fields of `LogFacts`.
 
         **Returns:** the times of the rows [s], and the table; `t` is 0 in the first row.
 

@@ -46,8 +46,6 @@ class FlightModel(AbstractModel):
     alpha6 m x_c (`jaxos4.center_of_mass`). Only thrust above hover counts, so that an estimate can distinguish it from
     a constant torque. Rotors of unequal thrust cause the same torque.
 
-    **Arguments:**
-
     - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity`, `inflow` and `drag`
       need `Flight.body_velocity`, or states with a velocity. `gyro_bias` and `offset` can be distinguished only if the
       attitude is compared too.

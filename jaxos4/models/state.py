@@ -63,8 +63,8 @@ class Forcing(NamedTuple):
     - `specific_thrust`: U_c/m around the time of the sample [m/s^2], as an accelerometer measures it.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
     - `velocity`: along the body's axes, measured or by dead reckoning [m/s].
-    - `early`: the same quantities, weighted by the time that is left in the sample: what they add to a mean over the
-      sample. `None`: measurements are those at the beginning of a sample.
+    - `early`: the same, weighted by the time that is left in the sample: what they add to a mean over it. `None`:
+      instants.
     """
 
     roll: Samples

@@ -64,14 +64,12 @@ class GatedPerceptron(eqx.Module):
 class CMAC(eqx.Module):
     """The cerebellar model articulation controller: a table of weights, of which an input selects a few.
 
-    The output is a sum over all pairs of inputs; each pair adds the mean of one weight from each of its tilings.
+    A tiling divides the plane of two inputs into square cells, each with a weight. The output is a sum over all pairs
+    of inputs; a pair adds the mean of one weight from each of its tilings, which are shifted, so that inputs that are
+    close share most weights. It is piecewise constant. The outermost cells also hold everything beyond them.
 
-    A tiling divides the plane of two inputs into square cells, and each cell has a weight. The tilings of a pair are
-    shifted against each other, so that inputs that are close share most of their weights. The output is piecewise
-    constant in the inputs. The outermost cells also hold everything beyond them.
-
-    Albus tiles all inputs together and hashes the cells. In nine dimensions two flights rarely share a cell, so that
-    little is learnt; pairs can represent the products in which parameters act on a flight.
+    Albus tiles all inputs together and hashes the cells. In nine dimensions two flights rarely share a cell; pairs can
+    represent the products in which parameters act on a flight.
 
     - `extent`: cells cover inputs from minus this to this: twice what a flight without noise has.
 

@@ -220,8 +220,7 @@ def velocity_of(
     """How a vehicle moved through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
-    this sum are forgotten, and so are slow changes of the velocity. Torque and thrust answer a change of
-    velocity faster than this.
+    this sum, and slow changes of the velocity, are forgotten; torque and thrust answer faster ones.
 
     **Arguments:**
 
@@ -231,7 +230,7 @@ def velocity_of(
       errors of the gyro sooner, the second holds in longer turns.
 
     **Returns:** the velocity along the body's axes [m/s], and the upright direction in these axes by each time
-    constant. They differ in long turns, and if the gyro errs. Both are the same if the attitude was measured.
+    constant. Both are the same if the attitude was measured.
     """
     angles, velocity = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY))
     to_body = None if angles is None else rotations_to_body(*angles.T)

@@ -1,11 +1,9 @@
 """White noise of sensors, and the rotor speeds that are expected given all measured ones.
 
-A noisy input makes the slope of a regression too small: moments of inertia come out too large, and true parameters
-predict worse than shrunken ones. The expectation of the speeds given the measurements has no such bias: what it misses
-does not correlate with it, and acts as a disturbance. It is the Wiener filter, which has no delay.
-
-Thrust and the torques of roll, pitch and yaw are filtered separately: rotors answer some of them more than others, and
-the noise is the same in all.
+A noisy input makes the slope of a regression too small: moments of inertia come out too large. The expectation of the
+speeds given the measurements, by a Wiener filter without delay, has no such bias: what it misses does not correlate
+with it, and acts as a disturbance. Thrust and torques are filtered separately: rotors answer some of them more than
+others, and the noise is the same in all.
 
 Reference: Carroll, Ruppert, Stefanski and Crainiceanu 2006, Measurement Error in Nonlinear Models, ch. 4.
 """

@@ -307,13 +307,8 @@ def _level(
 ) -> tuple[float, float] | None:
     """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
 
-    Over a stretch of flight a vehicle gains little velocity, so all forces together carry its weight.
-
-    **Arguments:**
-
-    - `gained`: the velocity that a stretch gains [m/s].
-    - `carried`: the share of the weight that is carried by other causes.
-    - `upright`: the least mean cosine of the tilt of a vehicle whose weight says how its accelerometer errs.
+    A vehicle gains little velocity over a stretch, at most `gained` [m/s], so all forces together carry its weight, but
+    for the share `carried`. `upright`: the least mean cosine of the tilt.
     """
     force = fitted.specific_force
     if force is None or not (known := np.isfinite(force).all(axis=1)).any():

@@ -66,8 +66,6 @@ def write_log_page(
 ) -> None:
     """Writes the page of a log, completely or not at all.
 
-    **Arguments:**
-
     - `log`: a recording, or the path of a log. `airframe`: of its vehicle; without it, torques are unknown.
     - `found`: of `inspect_log`, if it was computed before. `command`: that makes the page again.
     - `words`: of messages that name an argument of the library, as the user gives it.

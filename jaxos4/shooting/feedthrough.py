@@ -26,10 +26,8 @@ def input_innovations(
 ) -> Float[np.ndarray, "samples feedthroughs 3"]:
     """The part of the torque within each sample that the past does not tell, about each axis, of mean square 1.
 
-    A linear regression on the samples before, of the torque and the rate about the same axis. Of the parts of a sample,
-    `FEEDTHROUGHS` combinations are left, in which most of the rest lies. 0 at the beginning of a stretch.
-
-    **Arguments:**
+    A linear regression on earlier samples of torque and rate about the same axis leaves `FEEDTHROUGHS` combinations of
+    the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch.
 
     - `torque`: in equal parts of each sample, in any unit. `rates`: measured [rad/s]; NaN counts as 0.
     - `stretch`: the number of the uninterrupted stretch of each sample.

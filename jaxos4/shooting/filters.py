@@ -139,19 +139,15 @@ def innovate(
 
     A change of one channel's noise is taken to change no other channel's innovations.
 
-    **Arguments:**
-
-    - `functions`: each takes a state, the forcing and the parameters. The first returns the state one sample later, the
-      second its mean over what a measurement averages, the third the outputs of the sensors.
-    - `observed`: its number of rows is a multiple of `BLOCK`.
+    - `functions`: of a state, the forcing and the parameters: the state one sample later, its mean over what a
+      measurement averages, and the outputs of the sensors.
+    - `observed`: its number of rows is a multiple of `BLOCK`, of which `rows` are filtered; the others are padding.
     - `input_innovations`, `feedthrough`: what they explain of the innovations of the same samples, see
       `jaxos4.shooting.feedthrough`. `passed`: feedthroughs that were found before; what they explain counts as noise.
     - `parameters`: of all segments, or of each.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters at the positions `forcing_parameters`.
     - `window`: what a measurement averages.
-    - `rows`: how many rows are filtered; the others are padding. It is data, so that flights of different lengths share
-      a program.
     """
     flight, at = (
         (observed, input_innovations, forcing, forcing_tangents, rows, dt, window),

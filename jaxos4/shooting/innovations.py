@@ -39,27 +39,22 @@ class InnovationsProblem(AbstractProblem):
 
     Each channel has a disturbance with a strength and a time constant, and white noise of its sensor. The logarithms of
     the three are unknowns like the parameters, and follow them: `log_p_strength`, `log_p_time`, `log_p_sensor`, then
-    those of q, r, and each specific force that the model predicts. The bracket is a Gaussian prior, whose standard
-    deviation is its half-width. With `input_innovations`, each channel has further unknowns, `p_feedthrough_1`
-    and so on: see `jaxos4.shooting.feedthrough`.
-
-    **Arguments:**
+    those of q, r, and each specific force that the model predicts; with `input_innovations` also `p_feedthrough_1` and
+    so on. The bracket is a Gaussian prior, whose standard deviation is its half-width.
 
     - `problem`: model, flight, known or free initial state, and the bracket of the parameters. Its windows and its
       sigma do not matter.
     - `segments`: the number of parts of the flight that are filtered in parallel; by default one for about 384 samples.
-      A short segment loses information if the disturbance is weak, because its filter begins without memory. Padded
-      flights (`ShootingProblem.length`) with equal numbers of segments and equal room share a program, whatever their
-      lengths.
+      Short ones lose information, because a filter begins without memory. Padded flights with equal numbers of segments
+      and equal room share a program.
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
-    - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample; by default
-      nothing: the controller answers no measurement within its sample.
-    - `passed`: feedthroughs that were found before: what they explain counts as noise, which made it. NaN, or by
-      default: not known, so that a search has two stages. The first finds them, the second counts them.
+    - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample, see
+      `jaxos4.shooting.feedthrough`; by default nothing: the controller answers no measurement within its sample.
+    - `passed`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default: not known,
+      so that a search has two stages. The first finds them, the second counts them.
     - `noise_unknowns`: how the noise is looked for.
-    - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
-      of the disturbances.
+    - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants.
     """
 
     problem: ShootingProblem

@@ -40,8 +40,6 @@ _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2
 class ShootingProblem(AbstractProblem):
     """A model, a flight and weights: how badly do parameters explain the flight?
 
-    **Arguments:**
-
     - `model`: its parameters are the unknowns.
     - `flight`: the measurements. NaN in `flight.states` means missing.
     - `sigma`: standard deviation of each channel's noise, in the order of `CHANNEL_NAMES`; its reciprocal is the
