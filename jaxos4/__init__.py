@@ -1,8 +1,6 @@
-"""Identification of a quadrotor's dynamics from recorded flights.
+"""Identification of a quadrotor's dynamics from recorded flights. Public names: `__init__.pyi`, imported when used.
 
 Precision is the caller's choice: `jax.config.update("jax_enable_x64", True)` before anything else, for double.
-
-The public names are in `__init__.pyi`. Each is imported when it is first used, because JAX takes a second to import.
 Import this package before JAX computes: it sets how loops are compiled (`jaxos4._xla`).
 """
 

@@ -35,10 +35,7 @@ def _constant(x: ArrayLike, kind: type) -> Array:
 
 
 def as_constant(x: Any) -> Array | np.ndarray:
-    """Keep a physical constant as a NumPy array in double precision, until a computation uses it.
-
-    JAX would round a module's constants at import, before the user has chosen a precision.
-    """
+    """Keep a constant as a double in NumPy until it is used: at import, the user has chosen no precision yet."""
     return x if isinstance(x, jax.Array) else np.asarray(x, dtype=np.float64)
 
 
@@ -54,7 +51,7 @@ def setting(
 ) -> Callable[[ArrayLike | Sequence[float] | None], Array]:
     """A field's converter: accepts one number, or one for each of `axes`, in a range unless traced.
 
-    An optional setting can be `None`, which is stored as NaN, so that all values share one program.
+    An `optional` setting can be `None`, which is stored as NaN.
     """
 
     def convert(value: ArrayLike | Sequence[float] | None) -> Array:
@@ -78,10 +75,7 @@ def setting(
 
 
 def integer(name: str, least: int, *, static: bool = False) -> Callable[[Any], Any]:
-    """A field's converter: accepts an integer of at least `least`, or a traced array of integers.
-
-    Unless the field is static, it becomes an array, so that other values share the compiled program.
-    """
+    """A field's converter: accepts an integer from `least` on, or a traced one. Unless static, it becomes an array."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, jax.Array | np.integer) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():

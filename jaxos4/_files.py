@@ -1,10 +1,12 @@
-"""Output files are written completely or not at all. JSON and TOML files are read, or refused in one line."""
+"""Files are written completely or not at all, JSON and TOML read or refused in one line, templates escaped."""
 
 import contextlib
 import errno
+import html
 import json
 import math
 import os
+import re
 import secrets
 import shutil
 import sys
@@ -16,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, shortened
+from .errors import InputError, printable, shortened
 
 # Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
 BROKEN = (
@@ -39,13 +41,10 @@ _LARGEST = sys.float_info.max  # of a number: a longer integer has no float, and
 
 @contextlib.contextmanager
 def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yields a temporary path in the folder of `path`, and renames it to `path` when the block ends.
+    """Yields a temporary path beside `path`, with its suffix, and renames it to `path` when the block ends.
 
-    If the block raises, the temporary file is removed and an older `path` does not change. The temporary name keeps the
-    suffix. Links are followed, and the mode of an older file is kept. A pipe or a device cannot be replaced by a
-    rename: `path` itself is yielded.
-
-    **Raises:** `OSError` that names `path` if it is a folder, or its own folder does not exist.
+    If the block raises, an older `path` does not change. Links are followed, and the mode of an older file is kept. A
+    pipe or a device is yielded itself. Raises `OSError` that names `path`.
     """
     target = check_writable(path)
     if target.exists() and not target.is_file():
@@ -82,10 +81,7 @@ def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
-    """`path` with links resolved, checked before a long computation.
-
-    **Raises:** `OSError` that names `path` if its folder does not exist or is not writable, or if `path` is a folder.
-    """
+    """`path` with links resolved. Raises `OSError` if it is a folder, or its folder is missing or not writable."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         return Path(path)  # a pipe or a device, to which a link may lead that is no path
     target = Path(os.path.realpath(path))
@@ -131,10 +127,7 @@ def _read_text(
 
 
 def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST) -> None:
-    """Refuse, at any depth, a text that is not one printable line, and a number beyond `largest`.
-
-    By default, infinity and NaN are allowed.
-    """
+    """Refuse, at any depth, a text that is not one printable line, and a number beyond `largest`, by default none."""
     pending = [("", value)]
     while pending:
         place, each = pending.pop()
@@ -149,3 +142,27 @@ def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST
             continue
         elif isinstance(each, int | float) and not abs(each) <= largest:
             raise InputError(f"{path}: `{shortened(place, 80)}` is beyond {largest:.3g}; {remedy}.")
+
+
+def templates(package: str, escape: Callable[[str], str] | None = None) -> Any:
+    """The templates in a package's folder. `escape`: makes text harmless: `printable`, `in_xml`; by default as HTML."""
+    import jinja2  # slow, and few need it
+    from markupsafe import Markup
+
+    def finalize(value: Any) -> Any:
+        return value if escape is None or isinstance(value, Markup) else Markup(escape(str(value)))  # noqa: S704
+
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader(package, "."),
+        undefined=jinja2.StrictUndefined,
+        autoescape=True,  # macros give markup, which is not escaped twice
+        finalize=finalize,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=escape is not None,
+    )
+
+
+def in_xml(text: str) -> str:
+    """The text in a comment, an attribute or an element of XML. A comment must not contain two hyphens in a row."""
+    return re.sub("-(?=-)", "- ", html.escape(printable(text), quote=False).replace('"', "&quot;"))

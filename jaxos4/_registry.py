@@ -17,12 +17,7 @@ T = TypeVar("T")
 class Registry(UserDict[str, T], Generic[T]):
     """Objects by name: those of the table, then those of installed packages, which replace none of the table.
 
-    **Arguments:**
-
-    - `group`: the group of entry points. The name of an entry point is the name in the table.
-    - `own`: the table.
-
-    **Raises:** `InputError` if an entry point that is looked up cannot be imported.
+    `group`: of entry points, whose names are those in the table. Raises `InputError` if one cannot be imported.
     """
 
     def __init__(self, group: str, own: Mapping[str, T]):

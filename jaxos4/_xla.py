@@ -1,9 +1,8 @@
-"""Flags of XLA for a CPU: loops become native functions.
+"""Flags of XLA for a CPU: loops become native functions, and vectors are whole.
 
-By default, XLA calls one compiled function for every few operations of a loop, in each step. A step of a flight is so
-short that the calls take ten times as long as the operations. XLA also uses half the width of a processor's vectors.
-JAX reads the flags, in `XLA_FLAGS`, when it starts to compute. An unknown flag ends the process, so `pyproject.toml`
-names the versions of JAX that know all of these.
+By default, XLA calls a function for every few operations of a loop, which takes ten times as long. JAX reads
+`XLA_FLAGS` when it starts to compute. An unknown flag ends the process: `pyproject.toml` names the versions that know
+all.
 """
 
 import os

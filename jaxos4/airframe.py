@@ -54,10 +54,7 @@ class Airframe(eqx.Module):
 
     @property
     def sensor_axes(self) -> Float[Numeric, "3 3"]:
-        """The axes of the gyro and the accelerometer in the body, as columns: R_z(yaw) R_y(pitch) R_x(roll).
-
-        The matrix turns what they measure into the body's axes.
-        """
+        """The axes of gyro and accelerometer in the body, as columns: R_z(yaw) R_y(pitch) R_x(roll)."""
         return rotation(self.sensor_rotation * (math.pi / 180))
 
     @property
@@ -135,17 +132,16 @@ def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tup
 def load_airframe(source: str | PathLike[str]) -> Airframe:
     """Load an airframe by the name of a preset, or from a TOML file.
 
-    Presets: `os4`, `os4-simulator`, `voos`, and vehicles to start from: `crazyflie`, `crazyflie-brushless`, `x500`.
-    Their files (`jaxos4/airframes`) say where each number is from.
+    Presets: `os4`, `os4-simulator`, `voos`; `crazyflie`, `crazyflie-brushless` and `x500` are vehicles to start from,
+    whose files (`jaxos4/airframes`) say where each number is from.
 
-    The keys of the file, in SI units: `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, `drag_coefficient`,
-    `rotor_inertia`; either `arm` (plus layout) or `rotor_positions = [[x1, y1], ...]`; optionally `rotor_spins`,
-    `gravity`, `max_rotor_speed` and `sensor_rotation`. `hover_speed`, at which the rotors carry the weight [rad/s], can
-    replace `thrust_coefficient`.
+    The keys of a file, in SI units: `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, or `hover_speed`, at which
+    the rotors carry the weight [rad/s], `drag_coefficient`, `rotor_inertia`; `arm` (plus layout) or `rotor_positions =
+    [[x1, y1], ...]`; optionally `rotor_spins`, `gravity`, `max_rotor_speed`, `sensor_rotation`.
 
-    `inertia`, `drag_coefficient` and `rotor_inertia` can be `"guess"`. With the mass m, and the rotors' distance r from
-    the centre (root mean square), the guesses are: inertia m r^2 [0.3, 0.3, 0.5], drag coefficient 0.1 r times the
-    thrust coefficient, rotor inertia 0.001 m r^2. They are good enough to begin a search.
+    `inertia`, `drag_coefficient` and `rotor_inertia` can be `"guess"`, good enough to begin a search: with the mass m
+    and the root mean square distance r of the rotors from the centre, m r^2 [0.3, 0.3, 0.5], 0.1 r times the thrust
+    coefficient, and 0.001 m r^2.
 
     **Raises:** `InputError` with one line that names the wrong key; `OSError` if the file cannot be read.
     """

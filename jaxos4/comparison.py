@@ -19,11 +19,10 @@ Source = Identification | str | os.PathLike[str]
 class ComparedQuantity(NamedTuple):
     """One quantity in all results.
 
-    - `name`, `unit`: see `PhysicalQuantity`.
-    - `answers`: that of each result; `None` if it has none.
-    - `used`: which of them count: those with a standard deviation that no verdict refuses.
-    - `value`, `std`: the mean of these, weighted by 1 / std^2, and its standard deviation; NaN without any. If they
-      scatter more than their intervals say, `std` is widened by the square root of `chi2` over its degrees of freedom.
+    - `answers`: that of each result, or `None`. `used`: which of them count: with a standard deviation, and not
+      refused.
+    - `value`, `std`: the mean of these, weighted by 1 / std^2; NaN without any. If they scatter more than their
+      intervals say, `std` is widened by the square root of `chi2` over its degrees of freedom.
     - `chi2`, `p`: the weighted sum of squares about the mean, and the probability of this or more if all results are of
       one value. NaN if fewer than two count.
     """
@@ -75,8 +74,6 @@ def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Compar
     The test is that of equality of independent estimates with known standard deviations: chi-squared, with one degree
     of freedom less than results. Mass and arms are the same in all results, so that agreement says nothing about them.
 
-    **Arguments:**
-
     - `results`: two or more, of `jaxos4.identify`, or files of `jaxos4 estimate --out`; all of one kind of model.
     - `level`: see `Comparison`.
 
@@ -126,7 +123,7 @@ def _names(results: Sequence[Source], every: Sequence[Identification]) -> tuple[
 
 
 def _notes(names: Sequence[str], every: Sequence[Identification], *, same: float = 1e-3) -> list[str]:
-    """What makes the results hard to compare. `same`: constants of airframes that differ by less are equal."""
+    """Reasons why results are hard to compare. `same`: constants of airframes that differ by less are equal."""
     notes, first = [], every[0].airframe
     for constant, why in (("mass", "are proportional to it"), ("rotor_positions", "depend on them")):
         values = [np.asarray(getattr(each.airframe, constant), dtype=float) for each in every]

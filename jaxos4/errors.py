@@ -5,15 +5,13 @@ from collections.abc import Iterator
 
 
 class InputError(ValueError):
-    """A file or an argument cannot be used. The message is one printable line, whatever a file put into it.
-
-    `longest`: in characters; a path alone may have 4096.
-    """
+    """A file or an argument cannot be used. The message is one printable line of at most `longest` characters."""
 
     longest = 5000
 
     def __init__(self, message: str):
-        super().__init__(_middle_cut(printable(message), self.longest))
+        text, half = printable(message), (self.longest - 3) // 2
+        super().__init__(text if len(text) <= self.longest else f"{text[:half]}...{text[-half:]}")
 
 
 class TrainingError(RuntimeError):
@@ -23,12 +21,6 @@ class TrainingError(RuntimeError):
 def printable(text: str) -> str:
     """`text` on one line, with unprintable characters escaped: line breaks, controls, bytes that are not UTF-8."""
     return text if text.isprintable() else "".join(x if x.isprintable() else repr(x)[1:-1] for x in text)
-
-
-def _middle_cut(text: str, most: int) -> str:
-    """The text, with its beginning and its end if it is longer than `most` characters."""
-    half = (most - 3) // 2
-    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
 
 
 def shortened(text: str, most: int) -> str:

@@ -39,16 +39,14 @@ _count = functools.partial(jnp.asarray, dtype=int)
 class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
-    - `parameters`: all unknowns that the problem's windows share; a fixed one has its value, and a variance of 0. If
-      `result` says that there is no estimate: the bracket's center, or 0 if the bracket is invalid. The bracket of a
-      network is its own.
-    - `covariance`: of `parameters`; infinite without an estimate. It follows from the Fisher information at the
-      estimate and the problem's `sigma`; that of a network from its errors on simulated flights.
+    - `parameters`: all unknowns that the problem's windows share; a fixed one has a variance of 0. Without an estimate
+      (see `result`): the bracket's center, or 0 if the bracket is invalid. The bracket of a network is its own.
+    - `covariance`: of `parameters`, from the Fisher information and the problem's `sigma`; a network's from its errors
+      on simulated flights. Infinite without an estimate.
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
-    - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own); infinite without
-      an estimate.
-    - `rollouts`: the work in simulated flights: one for a shot, and one for each of its derivatives. IBSS, and the fit
-      of an initial state alone, count the derivatives only. `sweeps`: number of iterations, summed over the stages.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own), or infinite.
+    - `rollouts`: simulated flights: one for a shot, and one for each of its derivatives; IBSS, and the fit of an
+      initial state alone, count the derivatives only. `sweeps`: number of iterations, summed over the stages.
     - `result`: how the search ended.
     - `calibration`: of the intervals, if they were calibrated on simulated flights; `None` means Gaussian.
     - `seed`: the bracket that the search began from, if another estimator gave one.
@@ -110,8 +108,6 @@ def as_estimate(
     **more: Any,
 ) -> Estimate:
     """The answer of an algorithm as an `Estimate`, with its result code. All its parameters are finite.
-
-    **Arguments:**
 
     - `feasible`: whether the trajectory did not fail before its end. `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
@@ -221,11 +217,7 @@ class AbstractEstimator(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, problem: Any, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight, in the problem's own bracket or in another.
-
-        `problem`: a `ShootingProblem`, or any other `AbstractProblem`. For a batch use `eqx.filter_vmap`: a lane that
-        fails does not change the others.
-        """
+        """Identifies one flight, in the problem's own bracket or in another. For a batch use `eqx.filter_vmap`."""
 
 
 class AbstractRecursion(AbstractEstimator):
@@ -238,8 +230,7 @@ class AbstractRecursion(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
-        windows, or a model with rotor lag, delay, thrust curve or sensor terms.
+        **Raises:** `ValueError` for a wrong bracket, windows, or a model with rotor or sensor terms.
         """
         if problem.windows > 1:
             remedy = f"got {problem.windows}: use an estimator that shoots"

@@ -1,11 +1,10 @@
 """Factors and inverses of small symmetric positive semidefinite matrices: information and covariance matrices.
 
-All functions use plain operations in one loop. They vectorise over a batch of small matrices, while LAPACK's batched
-kernels inside a loop can deadlock on a CPU (seen with jaxlib 0.10 and 512 lanes). A direction without information gets
-a variance that is huge, but neither infinite nor negative.
+Plain operations in one loop vectorise over a batch, and LAPACK's batched kernels in a loop can deadlock on a CPU (seen
+with jaxlib 0.10). A direction without information gets a huge variance, neither infinite nor negative.
 
-**Windows.** Each window of a flight has an information matrix (n, n). Its first `count` unknowns are the parameters,
-which all windows share; the others are the initial state of that window. The time is linear in the number of windows.
+**Windows.** Each has an information matrix (n, n), in the `count` parameters that all windows share, and then in its
+own initial state. The time is linear in the number of windows.
 """
 
 from typing import NamedTuple
@@ -19,21 +18,17 @@ PerWindow = Float[Array, "windows n"]
 
 
 class JointFactor(NamedTuple):
-    """A factor A of the information A A^T of each window, and its `basis` A^-T.
-
-    The columns of `basis` are directions of unit information. The covariance of the unknowns is basis basis^T.
-    """
+    """A factor A of the information A A^T of each window, and its `basis` A^-T: directions of unit information."""
 
     factor: Float[Array, "windows n n"]
     basis: Float[Array, "windows n n"]
 
 
 def joint_factor(information: Float[Array, "windows n n"], count: int) -> JointFactor:
-    """A factor of the joint information of each window: A A^T is the inverse of its covariance.
+    """A factor of the joint information of each window: A A^T is the inverse of its covariance among all windows.
 
-    The covariance is that of the window's unknowns when those of all windows are estimated together. The last `count`
-    columns of A hold the factor for the shared unknowns. Each window's own unknowns are eliminated first, and the
-    remaining Schur complements are summed: no subtraction loses digits in single precision.
+    The last `count` columns of A are for the shared unknowns. Each window's own unknowns are eliminated first, and the
+    Schur complements summed: no subtraction loses digits in single precision.
     """
     windows, size, _ = information.shape
     own, places = size - count, np.arange(size)

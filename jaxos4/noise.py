@@ -1,7 +1,6 @@
-"""Sensor noise: turns a simulated flight into a measured one.
+"""Sensor noise: turns a simulated flight into a measured one; `vmap` it over keys, flights or its own numbers.
 
-A noise changes `Flight.states` and nothing else. States that were not measured stay NaN. A noise acts on one flight;
-`vmap` it over keys, flights or its own numbers.
+A noise changes `Flight.states` and nothing else. States that were not measured stay NaN.
 """
 
 import abc
@@ -49,10 +48,7 @@ class WhiteNoise(AbstractNoise):
 
 
 class ConstantBias(AbstractNoise):
-    """A Gaussian offset of each state that is constant during the flight.
-
-    - `sigma`, `mean`: of the offset, for each state in `STATE_UNITS`. `ConstantBias(0, mean=offset)` is a known offset.
-    """
+    """A Gaussian offset of each state that is constant during the flight; `sigma`, `mean`: in `STATE_UNITS`."""
 
     sigma: PerChannel = eqx.field(converter=setting("sigma", STATE_NAMES))
     mean: PerChannel = eqx.field(converter=setting("mean", STATE_NAMES, low=-np.inf), default=0.0)
@@ -63,9 +59,7 @@ class ConstantBias(AbstractNoise):
 
 
 class GaussMarkov(AbstractNoise):
-    """Coloured errors: a stationary first-order process with autocorrelation sigma^2 exp(-|tau| / T).
-
-    The samples are exact: e_{k+1} = a e_k + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T) and w_k standard normal.
+    """Coloured errors: a stationary first-order process with autocorrelation sigma^2 exp(-|tau| / T), exact at samples.
 
     - `sigma`: standard deviation for each state, in `STATE_UNITS`.
     - `correlation_time`: T [s] for each state, positive. Infinite: a constant bias.

@@ -46,13 +46,10 @@ _File = msgspec.defstruct(
 
 
 def read_result(path: str | os.PathLike[str]) -> Identification:
-    """Read a file that `jaxos4 estimate --out` wrote.
+    """Read a file of `jaxos4 estimate --out`: the result of `jaxos4.identify`, without `estimate` and `problem`.
 
-    The result is that of `jaxos4.identify`, without `estimate` and `problem`. Files of older versions lack
-    `predictions` and `response`.
-
-    **Raises:** `InputError`, one line, if the file is no result, also for texts, numbers and correlations that no
-    result has; `OSError` if it cannot be read.
+    **Raises:** `InputError`, one line, if it is none, also for texts, numbers and correlations that no result has;
+    `OSError`.
     """
     value = read_json(path, _REMEDY, _LARGEST)
     with named(path):
@@ -82,10 +79,7 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
 
 
 def vehicle_result(found: Identification | str | os.PathLike[str]) -> Identification:
-    """The result of a vehicle with an estimate: this one, or the one in a file, as `read_result` reads it.
-
-    **Raises:** `InputError`, one line, if it has no vehicle or no estimate; errors of `read_result`.
-    """
+    """The result of a vehicle, given or read, with an estimate. Raises `InputError`, one line; as `read_result`."""
     given = isinstance(found, Identification)
     own = found if given else read_result(found)
     with named("" if given else found):

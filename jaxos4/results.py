@@ -9,10 +9,7 @@ NINETY_FIVE = 1.959963984540054
 
 
 class RESULTS(eqx.Enumeration):
-    """How a simulation or an estimate ended.
-
-    The codes are valid in this process only. Files store the names, see `result_names`.
-    """
+    """How a simulation or an estimate ended. Codes are valid in this process; files store names (`result_names`)."""
 
     successful = ""
     at_bound = "a parameter reached the limit of the search around its bracket: widen the bracket or correct the model"

@@ -32,10 +32,7 @@ def midpoint_step(model: AbstractModel, state: State, forcing: Forcing, paramete
 
 
 def rk4_step(model: Any, state: S, forcing: Any, parameters: Any, dt: Scalar) -> S:
-    """The classical Runge-Kutta step, of order 4. The forcing is constant over the step.
-
-    `model`: whatever gives the derivative of a state, which is any tree of numbers, in its method `cascade`.
-    """
+    """The classical Runge-Kutta step, of order 4, with a constant forcing; `model.cascade` has the derivative."""
     k1 = model.cascade(state, forcing, parameters)
     k2 = model.cascade(_advance(state, k1, dt / 2), forcing, parameters)
     k3 = model.cascade(_advance(state, k2, dt / 2), forcing, parameters)

@@ -1,7 +1,4 @@
-"""Sine and cosine in one polynomial evaluation that vectorises over a batch of lanes.
-
-On a CPU the library's functions would take most of the time of a simulation step (see docs/measured.md).
-"""
+"""Sine and cosine in one polynomial evaluation over lanes, because a CPU's library functions are slow in steps."""
 
 import math
 

@@ -32,7 +32,7 @@ from jaxos4._files import read_toml
 from jaxos4.airframe import load_airframe
 from jaxos4.errors import InputError
 from jaxos4.export import TARGETS, export_vehicle, read_result
-from jaxos4.forecast.vehicle import vehicle_of
+from jaxos4.forecast import vehicle_of
 from jaxos4.identification.problem import bracket_of
 from jaxos4.logs import read_log
 from jaxos4.logs.messages import Messages
@@ -40,8 +40,8 @@ from jaxos4.models import MODELS
 from jaxos4.recording import read_recording
 from jaxos4.recording.inspection import airframe_draft, inspect_log
 from jaxos4.report.identification_figures import priors, strongest
-from jaxos4.report.identification_signals import identified_signals
 from jaxos4.report.style import style
+from jaxos4.report.timeline import identified_signals
 from jaxos4.study import load_study, read_results
 from jaxos4.study.dataset import read_store
 

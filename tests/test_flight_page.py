@@ -39,9 +39,9 @@ from jaxos4.report.identification_page import (
     vehicle,
     verdict,
 )
-from jaxos4.report.identification_signals import identified_signals, prediction_band
 from jaxos4.report.style import drawing, styles, svg
 from jaxos4.report.text import MISSING, Listing, plain
+from jaxos4.report.timeline import identified_signals, prediction_band
 
 EVIL = "</script><script>alert(1)</script>"
 

@@ -14,10 +14,9 @@ from .evaluation import Evaluation
 class Correlations(NamedTuple):
     """Correlations of the residuals of some channels: with themselves, and with the roll, pitch and yaw torque.
 
-    - `own`: at 1, 2, ... samples apart. `with_torque`: at lags from -`lags` to `lags`; at a positive lag, the residual
-      is the later one. A controller answers residuals, so that a vehicle has correlations at negative lags.
-    - `bound`, `torque_bound`: 95 % of the correlations of residuals that are white, and that no torque causes, are
-      smaller. The second one allows for coloured residuals.
+    - `own`: at 1, 2, ... samples apart. `with_torque`: at lags of the residual from -`lags` to `lags`; controllers
+      answer residuals, at negative lags.
+    - `bound`, `torque_bound`: larger than 95 % of those of white residuals, and of coloured ones without a torque.
     """
 
     own: Float[np.ndarray, "channels lags"]

@@ -1,8 +1,7 @@
 """A flight simulated at the answer of a fit, with all first derivatives: what every check of a fit is computed from.
 
-The simulation is one compiled program. What follows from it is small, and NumPy computes it: bounds, identifiability,
-diagnostics and noise levels need no program of their own. The covariance of a fit is the Cramer-Rao bound. If residuals
-are coloured, or not as large as sigma says, it is the sandwich covariance.
+The simulation is one compiled program, and NumPy computes the rest. The covariance of a fit is the Cramer-Rao bound,
+or the sandwich covariance if residuals are coloured, or not as large as sigma says.
 """
 
 from typing import NamedTuple
@@ -94,10 +93,7 @@ class Evaluation(NamedTuple):
 def evaluate(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Evaluation:
-    """Simulate a flight with all first derivatives. `initial_state` defaults to the measured one.
-
-    **Raises:** `ValueError` for wrong shapes.
-    """
+    """Simulate a flight with all first derivatives; `initial_state`: by default as measured. Raises `ValueError`."""
     for name, value, length in (
         ("parameters", parameters, len(problem.model.parameter_names)),
         ("initial_state", initial_state, problem.windows * problem.size),
@@ -148,9 +144,8 @@ def cramer_rao_bound(
 ) -> Covariance:
     """The smallest covariance that an unbiased estimate can have: the inverse of the Fisher information J^T W^2 J.
 
-    J is the Jacobian at `parameters`, W the weights 1 / sigma. A free initial state is unknown too. `initial_state` is
-    where J is computed, by default the measured one; it is ignored if the problem's initial state is known. A parameter
-    that is not excited has a huge variance, but not an infinite one.
+    J is the Jacobian at `parameters` and a free `initial_state`, by default as measured, W the weights 1 / sigma. A
+    parameter that is not excited has a huge variance, but not an infinite one.
     """
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     information = problem.local_model(problem.join(as_float(parameters), start)).information
@@ -161,15 +156,9 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
-    too. The residuals are taken as the noise. They lack slow noise that the fit explained as motion. A flight must
-    therefore be many times longer than the correlation time of the noise.
-
-    The noise is taken as stationary. With at least 20 windows of at most 4,000 residuals each, all windows are taken
-    instead as having noise of one covariance.
-
-    **Arguments:** the flight, evaluated at the answer of a fit.
-
-    **Returns:** the covariance; infinite if the trajectory diverges or nothing was measured.
+    too. The residuals are taken as the noise, and lack slow noise that the fit explained as motion: a flight must be
+    many times longer than the noise's correlation time. The noise is stationary, or, with 20 windows or more of at most
+    4,000 residuals each, of one covariance in all windows. Infinite if the trajectory diverges or nothing was measured.
 
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """
@@ -193,8 +182,7 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
 def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
     """The covariance for stationary noise: R(t, s) depends on t - s only. The first axis of all arrays is time.
 
-    Residuals are taken as correlated over lags up to a tenth of the flight. Bartlett's weights make the sum over lags
-    positive. Sums over lags are products of spectra.
+    Lags reach to a tenth of the flight, with Bartlett's weights. Sums over lags are products of spectra.
     """
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
@@ -215,8 +203,7 @@ def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> 
 def _window_by_window(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
     """The covariance for many windows: the residuals of the windows are draws of one random vector.
 
-    The initial state of a window absorbs some slow noise, more at its ends than in its middle, so residuals are not
-    stationary. The covariance of the vector, and of the vector with its successor, is the mean over the windows.
+    Residuals are not stationary: the initial state of a window absorbs slow noise, more at its ends.
     """
 
     def contribution(apart: int) -> Spread:
@@ -232,10 +219,7 @@ def _window_by_window(errors: np.ndarray, measured: np.ndarray, moves: np.ndarra
 
 
 def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
-    """The inverse of symmetric positive semidefinite matrices, whatever the units of their rows.
-
-    A direction without information gets a variance that is huge, but neither infinite nor negative.
-    """
+    """The inverse of symmetric positive semidefinite matrices in any units; huge, but finite, without information."""
     scale, values, vectors = unit_eigen(information)
     inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return inverse / scale[..., :, None] / scale[..., None, :]
@@ -244,10 +228,7 @@ def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "
 def unit_eigen(
     matrix: Float[np.ndarray, "*batch n n"],
 ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n n"]]:
-    """The scale that makes the diagonal 1, and the eigenvalues and eigenvectors of the scaled matrix.
-
-    An eigenvalue below the rounding errors counts as large as these.
-    """
+    """The scale that makes the diagonal 1, and the eigenvalues, at least the rounding errors, and eigenvectors then."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where((diagonal > 0) & np.isfinite(diagonal), diagonal, 1.0))
     unit = matrix / scale[..., :, None] / scale[..., None, :]

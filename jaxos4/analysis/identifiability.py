@@ -60,7 +60,12 @@ class Identifiability(eqx.Module):
             if not self.excited[i]:
                 return "not identifiable: not excited"
             if not self.identifiable[i]:
-                return f"not identifiable: only together with {', '.join(names[j] for j in self._partners(i))}"
+                vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
+                weakest = np.abs(vectors[:, np.argmax(np.abs(vectors[i]))])
+                share = weakest / weakest.max()  # that changes together with least effect on the flight
+                partners = np.flatnonzero((share > self.partner) & (np.arange(share.size) != i)).tolist()
+                partners = partners or [int(np.argsort(share)[-2])]
+                return f"not identifiable: only together with {', '.join(names[j] for j in partners)}"
             if self.noise_limit[i] < 1 and self.nominal[i] != 0:
                 limit = f"{self.noise_limit[i]:.2g} times this noise"
                 return f"below the noise floor: can be distinguished from 0 below {limit}"
@@ -68,22 +73,12 @@ class Identifiability(eqx.Module):
 
         return {name: text for i, name in enumerate(names) if (text := note(i))}
 
-    def _partners(self, i: int) -> list[int]:
-        """The parameters that can change together with parameter `i` with the least effect on the flight."""
-        vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
-        weakest = vectors[:, np.argmax(np.abs(vectors[i]))]
-        share = np.abs(weakest) / np.abs(weakest).max()
-        return [j for j in range(len(share)) if j != i and share[j] > self.partner] or [int(np.argsort(share)[-2])]
-
 
 def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability:
     """Analyse which parameters of the problem's model its flight can identify, at the problem's sigma.
 
-    **Arguments:** the flight, evaluated where the information is computed, and a bracket, whose half-widths say how
-    well each parameter is known without the flight. A free initial state is estimated too. If the trajectory diverges,
-    or the bracket is not valid, the standard deviations are infinite.
-
-    **Raises:** `ValueError` for a bracket of another length.
+    `bracket`: says how well each is known without the flight. The standard deviations are infinite if the trajectory
+    diverges or the bracket is not valid. Raises `ValueError` for a bracket of another length.
     """
     if bracket.lower.shape != evaluation.nominal.shape:
         raise ValueError(f"`bracket` must hold {evaluation.nominal.size} parameters, got {bracket.lower.shape[0]}.")

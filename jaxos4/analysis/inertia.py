@@ -1,7 +1,4 @@
-"""The constants of a rigid body from a fit: Ix, Iy, Iz, J_R from alpha_1..8, and the place of the centre of mass.
-
-These are a few small matrix products, computed by NumPy: a compiled program would cost seconds and save nothing.
-"""
+"""The constants of a rigid body from a fit: Ix, Iy, Iz, J_R from alpha_1..8, and the place of the centre of mass."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -102,10 +99,9 @@ def _alphas(constants: np.ndarray) -> np.ndarray:
 
 
 def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The constants, the curvature of the cost, and the weighted residuals.
+    """The constants, the curvature of the cost, and the weighted residuals, after 20 steps, which are enough.
 
-    It starts at the reciprocals of alpha3, 6, 8 if they are within a factor of 100 of the airframe's inertia. 20 steps
-    are enough, because the alphas are nearly linear in the constants over their errors.
+    It starts at the reciprocals of alpha3, 6, 8 if they are within a factor of 100 of the airframe's inertia.
     """
     first = 1 / alpha[..., [2, 5, 7]]
     first = np.where((first > inertia / 100) & (first < 100 * inertia), first, inertia)
@@ -127,10 +123,7 @@ def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) ->
 
 
 class CenterOfMass(NamedTuple):
-    """A coordinate of the centre of mass in the frame of the rotor positions: x forward, y left [m].
-
-    `std`: its standard deviation [m].
-    """
+    """A coordinate of the centre of mass, x forward or y left of the rotor positions' origin, and its `std` [m]."""
 
     axis: str
     value: float

@@ -30,8 +30,6 @@ def open_loop(
 ) -> Motion:
     """The motion after each step. Nothing is measured any more, and the disturbance fades.
 
-    **Arguments:**
-
     - `advance(motion, row, added)`: the motion after one step, to which disturbances add `added`.
     - `disturbance`: of each channel at the start, as filters know it.
     - `rows`: the forcing of each step.
@@ -97,10 +95,9 @@ class Traced(NamedTuple):
 
 
 def traced(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Traced:
-    """What Kalman filters know at each sample from the measurements until then, for the noise that was found.
+    """The knowledge of Kalman filters at each sample from the measurements until then, at the measured rates.
 
-    The model is evaluated at the measured rates. An innovation is a measured rate less its prediction from the sample
-    before. `noise`: its first three channels are p, q and r.
+    An innovation is a measured rate less its prediction. `noise`: its first three channels are p, q and r.
     """
     rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
     modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))

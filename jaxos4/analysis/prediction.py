@@ -172,8 +172,5 @@ def decisive_horizon(
     *,
     wanted: float = 0.25,
 ) -> int:
-    """The place of the horizon nearest to `wanted` [s] among those that are `known`: something was measured there.
-
-    A quarter of a second is long enough for a wrong model to show, and short enough for gusts not to decide.
-    """
+    """The place of the `known` horizon nearest to `wanted` [s]: it shows a wrong model, and gusts do not decide it."""
     return int(np.argmin(np.where(known, np.abs(np.asarray(horizons) - wanted), np.inf)))

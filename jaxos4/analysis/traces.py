@@ -1,4 +1,4 @@
-"""What a result keeps of its flights, so that its page can be drawn again: signals over time."""
+"""Signals over time that a result keeps of its flights, so that its page can be drawn again."""
 
 from typing import NamedTuple
 
@@ -43,18 +43,14 @@ class Traces(NamedTuple):
         fewer = {"log": self.log[::every]}
         for name, values in self._asdict().items():
             if values.ndim == 2:
-                fewer[name] = significant(_first_finite(np.where(apart[:, None], np.nan, values), every), digits)
+                rows = ((0, -len(values) % every), (0, 0))  # the last block may be shorter
+                padded = np.pad(np.where(apart[:, None], np.nan, values), rows, constant_values=np.nan)
+                cut = padded.reshape(len(padded) // every, every, values.shape[1])
+                known = np.isfinite(cut)
+                first = np.take_along_axis(cut, known.argmax(axis=1)[:, None], axis=1)[:, 0]
+                fewer[name] = significant(np.where(known.any(axis=1), first, np.nan), digits)
         times = {"time": self.time[::every].round(digits), "start_time": self.start_time.round(digits)}
         return self._replace(**fewer | times)
-
-
-def _first_finite(values: Float[np.ndarray, "samples channels"], every: int) -> Float[np.ndarray, "blocks channels"]:
-    """The first finite value of each block of so many samples; NaN if there is none. The last block may be shorter."""
-    padded = np.pad(values, ((0, -len(values) % every), (0, 0)), constant_values=np.nan)
-    cut = padded.reshape(len(padded) // every, every, values.shape[1])
-    known = np.isfinite(cut)
-    first = np.take_along_axis(cut, known.argmax(axis=1)[:, None], axis=1)[:, 0]
-    return np.where(known.any(axis=1), first, np.nan)
 
 
 def flight_traces(found: Evaluation) -> Traces:

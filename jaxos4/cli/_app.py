@@ -1,21 +1,69 @@
-"""The application: its commands and exit codes."""
+"""The application: its commands, their exit codes, and how JAX is prepared for them."""
 
 import functools
 import io
 import os
 import sys
+import tempfile
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from .._xla import add_flags
 from ..errors import InputError, TrainingError, printable
-from ._jax import NO_CACHE, prepare
 from .estimate import estimate, train
 from .identified import export, predict
 from .information import identifiability, inspect
 from .new_flights import design, simulate
 from .studies import compare, report, study
+
+NO_CACHE = "JAXOS4_NO_CACHE"
+"""The environment variable that switches off the cache of compiled programs."""
+
+
+def prepare(*, batch: bool) -> None:
+    """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off.
+
+    `batch`: whether the command computes many flights at once; those of a single one should compile quickly.
+    """
+    if not batch:
+        add_flags(quick=True)
+
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if os.environ.get(NO_CACHE):
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        folder = _usable_folder()
+        if folder is None:
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_max_size", 1 << 30)  # 1 GB
+    if jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 1.0:  # JAX's default [s]
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
+    # Another process may be writing the same program, or remove it: it is then compiled again.
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+
+
+def _usable_folder() -> Path | None:
+    """The folder of compiled programs; `None` if it cannot be written."""
+    import platformdirs
+
+    # JAX removes the oldest programs only from a folder that has had a limit since its first one.
+    folder = platformdirs.user_cache_path("jaxos4", appauthor=False) / "compiled"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        return folder
+    except OSError:
+        return None
+
 
 _EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1: nothing is kept."
 
@@ -55,10 +103,7 @@ def _jaxos4(
 
 
 def main() -> None:
-    """Runs the command line.
-
-    Exit code 0: done, 1: the computation failed, 2: unusable arguments or input, 130: interrupted.
-    """
+    """Runs the command line. Exit code 0: done, 1: failed, 2: unusable arguments or input, 130: interrupted."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may hold what no encoding can print
@@ -77,14 +122,10 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # what all errors of the parser have, in every version of typer
             raise
-        typer.echo(_parser_message(error), err=True)
+        mistake: Any = error
+        message, ctx = mistake.format_message().removesuffix(".").replace("Value error, ", ""), mistake.ctx
+        if "\n" not in message:  # else it is the help, because there are no arguments
+            message = f"jaxos4: {message}; see `{ctx.command_path if ctx else 'jaxos4'} --help`."
+        typer.echo(message, err=True)
         raise SystemExit(2) from None
     raise SystemExit(code)
-
-
-def _parser_message(error: Any) -> str:
-    """A mistake in the arguments in one line. If there are no arguments: the help."""
-    message = error.format_message().removesuffix(".").replace("Value error, ", "")
-    if "\n" in message:
-        return message
-    return f"jaxos4: {message}; see `{error.ctx.command_path if error.ctx else 'jaxos4'} --help`."

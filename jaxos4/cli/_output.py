@@ -1,7 +1,4 @@
-"""Output of the commands: the stage of a computation, the library's messages with names of options, and files.
-
-Files are checked before the work that fills them, are never one of the inputs, and are written whole or not at all.
-"""
+"""Output of the commands: progress, the library's messages with names of options, and files, whole or not at all."""
 
 import contextlib
 import json
@@ -33,10 +30,7 @@ OPTIONS = {
 
 
 def in_options(text: str, **files: Path | None) -> str:
-    """A message with options in the place of the library's arguments: `--from` for `` `begin` ``.
-
-    `files`: file names to print behind an option.
-    """
+    """A message with options for the library's arguments. `files`: names of files to print behind an option."""
     for argument, option in OPTIONS.items():
         path = files.get(argument.strip("`"))
         text = text.replace(argument, option if path is None else f"{option} {path}")
@@ -82,10 +76,7 @@ def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]
 
 
 def check_outputs(*inputs: Path | str | None, **outputs: Path | None) -> None:
-    """Refuses outputs that cannot be written, that would overwrite an input, or that are one file.
-
-    `outputs`: by the names of their options in Python.
-    """
+    """Refuses outputs that cannot be written, overwrite an input, or are one file. `outputs`: by their options."""
     sources = [Path(source) for source in inputs if source is not None and Path(source).exists()]
     names: dict[Path, str] = {}
     for name, out in outputs.items():

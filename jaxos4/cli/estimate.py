@@ -81,10 +81,7 @@ def estimate(
 def _subject(
     recordings: "list[jaxos4.Recording]", model: options.VehicleModel | None, vehicle: "jaxos4.Airframe", *, given: bool
 ) -> "tuple[jaxos4.Airframe | jaxos4.AbstractModel, str]":
-    """The airframe of a real vehicle, or a model of an OS4; and why a log is evidently of a real vehicle, if one is.
-
-    `given`: whether the user gave the airframe.
-    """
+    """An airframe or an OS4 model; and why a log is evidently of a vehicle. `given`: whether the airframe was."""
     from ..models import MODELS
 
     shown = (f"{each.name} {why}" for each in recordings if (why := each.vehicle_evidence))

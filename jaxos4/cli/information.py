@@ -40,7 +40,7 @@ def inspect(
 
         from ..recording import read_recording
         from ..recording.inspection import airframe_draft, inspect_log
-        from ..report.log_text import print_inspection
+        from ..report.terminal import print_inspection
 
         progress("reading")
         vehicle = None if airframe is None else jaxos4.load_airframe(airframe)
@@ -79,7 +79,7 @@ def identifiability(
 
         from ..models import MODELS
         from ..recording import read_recording
-        from ..report.log_text import print_information
+        from ..report.terminal import print_information
 
         progress("reading")
         subject = MODELS[model](jaxos4.load_airframe(airframe))

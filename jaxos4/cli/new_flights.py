@@ -203,10 +203,7 @@ def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "jaxos4.Des
 
 
 def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a command, with the defaults of its kind of flight.
-
-    Refuses options of the other kind, and settings that are out of range.
-    """
+    """The options of a command with the defaults of its kind of flight. Refuses those of the other, or out of range."""
     own, others = (_CLOSED, _OPEN) if closed_loop else (_OPEN, _CLOSED)
     for name, value in options.given(**asked).items():
         if name in others and name not in own:

@@ -166,8 +166,7 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
 def comparison(*, quick: bool) -> "jaxos4.study.Study":
     """The study that compares the estimators: the whole one, or a short one.
 
-    The training is shorter than the best one. The network loses accuracy, the hybrid does not: its search starts from a
-    network of the rates, and a short training is enough for that.
+    Training is short. The network loses accuracy; the hybrid does not, as its search only starts from a network.
     """
     if quick:
         return jaxos4.study.Study(

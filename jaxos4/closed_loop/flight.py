@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float, integer, setting
 from ..airframe import alpha_scalars
+from ..excitation import References, random_references
 from ..flight import Flight
 from ..linalg import invert
 from ..models.os4 import CorrectedOS4
@@ -17,7 +18,6 @@ from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
-from .references import References, random_references
 from .sensors import BodyMotion, Sense, Signals, log
 from .settings import ClosedLoop, PerAxis
 
@@ -27,17 +27,15 @@ def fly_closed_loop(
 ) -> Flight:
     """Fly a vehicle in closed loop from hovering, and return what its autopilot logs. `vmap` it for a batch.
 
-    **Arguments:**
-
-    - `references`: roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, of shape
-      (samples, 4); `random_references` makes some.
+    - `references`: roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, of shape (samples,
+      4).
     - `dt`: the sample time of the log [s]. The controller runs `loop.log_every` times in it.
     - `key`: for the gusts and the noise.
     - `substeps`: Runge-Kutta steps of the physics in each sample, a multiple of `loop.log_every`.
 
     **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands that
-    act from sample k on, or the speed of each rotor at sample k. Its `result` is that of `simulate`. After a failure
-    the measurements are NaN and the rotor speeds are 0.
+    act from sample k on, or the speed of each rotor at sample k. After a failure (`result`) measurements are NaN,
+    speeds 0.
 
     **Raises:** `ValueError` that names the argument.
     """
@@ -137,7 +135,7 @@ class _Drawn(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """What a run of the controller leaves to the next. Row k + 1 of `commands` is that of run k."""
+    """The state between two runs of the controller. Row k + 1 of `commands` is that of run k."""
 
     motion: BodyMotion
     speeds: Float[Array, "4"]

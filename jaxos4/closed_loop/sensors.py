@@ -67,10 +67,7 @@ class Sense(NamedTuple):
 
 
 def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Array, Array], key: Key) -> Flight:
-    """The log up to the first sample at which the vehicle pitches to 90 degrees or a number is not finite.
-
-    `logged`: rotor speeds, motion, body rates, attitude and specific force in each run of the controller.
-    """
+    """The log up to a failure. `logged`: rotor speeds, motion, rates, attitude and specific force in each run."""
     every, sensors, keys = loop.log_every, loop.sensors, jax.random.split(key, 3)
     commands = loop.logged == "commands"
     omega = logged[0] if sensors is None else _late(logged[0], sensors.clock_offset * every / dt)

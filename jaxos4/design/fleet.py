@@ -65,8 +65,7 @@ def fly_batch(
 ) -> Flight:
     """Fly a batch. Velocity and position are integrals of measured attitude and specific force.
 
-    `substeps`: of the physics in a sample, twice as many as `fly_closed_loop` takes by default. How the sensors are
-    mounted changes no design: they measure along the body's axes.
+    `substeps`: of the physics in a sample. Sensors measure along the body's axes: no design depends on this.
     """
 
     def one(loop: ClosedLoop, references: References, key: Key) -> Flight:
@@ -85,18 +84,15 @@ def fly_batch(
 class Fleet(eqx.Module):
     """A vehicle in gusts, and vehicles with moments of inertia that are drawn from a bracket, and gusts of their own.
 
-    - `loop`: the vehicle of the airframe. `loops`: the drawn ones, as a batch. All have the controller of the airframe.
-      Some fly in still air. Only they show velocity and distance.
+    - `loop`: the vehicle of the airframe. `loops`: the drawn ones, as a batch, all with its controller.
     - `model`, `parameters`: of the filters, which know the true parameters, gusts and noise of `loop`.
     - `prior`: the information of the bracket, of which the half-widths are standard deviations.
 
     The same for all fleets:
 
-    - `still`: so many vehicles fly in still air, because gusts carry a vehicle without a position controller away,
-      whatever its references.
+    - `still`: so many vehicles fly in still air, and show velocity and distance: gusts carry the others away.
     - `least_gust`: disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2].
-    - `slowest`, `fastest`: rotors turn at least with this share of the speed in hover, and at most with this multiple
-      if no maximum is known.
+    - `slowest`, `fastest`: speeds of rotors, as shares of that in hover, if no maximum is known.
     - `gust_share`: gusts alone use at most this share of a limit that is not given.
     """
 
@@ -161,10 +157,9 @@ class Fleet(eqx.Module):
     def informations(
         self, flights: Flight
     ) -> tuple[Float[Array, "flights n n"], Float[Array, "flights channels parameters parameters"]]:
-        """The Fisher information of each flight's innovations. All that the design knows of filter error is here.
+        """The Fisher information of each flight's innovations: all that the design knows of filter error.
 
-        **Returns:** the information about the parameters and then the noise of each channel, with its weak prior; and
-        that of each channel about the parameters. A controller answers gusts, so the errors of both are correlated.
+        **Returns:** that about parameters and noise, with its weak prior; that of each channel about the parameters.
         """
         loop, count = self.loop, self.parameters.shape[0]
         strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), self.least_gust)

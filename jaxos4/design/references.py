@@ -34,10 +34,7 @@ class Tones(NamedTuple):
 
     @classmethod
     def up_to(cls, bandwidth: float, samples: int, dt: float) -> "Tones":
-        """As many as fit into a batch, up to a bandwidth [Hz]: the references of a long flight repeat.
-
-        At least eight flights of the batch hover in gusts instead.
-        """
+        """As many as fit into a batch beside eight hovering flights, up to a bandwidth [Hz]; the references repeat."""
         most = (LANES - 1 - 8) // 2
         period = (samples - 1) // max(math.ceil(samples * dt * bandwidth / most), 1)
         return cls(period, max(min(math.floor(bandwidth * period * dt + 1e-9), most), 1))
@@ -209,10 +206,8 @@ def design_references(
     """Design the references with which filter error identifies the moments of inertia of a vehicle most accurately.
 
     Each reference is a sum of tones, which repeats. The simulator flies each tone once; the search for the amplitudes
-    and phases is then algebra. At the end 64 vehicles with moments of inertia from the bracket fly the references
-    through gusts, and the references are reduced until all of them stay within the limits.
-
-    **Arguments:**
+    and phases is then algebra. At the end 64 vehicles from the bracket fly the references through gusts, and the
+    references are reduced until all of them stay within the limits.
 
     - `loop`: the vehicle, its controller, its gusts and its sensors.
     - `angle`: the largest reference of roll, pitch and yaw [rad], at most 1. `acceleration`: the largest vertical one

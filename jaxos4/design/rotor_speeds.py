@@ -191,10 +191,7 @@ class RotorSpeedTask(task.AbstractTask):
         return jax.lax.scan(add, jnp.zeros((slopes.shape[-1],) * 2, dtype=float), slopes)[1]
 
     def _sense(self, omega: RotorSpeeds, parameters: Parameters) -> Float[Array, "samples sensors unknowns"]:
-        """The derivatives of the weighted outputs of a flight from rest, by forward Euler; fast in reverse mode.
-
-        The unknowns are the parameters and, if the start is not known, the initial state of the measured channels.
-        """
+        """The derivatives of the weighted outputs of a flight from rest, in the parameters and an unknown start."""
         count, sensors = parameters.shape[0], self.weights.shape[0]
         unknowns = count + (0 if self.start_is_known else sensors)
         identity, scalars = np.eye(unknowns), tuple(parameters)
@@ -292,25 +289,22 @@ def design_input(
 ) -> task.Design:
     """Design the rotor speeds that identify a vehicle's parameters most accurately within an envelope.
 
-    The input is a multisine. Its amplitudes are searched from random starts, by the gradient of the simulator. The
-    criterion is the mean over vehicles from the bracket. At the end 200 vehicles fly the input with a tenth of the
-    step, and its amplitude is reduced until all of them stay within the envelope.
-
-    **Arguments:**
+    The input is a multisine. Its amplitudes are searched from random starts, by the gradient of the simulator, for the
+    mean criterion over vehicles from the bracket. At the end 200 vehicles fly the input with a tenth of the step, and
+    its amplitude is reduced until all of them stay within the envelope.
 
     - `limits`: some limits of an `Envelope`, by name. The others are those that the standard multisine needs, for all
-      vehicles of the bracket.
-    - `bracket`: the knowledge of the parameters before the flight; by default the model's.
-    - `duration`, `dt`: length and sample time [s].
+      vehicles of the `bracket`, which is by default the model's.
+    - `duration`, `dt`: length and sample time [s]. `bandwidth`: the highest frequency [Hz].
     - `channels`: what will be measured, with the noise of the standard sensors: `"rates"`, `"attitude"` or `"all"`.
     - `start_is_known`: whether the flight starts exactly at rest. If not, the initial state will be estimated too.
     - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
       bound. Bounds are shares of the bracket's half-widths.
-    - `bandwidth`: the highest frequency [Hz]. `compare`: whether to judge the standard inputs in the envelope too.
+    - `compare`: whether to judge the standard inputs in the envelope too.
     - `key`: for the draws and the starts, or a seed. `progress`: called with the name of each stage.
 
-    **Raises:** `InputError` if an argument is out of range, the vehicle cannot hover within the envelope, or no input
-    within it excites a parameter.
+    **Raises:** `InputError` if an argument is out of range, or no input within the envelope hovers and excites a
+    parameter.
     """
     task.check_settings(duration, dt, bandwidth, criterion, samples=(50, 2500), cycles=1, fastest=0.25)
     if channels not in CHANNELS:

@@ -85,8 +85,7 @@ class Designed(NamedTuple):
     def shortest(self, wanted: Float[Numeric, " targets"]) -> Float[np.ndarray, " targets"]:
         """The shortest flights [s] after which the first parameters can have the standard deviations `wanted`.
 
-        Longer flights repeat the inputs: the bounds fall with the square root of the duration. This is not exact for a
-        flight of references that cuts a period.
+        Longer flights repeat the inputs: bounds fall with the root of the duration, about so if a period is cut.
         """
         wanted = np.asarray(wanted)
         repeated = self.duration * np.square(self.bounds[: wanted.size] / wanted)
@@ -163,10 +162,7 @@ class Design(NamedTuple):
     standard: dict[str, Designed]
 
     def gain(self, name: str) -> tuple[float, int]:
-        """The designed bounds over those of a standard input.
-
-        **Returns:** the geometric mean over the targets that it excites, NaN without any; and the number of these.
-        """
+        """The geometric mean of designed over standard bounds of the targets that are excited, or NaN; their number."""
         count = self.task.scale.size
         own, other = (one.bounds[:count] for one in (self.designed, self.standard[name]))
         excited = other < self.task.unexcited[:count]
@@ -272,10 +268,7 @@ def read_input(path: Path, dt: float) -> Series:
 
 
 def read_references(path: Path, names: tuple[str, ...] = _REFERENCE_NAMES) -> tuple[Series, float]:
-    """Read the columns `names`, by default references, and their sample time [s]. Other columns are ignored.
-
-    **Raises:** `InputError`, one line: file, what is wrong and what to do.
-    """
+    """Read the columns `names`, by default references, and their sample time [s]. Raises `InputError`, one line."""
     columns = read_table(path, ("t", *names)).columns
     for column in ("t", *names):
         if column not in columns:

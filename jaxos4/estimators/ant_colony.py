@@ -1,13 +1,11 @@
 """Ant colony optimisation for continuous domains (ACO_R): a baseline that searches by a population.
 
-An archive holds the best points so far, in order of their cost. Each ant chooses one of them, a good one more often
-than a bad one, and samples a Gaussian around it. The standard deviation along each direction is in proportion to the
-mean distance of the archive from the chosen point. The new points replace the worst of the archive, so that the
-archive contracts around a minimum. The directions are drawn from the archive, because the parameters are correlated.
+An archive holds the best points so far. Each ant chooses one of them, a good one more often, and samples a Gaussian
+around it, whose standard deviation along each direction is in proportion to the mean distance of the archive. The new
+points replace the worst, so that the archive contracts around a minimum. The directions are drawn from the archive.
 
 Reference: Socha and Dorigo 2008, European Journal of Operational Research 185(3), 1155-1173: the kernels in sec. 3, and
-the rotation for correlated variables in sec. 4. One thing differs: here all ants of a sweep share the directions, which
-the reference draws for each ant.
+the rotation for correlated variables in sec. 4. Here all ants of a sweep share the directions; there each has its own.
 """
 
 from typing import ClassVar, NamedTuple
@@ -45,8 +43,6 @@ class AntColony(AbstractSolver[Colony]):
 
     It finds the optimum of the other methods that shoot, with many times their rollouts, and so shows what derivatives
     are worth. Use another method if the initial state is free: it adds 3 to 12 unknowns for each window.
-
-    **Arguments:**
 
     - `archive`: number of points in the archive. The first is the bracket's center, the others are uniform in the
       bracket.
@@ -149,8 +145,7 @@ class AntColony(AbstractSolver[Colony]):
 def _directions(differences: Points, key: Key) -> Float[Array, "unknowns unknowns"]:
     """An orthonormal basis, one direction in each row, drawn from the differences of the archive from a point.
 
-    Each direction is a difference, less its part along the directions before it (Gram-Schmidt). A remaining difference
-    of length d is drawn with a probability in proportion to d^4. If none remains, the other directions are 0.
+    Gram-Schmidt: a remaining difference of length d is drawn with a probability in proportion to d^4; without any: 0.
     """
     rounding = ROUNDING * jnp.finfo(differences.dtype).eps
     floor = jnp.square(rounding) * jnp.square(differences).sum(axis=1).max()

@@ -50,10 +50,7 @@ class Directions(NamedTuple):
         added: WindowUnknowns,
         count: int,
     ) -> "Directions":
-        """The directions from some unknowns, of which the first `count` are shared, from the local model there.
-
-        `added`: information about each unknown that the cost does not contain.
-        """
+        """The directions at some unknowns, of which `count` are shared. `added`: information that the cost lacks."""
         moves = movable(unknowns, model.gradient, limits, count)
         information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
         factor, basis = joint_factor(information + jax.vmap(jnp.diag)(added), count)

@@ -1,12 +1,9 @@
 """Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares.
 
-`EquationError` uses all samples in one step, `RecursiveLeastSquares` one sample after the other, with forgetting.
-
 Between two samples the rates change by the integral of the rate equations, which are linear in the parameters. The
-noise of measured rates makes their differences coloured. Integrating again whitens them exactly:
-y_k = w_0 + sum_{j<k} T Phi_j alpha + e_k, with white noise e and an unknown w_0. `Regression.rows` eliminates w_0
-recursively (it subtracts the mean of all rows before each row, the Helmert transform). Every row then has white noise,
-unit variance, and no unknown but the parameters.
+noise of measured rates makes their differences coloured. Integrating again whitens them exactly: y_k = w_0 + sum_{j<k}
+T Phi_j alpha + e_k, with white noise e and an unknown w_0, which `Regression.rows` eliminates (it subtracts the mean of
+all rows before each row, the Helmert transform). Rows then have white noise, unit variance, and no other unknowns.
 """
 
 from collections.abc import Callable
@@ -68,10 +65,9 @@ class Regression(NamedTuple):
         return self.problem.sigma[RATES]
 
     def rows(self) -> tuple[RegressionRows, Callable[[RegressionRows], Float[Array, "samples 3"]]]:
-        """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
+        """Regressors, then the output: a row of unit noise for p, q and r at every sample, 0 for a missing one.
 
-        Missing samples get rows of zeros. The function turns the slope of a number in the rows into its slope in the
-        measured rates.
+        The function turns the slope of a number in the rows into its slope in the measured rates.
         """
         rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
         return rows, lambda slope: back(slope)[0]
@@ -236,8 +232,6 @@ class EquationError(AbstractEstimator):
     measured rates, are the regressors. Only the body rates are used, but the estimate's cost counts all of the
     problem's channels. A free initial state is fitted to the parameters afterwards.
 
-    **Arguments:**
-
     - `memory`: how the rates are differentiated, from 0 to 1. The mean of the earlier samples is subtracted, in which
       each sample weighs `memory` times its successor. 0 gives plain forward differences (ordinary least squares); 1
       gives the integrated regression, generalised least squares for white noise of the rates. 1 has the smallest
@@ -264,8 +258,7 @@ class EquationError(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
-        linear in those that are not fixed. Inside `jit`, where it is not known which are fixed, all must be linear.
+        **Raises:** `ValueError` for a wrong bracket, or a model that is not linear in its free parameters.
         """
         mask, parameters = problem.unknowns.free, problem.model.parameters
         free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
@@ -285,10 +278,7 @@ class EquationError(AbstractEstimator):
 
     @eqx.filter_jit
     def solution(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Parameters:
-        """The least-squares solution alone, without its covariance and without a simulation.
-
-        Parameters in which the rate equations are not linear stay at the center of their bracket.
-        """
+        """The least-squares solution alone. Parameters in which the equations are not linear stay at their center."""
         data = Regression.of(problem.within(bracket), self)
         return data.center + data.half_width * solve(*normal_equations(data.rows()[0]))[0]
 
@@ -298,8 +288,6 @@ class RecursiveLeastSquares(AbstractRecursion):
 
     The recursion carries the normal matrix and its right-hand side, which stay symmetric and positive in single
     precision. A parameter stays at the bracket's center until it is excited.
-
-    **Arguments:**
 
     - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1. The estimate describes the
       last 1 / (1 - forgetting) samples or so, and follows parameters that change within this time. With the default of

@@ -36,8 +36,6 @@ class Hybrid(AbstractEstimator):
     The estimate's `seed` is the bracket of the network's 99.9 % intervals for all parameters at once. `rollouts` are
     those of network and search together.
 
-    **Arguments:**
-
     - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
     - `ibss`: how to search.
     - `seen`: the part of the flight that the network looks at; by default the shooting problem that is searched, or

@@ -1,7 +1,4 @@
-"""Iterative Bi-Section Shooting (IBSS): narrow brackets by the sign of the slope of the cost.
-
-The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md).
-"""
+"""Iterative Bi-Section Shooting (IBSS): narrow brackets by the slope of the cost; its steps are our choice."""
 
 from typing import ClassVar, NamedTuple
 
@@ -54,8 +51,6 @@ class IBSS(AbstractSolver[State]):
     separable along them, so a sweep bisects all together. Parameters are bisected on the sum of all windows' slopes,
     initial states on those of their own window.
 
-    **Arguments:**
-
     - `halvings`: the shots of a sweep that narrow the brackets.
     - `max_sweeps`: the most sweeps of a stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
@@ -104,11 +99,7 @@ class IBSS(AbstractSolver[State]):
     damping: float = eqx.field(static=True, default=0.1)
 
     def init(self, stage: Stage, before: Found) -> State:
-        """At the start, without directions, so that the first shot is there.
-
-        That shot is the first step of the loop: a second copy of the simulation would take as long to compile as all of
-        the search.
-        """
+        """At the start, without directions: the first shot is the first step of the loop, and is compiled once."""
         unknowns = before.unknowns
         directions = Directions.none(unknowns)
         return State(

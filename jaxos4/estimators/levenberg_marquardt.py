@@ -1,8 +1,6 @@
 """Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood; and output error and filter error, which use it.
 
-Output error is the prediction-error method for a model without process noise: nonlinear least squares of the simulated
-against the measured trajectory. Filter error allows for disturbances that the model does not contain: its likelihood is
-that of `InnovationsProblem`.
+Output error has noise of the sensors only, filter error disturbances too (`InnovationsProblem`).
 
 References: Marquardt 1963, SIAM J. Appl. Math. 11(2), on the damping; Ljung, System Identification, ch. 7 and 13;
 Jategaonkar, Flight Vehicle System Identification, ch. 4 and 5.
@@ -52,8 +50,6 @@ class State(NamedTuple):
 
 class LevenbergMarquardt(AbstractSolver[State]):
     """Gauss-Newton steps, which are damped more after a step that failed, and less after one that succeeded.
-
-    **Arguments:**
 
     - `step_tolerance`: a stage ends with a step that changes no unknown by more, in the unit of how far off its initial
       guess may be. Cost and covariance are those before this step. 0: no step is short enough.
@@ -158,10 +154,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
 class OutputError(AbstractEstimator):
     """Levenberg-Marquardt on the weighted residuals, from the bracket's center: first the rates, then all channels.
 
-    **Arguments:**
-
-    - `tolerance`: the search ends with a step that changes no unknown by more, in half-widths of the bracket. Cost and
-      covariance are those before this step.
+    - `tolerance`: the search ends with a step that changes no unknown by more, in half-widths of the bracket.
     - `max_steps`: for each stage.
     """
 
@@ -172,12 +165,7 @@ class OutputError(AbstractEstimator):
     max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
-
-        The estimate's `rollouts` count each trial and each of its tangents; `sweeps` are the steps of all stages.
-
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
-        """
+        """Identifies one flight. `rollouts` counts trials and tangents. Raises `ValueError` for a wrong bracket."""
         return LevenbergMarquardt(step_tolerance=self.tolerance, max_steps=self.max_steps)(problem, bracket)
 
 
@@ -187,8 +175,6 @@ class FilterError(AbstractEstimator):
     It compares the body rates, and specific force if the model predicts it. The disturbance and the sensor's noise of
     each channel are estimated too, see `InnovationsProblem`. The bracket is a Gaussian prior, whose standard deviation
     is the bracket's half-width.
-
-    **Arguments:**
 
     - `tolerance`: the search ends with a step that promises to lower the cost by less. An error of one standard
       deviation costs 0.5.
@@ -218,12 +204,10 @@ class FilterError(AbstractEstimator):
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem | InnovationsProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
+        """Identifies one flight. Raises `ValueError` for a bracket of another length than the model's parameters.
 
-        The estimate of a shooting problem has the model's parameters alone, and the cost of a simulation, as that of
-        any other estimator. The estimate of a problem of innovations has all its unknowns and the cost of these.
-
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        The estimate of a shooting problem has the model's parameters alone, and the cost of a simulation; that of a
+        problem of innovations has all its unknowns and their cost.
         """
         return in_blocks(self._identify, problem.within(bracket))
 

@@ -70,14 +70,10 @@ class AbstractSolver(AbstractEstimator, Generic[State]):
         *,
         start: Float[Array, " unknowns"] | None = None,
     ) -> Estimate:
-        """Identifies one flight.
-
-        **Arguments:**
+        """Identifies one flight. Raises `ValueError` for a bracket or a start of another length than the unknowns.
 
         - `problem`, `bracket`: see `AbstractEstimator`. The parameters may turn out to lie outside of the bracket.
         - `start`: where the search begins, unless it is NaN; by default the problem's `initial_guess`.
-
-        **Raises:** `ValueError` for a bracket or a start of another length than the unknowns.
         """
         return in_blocks(solve, self, problem.within(bracket), start)
 
@@ -96,8 +92,6 @@ def solve(
     The first stage is searched from each start of the problem. Equal starts count once. A later start begins with the
     parameters that are the best so far. The other stages are searched from the best answer of all starts.
 
-    **Arguments:**
-
     - `start`: where to start instead, unless it is NaN or the unknown is fixed. Shared unknowns, or those of each
       window.
     - `spread`: the covariance of the first unknowns of each window at the start; by default that of the initial guess.
@@ -107,11 +101,8 @@ def solve(
     stages = problem.stages(solver.shares)
     # Traced once, although a solver may call it twice.
     stages = stages._replace(local_model=jax.jit(stages.local_model, inline=True))
-    starts, begin, skip = _starts(problem, start), before_search(problem, stages), jnp.asarray(skip)
-    if spread is not None:
-        given, wide = spread.shape[0], begin.spread
-        # A search that is skipped may have no finite spread.
-        begin = begin._replace(spread=wide.at[:, :given, :given].set(jnp.where(skip, wide[:, :given, :given], spread)))
+    starts, skip = _starts(problem, start), jnp.asarray(skip)
+    begin = before_search(problem, stages, spread, skip)
     number = stages.first if is_close is False else jnp.where(is_close, stages.whole, stages.first)
     count = 1
     if starts.shape[0] > 1 and solver.is_local:
@@ -120,11 +111,8 @@ def solve(
     def search(place: Count, best: Found) -> Found:
         """From a start in the first stage, or from the best answer in a later one."""
         from_start = place < count
-        own = (
-            (jnp.arange(starts.shape[2]) < problem.unknowns.parameters)
-            & (place > 0)
-            & jnp.isfinite(cost_of(best.model))
-        )
+        own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameters) & (place > 0)
+        own &= jnp.isfinite(cost_of(best.model))
         first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
         before = chosen(from_start, first, best)
         stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
@@ -146,13 +134,22 @@ def solve(
     return estimate_at(problem, end.unknowns, end.model, end.rollouts, end.steps, done=end.done, reach=solver.reach)
 
 
-def before_search(problem: AbstractProblem, stages: Stages) -> Found:
+def before_search(
+    problem: AbstractProblem,
+    stages: Stages,
+    spread: Float[Array, "given given"] | None = None,
+    skip: Bool[Array, ""] | bool = False,
+) -> Found:
     """The knowledge before a search: the first start, how far off it may be, and nothing about the cost."""
     guess, zero = problem.initial_guess, jnp.zeros((), dtype=int)
-    start, spread = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
+    start, wide = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
     shapes = jax.eval_shape(stages.local_model, zero, start, start)
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return Found(start, nothing, spread, zero, zero, jnp.zeros((), dtype=bool))
+    if spread is not None:
+        given = slice(spread.shape[0])
+        # A search that is skipped may have no finite spread.
+        wide = wide.at[:, given, given].set(jnp.where(skip, wide[:, given, given], spread))
+    return Found(start, nothing, wide, zero, zero, jnp.zeros((), dtype=bool))
 
 
 def _starts(problem: AbstractProblem, start: Array | None) -> Float[Array, "starts windows unknowns"]:

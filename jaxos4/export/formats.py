@@ -1,8 +1,4 @@
-"""From a result to the texts of files for a simulator.
-
-A new simulator has a template in this folder, and a line in `TARGETS`. The notes in a template say what the simulator
-does not have.
-"""
+"""From a result to the texts of files for a simulator: each has a template in this folder and a line in `TARGETS`."""
 
 import functools
 import math
@@ -10,10 +6,9 @@ import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jinja2
 import numpy as np
 
-from .._templates import in_xml, templates
+from .._files import in_xml, templates
 from .._version import __version__
 from ..errors import InputError, printable
 from ..results import meaning
@@ -24,12 +19,12 @@ _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. R
 
 
 class Assumed(NamedTuple):
-    """What simulators need and no flight shows.
+    """Constants that simulators need and no flight shows.
 
     - `lag`: for RotorPy and Gazebo, which need one: too short to notice [s].
-    - `radius`, `thickness`: of a drawn rotor, in arms.
+    - `radius`, `thickness`: of a drawn rotor, in arms. `rotor_mass`: of its link in Gazebo, as a share of the
+      vehicle's.
     - `shortest`: MuJoCo keeps enough past controls for the delay in scenes with time steps down to this [s].
-    - `rotor_mass`: of the link of a rotor in Gazebo, as a share of the vehicle's: links need a mass.
     - `slowdown`: links of rotors in Gazebo turn this many times slower than the rotors, for long time steps.
     """
 
@@ -45,11 +40,7 @@ _ASSUMED = Assumed()
 
 
 class Target(NamedTuple):
-    """A simulator's format.
-
-    - `label`: the name of the format. `suffix`: the suffix of its files.
-    - `values`: what its template needs besides the vehicle.
-    """
+    """A simulator's format: its name, the suffix of its files, and what its template needs besides the vehicle."""
 
     label: str
     suffix: str
@@ -59,11 +50,9 @@ class Target(NamedTuple):
 class Exported(NamedTuple):
     """Files for a simulator, as texts.
 
-    - `text`: the estimated vehicle.
-    - `samples`: vehicles drawn from the uncertainty of the estimate.
+    - `text`: the estimated vehicle. `samples`: vehicles drawn from its uncertainty.
     - `impossible`: the number of impossible draws, which were repeated.
-    - `notes`: the effects that the simulator does not have, or has differently; one line each. They stand in the file
-      too, and each sample has its own.
+    - `notes`: the effects that the simulator does not have, or has differently, as in each file; one line each.
     """
 
     text: str
@@ -77,8 +66,6 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 
         found = jaxos4.export.read_result("found.json")
         jaxos4.export.export_vehicle(found, "mujoco").text
-
-    **Arguments:**
 
     - `found`: a result, from `read_result`.
     - `to`: the simulator, a name in `TARGETS`.
@@ -152,7 +139,7 @@ def _drone_models(vehicle: RigidVehicle) -> dict[str, Any]:
 
 
 @functools.cache
-def _templates(suffix: str) -> jinja2.Environment:
+def _templates(suffix: str) -> Any:
     made = templates("jaxos4.export", printable if suffix in (".py", ".toml") else in_xml)
     made.filters["short"] = lambda values: ", ".join(f"{value:.3g}" for value in np.atleast_1d(values))
     made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}

@@ -81,10 +81,8 @@ class Identified(NamedTuple):
     def draw(self, number: int, *, seed: int, most: int = 1000) -> tuple[RigidVehicle, int]:
         """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
 
-        Vehicle `number` does not depend on how many are drawn. A damping, drag, lag or delay that is drawn negative
-        is 0.
-
-        **Raises:** `InputError` if `most` draws are impossible: the uncertainty is too large.
+        It depends on its `number` and the seed alone. A damping, drag, lag or delay that is drawn negative is 0.
+        Raises `InputError` if `most` draws are impossible.
         """
         generator = np.random.default_rng([seed, number])
         root = covariance_root(self.covariance)
@@ -103,8 +101,7 @@ class Identified(NamedTuple):
 def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None) -> Identified:
     """Read a file that `jaxos4 estimate --out` wrote.
 
-    `inertia_z`: Iz [kg m^2] to use in the place of the estimate, as far as a rigid body with these Ix and Iy can have
-    it: no moment of inertia exceeds the sum of the other two. Flights hardly ever show Iz well.
+    `inertia_z`: Iz [kg m^2] instead of the estimate, as far as a rigid body with these Ix and Iy can have it.
 
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.

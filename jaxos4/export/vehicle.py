@@ -118,10 +118,9 @@ class RigidVehicle(NamedTuple):
 
 @np.errstate(all="ignore")  # `impossible` says what is not finite
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
-    """The vehicle with an airframe and the parameters that were identified.
+    """The vehicle with the parameters of a `FlightModel`, by name, and the airframe's constants for missing ones.
 
-    **Arguments:** `values`: the parameters of a `FlightModel`, by name. The airframe gives the constants that are
-    missing. Offsets of several recordings are averaged.
+    Offsets of several recordings are averaged.
     """
     mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)

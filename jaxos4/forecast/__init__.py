@@ -6,5 +6,4 @@ from .flight_prediction import (
     Quality as Quality,
     check_suffix as check_suffix,
 )
-from .predict import predict as predict
-from .vehicle import Vehicle as Vehicle, vehicle_of as vehicle_of
+from .predict import Vehicle as Vehicle, predict as predict, vehicle_of as vehicle_of

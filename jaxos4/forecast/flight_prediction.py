@@ -32,12 +32,10 @@ _AXES = {"attitude": ("component", ["w", "x", "y", "z"]), "rates": ("rate", ["p"
 
 
 class Quality(NamedTuple):
-    """The mean absolute error of one quantity by horizon, in its unit, over all starts.
+    """The mean absolute error of one quantity by horizon, in its unit, over all starts. NaN: nothing was measured.
 
-    The error of a start is the length of the vector of the error, and of the attitude the geodesic angle. NaN: nothing
-    was measured.
-
-    - `error`: of the prediction. `unaware`: of the prediction that knows no disturbance at the start.
+    - `error`: the length of the error's vector, of the attitude the angle. `unaware`: without the disturbance at the
+      start.
     - `constant`: if velocity and body rates stay constant. `regression`: of the regression; NaN if there is none.
     - `coverage`: the share of measured components inside the 95 % band.
     """
@@ -148,10 +146,7 @@ class FlightPrediction(NamedTuple):
         return xr.Dataset(variables, coords=coordinates, attrs=about | {"notes": "\n".join(self.notes)})
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write netCDF (`.nc`) or CSV (`.csv`), one row for each start and horizon; completely or not at all.
-
-        **Raises:** `InputError` for another suffix; `OSError` if the file cannot be written.
-        """
+        """Write netCDF (`.nc`) or CSV (`.csv`), a row for each start and horizon. Raises `InputError` or `OSError`."""
         check_suffix(path, ".nc", ".csv")
         if Path(path).suffix == ".nc":
             write_netcdf(path, self.to_dataset(), 1)

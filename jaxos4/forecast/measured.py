@@ -69,14 +69,13 @@ class Measured(NamedTuple):
     def contradictions(
         self, start: Int[np.ndarray, " starts"], steps: int, gravity: float, *, fewest: int = 10
     ) -> Float[np.ndarray, "steps 9"]:
-        """How far position, velocity and attitude are from dead reckoning with gyro and accelerometer.
+        """How far position, velocity and attitude are from dead reckoning with gyro and accelerometer, without a model.
 
-        Dead reckoning begins as measured at each start. It knows no model: it is off because the sensors contradict
-        each other, by noise of any colour, or by shifted clocks. The mean error of the accelerometer is corrected.
+        Sensors contradict each other by noise of any colour, or by shifted clocks; the accelerometer's mean error does
+        not count.
 
         **Returns:** the standard deviation after each step, without what the white noise of gyro and accelerometer
-        causes, and at least what the white noise of the start and of the end causes; that alone if fewer than `fewest`
-        starts were measured.
+        causes, and at least that of the start and the end; that alone for fewer than `fewest` starts.
         """
         rows, dt, down = start[:, None] + np.arange(steps + 1), self.dt, np.array([0.0, 0.0, gravity])
         begin, rates = self.states[start], self.states[rows[:, 1:], 10:]
@@ -114,8 +113,7 @@ def regressed(
 ) -> Float[np.ndarray, "starts steps 13"] | None:
     """The states by a regression, one step after another; `None` if the flight `trained` measured too little.
 
-    Changes of the rates, and the specific force, are linear in rates, velocity and squared rotor speeds. If no velocity
-    was measured, it stays constant.
+    It is linear in rates, velocity and squared rotor speeds. A velocity that was not measured stays constant.
     """
     moves = trained.has("velocity")
     features, targets = _features(trained.states, trained.omega, moves), trained.accelerations(gravity)

@@ -55,7 +55,7 @@ class Motion(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What is known at each sample, or at one.
+    """The knowledge at each sample, or at one.
 
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: of the filters [rad/s], [rad/s^2; m/s^2].
@@ -191,10 +191,7 @@ def _unit(a: Quaternion) -> Quaternion:
 
 
 def departures(states: Any, others: Any) -> Any:
-    """How far other states are off: position, velocity, attitude by `deviation`, rates. NumPy and JAX.
-
-    From (..., 13) to (..., 12).
-    """
+    """How far other states are off, (..., 13) to (..., 12): attitude by `deviation`. NumPy and JAX."""
     difference, xp = others - states, np if isinstance(states, np.ndarray) else jnp
     turn = deviation(xp.moveaxis(states[..., 6:10], -1, 0), xp.moveaxis(others[..., 6:10], -1, 0))
     return xp.concatenate([difference[..., :6], xp.stack(turn, axis=-1), difference[..., 10:]], axis=-1)
@@ -229,8 +226,6 @@ def known_at_samples(
     """The knowledge at each sample, by the first row of `parameters`; forcing and offsets of each row: see `Futures`.
 
     The velocity is left out of the forcing: it will be that of the prediction.
-
-    **Arguments:**
 
     - `length`: the samples of the flight that are no padding.
     - `measured`: states, accelerations and the white noise of velocity: see `jaxos4.forecast.measured.Measured`.
@@ -275,8 +270,7 @@ def _offset_weights(
 ) -> tuple[Float[Array, "samples 6"], Float[Array, "samples 6"]]:
     """The factor of the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
 
-    Each recording has its own offsets. The mean of the residuals, of which it forgets the oldest, is drawn to 0 as far
-    as offsets are known not to differ.
+    The mean of a recording's residuals is drawn to 0 as far as offsets are known not to differ.
     """
     channels = np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
     strength, time_constant = (jnp.full(6, x) for x in (tuning.push, tuning.push_time))

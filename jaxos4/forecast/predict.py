@@ -1,26 +1,118 @@
-"""`jaxos4.predict`: the whole flight, open loop, from many starts."""
+"""`jaxos4.predict`: the whole flight, open loop, from many starts, by the vehicle of a result."""
 
 import dataclasses
 import math
 import os
+from pathlib import Path
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._custom_types import as_float
-from ..errors import InputError
+from .._custom_types import Parameters, as_float
+from ..errors import InputError, named, printable, shortened
+from ..flight import FORCE_NAMES
 from ..identification import Identification
+from ..linalg import covariance_root
 from ..logs import Recording, Source, as_recording
+from ..models.flight_model import FlightModel, without_recording
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording.prepared import Prepared, prepare
+from ..result_file import vehicle_result
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .flight_prediction import FlightPrediction
 from .measured import Measured, constant_rates, regressed
 from .motion import PARTS, Futures, Tuning, fly_chunk, known_at_samples, settled, turned
-from .vehicle import Vehicle, vehicle_of
+
+
+class Vehicle(NamedTuple):
+    """The vehicle that predicts.
+
+    - `name`: of the result's file. Without a file: the estimator and the model.
+    - `model`: of one recording.
+    - `parameters`, `covariance`: of the model. The mean of the recordings, if each had its own value.
+    - `offset`: how far an offset of p', q', r' may be from the parameter in another recording, as a standard deviation
+      [rad/s^2]; 0 if the model has none.
+    - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
+    - `sample_time`: of the fit [s].
+    - `result`: the name of the result code.
+    - `notes`: why the estimate cannot be trusted, and which parameters were not identified; one line each.
+    """
+
+    name: str
+    model: FlightModel
+    parameters: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    offset: Float[np.ndarray, "3"]
+    noise: LogNoise
+    sample_time: float
+    result: str
+    notes: tuple[str, ...]
+
+    def draw(self, count: int, generator: np.random.Generator) -> Float[np.ndarray, "count parameters"]:
+        """Parameters drawn from the estimate's uncertainty."""
+        root = covariance_root(self.covariance)
+        return self.parameters + generator.standard_normal((count, len(root))) @ root.T
+
+
+def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
+    """The vehicle of an identification or a file of `jaxos4 estimate --out`. Raises `InputError` or `OSError`."""
+    file = vehicle_result(found)
+    given = isinstance(found, Identification)
+    name = f"{file.estimator}, {file.model} model" if given else printable(Path(found).name)
+    with named("" if given else found):
+        used = file.provenance
+        if strangers := [term for term in used.terms or () if term not in TERMS]:
+            raise InputError(
+                f"the term {shortened(strangers[0], 40)} is not of this version; run `jaxos4 estimate` again."
+            )
+        model = FlightModel(file.airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
+        known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
+        known |= {row: each.value for row, each in file.held.items()}
+        alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))
+        center, width = (dict(zip(model.parameter_names, each, strict=True)) for each in (alpha, half_width))
+        listed, rows, covariance = [*file.parameters, *file.held], list(file.parameters), np.array(file.covariance)
+        # Each parameter is the mean of its rows: one, or one for each recording.
+        shares, values, missing, guessed = np.zeros((len(center), len(rows))), [], [], []
+        for place, each in enumerate(center):
+            own = [row for row in listed if without_recording(row) == each]
+            estimated = [row for row in own if row in known]
+            if not own:
+                missing.append(each)
+            elif not estimated:
+                guessed.append(each)
+            values.append(np.mean([known[row] for row in estimated]) if estimated else center[each])
+            shares[place, [rows.index(row) for row in estimated if row in file.parameters]] = 1 / max(len(estimated), 1)
+        if missing:
+            raise InputError(f"has no {', '.join(missing)}; run `jaxos4 estimate` again.")
+        notes = [f"not identified, and predicted with the centre of the bracket: {', '.join(guessed)}"] * bool(guessed)
+        channels = (*"pqr", *(FORCE_NAMES[axis] for axis in model.force_axes))
+        if lacking := [each for each in channels if each not in file.disturbances]:
+            raise InputError(f"does not say the disturbance of {lacking[0]}; run `jaxos4 estimate` again.")
+        levels = [file.disturbances[each] for each in channels]
+        table = np.array([(each.strength, each.time_constant, each.sensor) for each in levels])
+        return Vehicle(
+            name,
+            model,
+            np.array(values),
+            shares @ covariance @ shares.T,
+            np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
+            LogNoise(*np.log(np.maximum(table, 1e-9)).T),  # finite
+            used.sample_time,
+            file.result,
+            (*file.reasons, *notes),
+        )
+
+
+@eqx.filter_jit
+def _bracket(model: FlightModel) -> tuple[Parameters, Parameters]:
+    """The centre and the half-width of the default bracket."""
+    return model.alpha, model.half_width
+
 
 # Inputs that no prediction can replace.
 _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
@@ -37,26 +129,20 @@ def predict(
 ) -> FlightPrediction:
     """Predict position, velocity, attitude and body rates from many starts of a flight, with its rotor speeds.
 
-        prediction = jaxos4.predict("found.json", "flight.csv")
-        prediction.quality["attitude"].error       # by horizon [rad]
+    prediction = jaxos4.predict("found.json", "flight.csv") prediction.quality["attitude"].error       # by horizon
+    [rad]
 
     A prediction begins with the measured position, velocity and attitude, and with the rates and disturbances that
     Kalman filters know from the measurements until then. After that it knows rotor speeds or commands, and the
-    battery's voltage if the model needs it, and nothing else that was measured.
+    battery's voltage if the model needs it. The 95 % band holds what will be measured: it comes from 64 futures, of
+    parameters, starts and disturbances, and from how far position, velocity and attitude are from dead reckoning.
 
-    The 95 % band holds what will be measured. It comes from 64 futures: parameters drawn from their covariance, errors
-    of the rates at the start, and disturbances drawn as the fit found them. The band also contains the disagreement of
-    the sensors: how far position, velocity and attitude are from dead reckoning.
-
-    **Arguments:**
-
-    - `found`: the identification of a vehicle, or the file that `jaxos4 estimate --out` wrote, or what
-      `jaxos4.forecast.vehicle_of` makes of one of these.
+    - `found`: the identification of a vehicle, the file that `jaxos4 estimate --out` wrote, or its
+      `jaxos4.forecast.vehicle_of`.
     - `flight`: or the path of a log. It has body rates and attitude at least. Without a velocity, predictions begin
       with that of dead reckoning, or at rest; what was not measured is not compared.
-    - `horizon`: how far ahead [s].
+    - `horizon`: how far ahead [s]. `spacing`: the time between two starts [s]; 0: at each sample.
     - `sample_time`: the log is averaged to it [s]. Default: that of the fit.
-    - `spacing`: the time between two starts [s]; 0: at each sample.
     - `seed`: of the draws.
 
     The regression for comparison is fitted to the flight of an identification, or else to the first half of `flight`.
@@ -175,8 +261,7 @@ def _fly(
 ]:
     """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures.
 
-    A position that was not measured is 0. If no velocity is measured, it is that of dead reckoning, and the specific
-    force has no offset.
+    A position that was not measured is 0, a velocity that of dead reckoning, without an offset of the force.
     """
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, problem.flight.dt
     draws, chunk = tuning.draws, tuning.chunk

@@ -92,10 +92,7 @@ def read_recording(
     full_scale: float | None = None,
     columns: ColumnsGiven = None,
 ) -> Recording:
-    """Read a log in any format that `jaxos4.read_log` knows, named by its path. Arguments and errors are the same.
-
-    If the log was written too rarely, its facts say so, and not its notes.
-    """
+    """`jaxos4.read_log` for a `Recording`, named by its path. If it was written too rarely, its facts say so."""
     if not isinstance(log, str | os.PathLike):
         return recording_of(array_table(log, column_map(columns)), (), airframe, full_scale=full_scale)
     kind = log_format(log)
@@ -125,8 +122,7 @@ def log_format(path: Path) -> LogFormat:
     """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
 
     Formats of other packages are asked before the last. A pipe can be read only once, so it always counts as the last.
-
-    **Raises:** `InputError` if the file cannot be opened, or is evidently of another kind.
+    Raises `InputError` if the file cannot be opened, or is evidently of another kind.
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
@@ -144,10 +140,7 @@ def log_format(path: Path) -> LogFormat:
 def as_recordings(
     flights: Source | Sequence[Source], name: str = "flight", airframe: Airframe | None = None
 ) -> tuple[Recording, ...]:
-    """One or several flights as recordings. A flight without a name is called `name`; several are numbered from 1.
-
-    `airframe`: of logs that are read, see `jaxos4.read_log`.
-    """
+    """One or several flights as recordings, see `as_recording`. The names of several are numbered from 1."""
     single = isinstance(flights, Recording | str) or not isinstance(flights, Sequence)
     every = [flights] if single else cast(Sequence[Any], flights)
     names = [f"{name} {i + 1}" if len(every) > 1 else name for i in range(len(every))]
@@ -157,9 +150,7 @@ def as_recordings(
 def as_recording(flight: Source, name: str = "flight", airframe: Airframe | None = None) -> Recording:
     """A flight as a recording of this name, without impossible values. A recording stays as it is.
 
-    A path, or arrays by their names, are read as a log of this `airframe`.
-
-    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible, or if a log cannot be used.
+    A path, or arrays by their names, are read as a log of this `airframe`. Raises `InputError`, as `read_log`.
     """
     if isinstance(flight, Recording):
         return flight

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from .messages import ANGLES, FORCES, RATES, Fields, Messages
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, motor_order
 from .sampling import HALF_TURN, Series, logged_rate
 from .table import LogFormat, Path, Table, counted, fast_enough, needed, order_note, read_bytes, refuse
 
@@ -43,10 +43,12 @@ _REMEDY = "the log is corrupt there: download it again, or choose another"
 def read_ardupilot(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a log of ArduPilot, and notes on what was assumed. Raises `InputError`."""
     log = _decoded(path)
-    outputs = _outputs(log)
-    setting = (
-        f"set LOG_BITMASK to {int(log.parameters.get('LOG_BITMASK', 0)) | _FAST} (with fast attitude and fast IMU)"
-    )
+    get = log.parameters.get
+    functions = [int(get(f"SERVO{number}_FUNCTION", 0)) for number in range(1, 33)]
+    if get("FRAME_CLASS", 1.0) not in (0.0, 1.0) or _MOTOR5 in functions:
+        refuse(path, "FRAME_CLASS or SERVO5_FUNCTION: this is no quadrotor; give the log of a quadrotor")
+    outputs = motor_order(functions, _MOTORS) or [0, 1, 2, 3]
+    setting = f"set LOG_BITMASK to {int(get('LOG_BITMASK', 0)) | _FAST} (with fast attitude and fast IMU)"
     others = {columns: log.fastest(columns, sources) for columns, sources in _SOURCES.items()}
     rates = needed(path, others.pop(RATES), "body rates", setting)
     remedy = "add 1024 (RC output) to LOG_BITMASK, and use ESC telemetry by bidirectional DShot"
@@ -62,18 +64,9 @@ ARDUPILOT = LogFormat(
 )
 
 
-def _outputs(log: Messages) -> list[int]:
-    """The outputs of motors 1 to 4, counted from 0. Refuses a vehicle that is not a quadrotor. Raises `InputError`."""
-    get = log.parameters.get
-    functions = [int(get(f"SERVO{number}_FUNCTION", 0)) for number in range(1, 33)]
-    if get("FRAME_CLASS", 1.0) not in (0.0, 1.0) or _MOTOR5 in functions:
-        refuse(log.path, "FRAME_CLASS or SERVO5_FUNCTION: this is no quadrotor; give the log of a quadrotor")
-    return [functions.index(motor) for motor in _MOTORS] if {*_MOTORS} <= {*functions} else [0, 1, 2, 3]
-
-
 def _rotors(log: Messages, outputs: list[int]) -> Series | None:
     """Speeds [rad/s], or commands [0..1] if they were not measured, or only rarely."""
-    every = [log.series("ESC", ("RPM",), output) for output in outputs]
+    every = (log.series("ESC", ("RPM",), output) for output in outputs)
     escs = [each for each in every if each is not None and (each.values > 0).any()]
     commands = log.series("RCOU", [f"C{output + 1}" for output in outputs])
     if len(escs) == len(outputs):
@@ -95,11 +88,7 @@ def _rotors(log: Messages, outputs: list[int]) -> Series | None:
 
 
 def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> Messages:
-    """The messages that are read.
-
-    **Raises:** `InputError` for a file of more than `largest` bytes, or that is damaged in more than `most_damage`
-    places: it is no log.
-    """
+    """The messages that are read. Raises `InputError` for more than `largest` bytes, or places of damage."""
     content, at, notes = read_bytes(path, largest), 0, []
     sizes, layouts = {_FMT: _FMT_LENGTH}, {}
     places = {number: array.array("q") for number in range(256)}
@@ -149,10 +138,7 @@ def _instances(fields: Fields) -> dict[int, Fields]:
 
 
 def _layout(body: bytes) -> tuple[int, int, str, np.dtype | None, dict[str, float]]:
-    """The number, length and name of the messages that a message FMT describes, and their layout.
-
-    The layout is `None` if it is not known. Last, by field, the unit of its last digit; 0 for a text.
-    """
+    """What a message FMT describes: number, length, name, layout (`None`: unknown), units of last digits by field."""
     name, letters, fields = (body[a:b].rstrip(b"\0").decode(errors="replace") for a, b in ((2, 6), (6, 22), (22, 86)))
     labels, unknown = fields.split(","), (body[0], body[1], name, None, {})
     if not len(labels) == len(letters) == len({*labels}) or "" in labels or not {*letters} <= _TYPES.keys():

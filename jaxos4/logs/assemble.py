@@ -36,7 +36,11 @@ def recording_of(
         if np.isnan(table.columns[name][0]):
             table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
     table = without_impossible(table, LIMITS | PITCH)
-    _check_heading(table)
+    if table.holds("psi"):
+        psi = table.columns["psi"]
+        measured, jumps = np.flatnonzero(np.isfinite(psi)), np.zeros(psi.size, dtype=bool)
+        jumps[measured[1:]] = np.abs(np.abs(np.diff(psi[measured])) - 360) < 20
+        _refuse_any(table, "psi", jumps, "jumps by about 360: it looks like degrees, divide by 57.3")
     if table.impossible:
         found.append(table.impossible_note)
     omega = _rotor_speeds(table, airframe, full_scale, found)
@@ -69,10 +73,7 @@ def recording_of(
 
 
 def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
-    """The column that was logged most rarely, of those that were logged at all.
-
-    Rows that repeat the values of the row before were not logged: programs that join topics fill them in.
-    """
+    """The column that was logged most rarely. Rows that repeat a value were filled in by programs that join topics."""
     found = []
     for name in filter(table.holds, names):
         logged = np.isfinite(table.columns[name])
@@ -86,10 +87,7 @@ def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
 
 
 def _check_time(table: Table, *, shortest: float = 1e-6, longest: float = 2.0) -> float:
-    """The median time between rows [s]. Refuses a time that is missing, does not increase, or is not in seconds.
-
-    `shortest`, `longest`: the limits of the median time [s].
-    """
+    """The median time between rows [s], refused outside of `shortest` to `longest`, or if times do not increase."""
     t = table.columns["t"]
     _refuse_any(table, "t", np.isnan(t), "is empty; each row needs its time")
     _refuse_any(table, "t", np.abs(t) > LIMITS["t"].largest, f"is {{:g}} s; {LIMITS['t'].advice}")
@@ -108,15 +106,6 @@ def _check_time(table: Table, *, shortest: float = 1e-6, longest: float = 2.0) -
         what = f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide"
         table.refuse(what, column="t")
     return dt
-
-
-def _check_heading(table: Table) -> None:
-    """Refuse a heading that jumps by 360."""
-    if table.holds("psi"):
-        psi = table.columns["psi"]
-        measured, jumps = np.flatnonzero(np.isfinite(psi)), np.zeros(psi.size, dtype=bool)
-        jumps[measured[1:]] = np.abs(np.abs(np.diff(psi[measured])) - 360) < 20
-        _refuse_any(table, "psi", jumps, "jumps by about 360: it looks like degrees, divide by 57.3")
 
 
 def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
@@ -155,12 +144,10 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
     empty = np.isnan(column)
     if not empty.any():
         return column
-    impossible, _ = table.impossible.get(name, (0, ""))
-    last = last_measured(~empty)
-    longest, cells = (t - t[last]).max(), int(np.count_nonzero(empty)) - impossible
+    last, cells = last_measured(~empty), int(np.count_nonzero(empty)) - table.impossible.get(name, (0, ""))[0]
     if cells:
-        filled = f"{counted(cells, 'empty cell')} filled with the value before, for up to {longest:.3g} s"
-        notes.append(f"{name}: {filled}")
+        filled = f"filled with the value before, for up to {(t - t[last]).max():.3g} s"
+        notes.append(f"{name}: {counted(cells, 'empty cell')} {filled}")
     return column[last]
 
 

@@ -87,7 +87,13 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
     with opened(path, "rb") as file:
         is_raw = file.seekable() and file.read(len(_MAGIC)) == _MAGIC
-    log = _decoded(path) if is_raw else _csv(path)
+    if is_raw:
+        log = _decoded(path)
+    else:
+        settings, skip = _settings_above(path)
+        columns = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan")).columns
+        logged = {name: column for name, column in columns.items() if not np.isnan(column).all()}
+        log = _Log(path, skip + 1, settings, logged, {}, {}, [])
     raw, first_row = log.raw, None if log.header is None else log.header + 1
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
@@ -97,7 +103,11 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     _add_rotors(log)
     _add_force(log)
     _add_attitude(log)
-    _turn(log)
+    newer = any(log.names.get(name, "").startswith(("omega", "quat")) for name in ("omega1", "phi"))
+    if newer and np.median(_finite(log.columns.get("az", _NONE))) < 0:  # Indiflight: forward, right, down
+        log.columns.update((name, -log.columns[name]) for name in ("q", "r", "ay", "az"))
+        what = "the specific force in flight points down: gyro and accelerometer count as forward, right, down"
+        log.notes.append(what)
     if _VOLTAGE in raw and _KNOWN_UNIT.match(log.settings.get("Firmware revision", "")):
         log.add({"voltage": _VOLTAGE}, 1.0)
         log.columns["voltage"] /= 100
@@ -111,14 +121,6 @@ def _recognises(begin: bytes) -> bool:
 
 
 BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
-
-
-def _csv(path: Path) -> _Log:
-    """A CSV, with the settings above its header, if there are any."""
-    settings, skip = _settings_above(path)
-    table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
-    raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    return _Log(path, skip + 1, settings, raw, {}, {}, [])
 
 
 def _is_header(line: str) -> bool:
@@ -143,10 +145,7 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
 
 
 def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
-    """The settings and the frames of the sessions of a file, in order.
-
-    A header ends at the first line that does not begin with `H `, or is not text.
-    """
+    """The settings and the frames of each session. A header ends before a line without `H `, or that is not text."""
     content, found = read_bytes(path, 1 << 29), []  # more than an hour of flight
     places = [match.start() for match in re.finditer(_MAGIC, content)]
     for at, end in itertools.pairwise([*places, len(content)]):
@@ -277,16 +276,6 @@ def _add_attitude(log: _Log) -> None:
         return
     log.names.update(dict.fromkeys(ANGLES, field))
     log.columns.update(zip(ANGLES, angles.T, strict=True))
-
-
-def _turn(log: _Log) -> None:
-    """Turn gyro and accelerometer of a newer Indiflight, whose axes point forward, right and down."""
-    indiflight = any(log.names.get(name, "").startswith(("omega", "quat")) for name in ("omega1", "phi"))
-    if indiflight and np.median(_finite(log.columns.get("az", _NONE))) < 0:
-        log.columns.update((name, -log.columns[name]) for name in ("q", "r", "ay", "az"))
-        log.notes.append(
-            "the specific force in flight points down: gyro and accelerometer count as forward, right, down"
-        )
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

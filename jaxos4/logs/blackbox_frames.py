@@ -1,11 +1,9 @@
 """The frames of a blackbox session: numbers of few bits, most of them as differences from a prediction.
 
-A frame begins with a letter: "I" (complete), "P" (differences from the frames before), "S", "G", "H" (slow values, GPS,
-home) or "E" (an event). The settings give the fields of each kind with their encodings and predictors. If a frame is
-damaged, all differences after it are wrong up to the next complete frame: they are left out.
+A frame begins with a letter: "I" (complete), "P" (differences), "S", "G", "H" (slow values, GPS, home) or "E" (event).
+The settings give the fields of each kind. After a damaged frame, all are left out up to the next complete one.
 
-Reference: the description of the format by Nicholas Sherlock ("Blackbox internals", Cleanflight), and the sources of
-Betaflight and INAV for the encodings that came later.
+Reference: Nicholas Sherlock, "Blackbox internals", Cleanflight; later encodings: sources of Betaflight and INAV.
 """
 
 import array
@@ -108,10 +106,7 @@ def _whole(text: str | None, default: int) -> int:
 
 
 class Numbers:
-    """Reads numbers from `data`: few bits for small ones. `at`: the number of bytes read.
-
-    Raises `IndexError` at the end of the data.
-    """
+    """Reads numbers from `data`; `at`: the number of bytes read. Raises `IndexError` at the end of the data."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
@@ -210,10 +205,7 @@ class _Stream:
         self.steps: dict[int, int] = {}
 
     def frames(self) -> Iterator[list[int]]:
-        """The values of each main frame that can be trusted.
-
-        Frames are trusted when the next complete one follows the last of them: else one was lost among them.
-        """
+        """The values of each main frame that can be trusted: no frame was lost before the next complete one."""
         data, size = self.data, len(self.data)
         run: list[list[int]] = []  # a complete frame, and the differences after it
         intact = False  # no difference can be trusted before the first complete frame

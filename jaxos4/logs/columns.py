@@ -72,12 +72,8 @@ class ColumnMap(NamedTuple):
     def chosen(self, path: Path, held: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
         """By column, its place in a log.
 
-        **Arguments:**
-
         - `held`: takes a source; returns its name in the log, or `None` if the log does not hold it.
-        - `names`: of all that the log holds, for the message.
-
-        **Raises:** `InputError` if the log does not hold a column that is needed.
+        - `names`: of all that the log holds, for the `InputError` about a column that is needed.
         """
         found = {}
         for column, source in self.sources.items():
@@ -99,10 +95,7 @@ class ColumnMap(NamedTuple):
 
 
 def column_map(given: ColumnsGiven) -> ColumnMap:
-    """A checked column map; `None`: the columns of the flight CSV.
-
-    **Raises:** `InputError`, one line, for a map that cannot be used; `OSError` if its file cannot be read.
-    """
+    """A checked column map; `None`: the columns of the flight CSV. Raises `InputError`, one line, or `OSError`."""
     if given is None:
         return ColumnMap("flight CSV", {name: Source((name,)) for name in _COLUMNS})
     if isinstance(given, Mapping):
@@ -172,12 +165,9 @@ def mapped_rows(table: Table, columns: ColumnMap) -> Table:
 
 
 def array_table(data: Any, columns: ColumnMap) -> Table:
-    """The table of a mapping of arrays, or of an object like one: a DataFrame, a Dataset.
+    """The table of a mapping of arrays, a DataFrame or a Dataset, with one row for each time, which may be a date.
 
-    Arrays have one row for each time. Column i of an array `name` with two dimensions is named `name[i]`. Times may be
-    dates.
-
-    **Raises:** `InputError` if a column is missing, or lengths differ.
+    Column i of an array `name` with two dimensions is named `name[i]`. Raises `InputError`.
     """
     names = getattr(data, "columns", None)
     if names is None and not hasattr(data, "keys"):

@@ -15,10 +15,8 @@ from .table import Path, opened, refuse
 class Limits(NamedTuple):
     """The largest sizes after decompression [bytes].
 
-    - `part`: of a chunk or a message, which is decompressed in memory. Recorders write about a megabyte; a bomb has
-      gigabytes.
-    - `file`: of a file that is compressed as a whole (`ros2 bag record --compression-mode file`), which is decompressed
-      to the disk piece by piece. A bag of an hour has a few gigabytes.
+    - `part`: of a chunk or a message, in memory. Recorders write about a megabyte; a bomb has gigabytes.
+    - `file`: of a file that is compressed as a whole, on the disk. A bag of an hour has a few gigabytes.
     """
 
     part: int = 1 << 28
@@ -31,10 +29,7 @@ _MCAP, _CHUNK_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, b"\x05"
 
 
 def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
-    """Refuse a bag or MCAP file that is larger than `limits` when it is decompressed.
-
-    `path`: a file, or the folder of a bag of ROS 2. What is damaged is left to the reader. Raises `InputError`.
-    """
+    """Refuse a file or folder of a bag that decompresses to more than `limits`. Damage is left to the reader."""
     place = FilePath(path)
     for each in sorted(file for file in place.iterdir() if file.is_file()) if place.is_dir() else [place]:
         with opened(each, "rb") as file:

@@ -24,8 +24,6 @@ _FILLED = ((",,", ",nan,"), (",,", ",nan,"), (",\n", ",nan\n"), ("\n,", "\nnan,"
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
-_NEUROBEM = ("ang vel x", "mot 1")
-
 
 def read_mapped(path: Path, columns: ColumnMap) -> tuple[Table, tuple[str, ...]]:
     """Read a CSV file by a column map. Raises `InputError`."""
@@ -35,14 +33,12 @@ def read_mapped(path: Path, columns: ColumnMap) -> tuple[Table, tuple[str, ...]]
 
 def _is_neurobem(begin: bytes) -> bool:
     header = begin.partition(b"\n")[0].decode(errors="replace")
-    return {name.strip() for name in header.split(",")}.issuperset(_NEUROBEM)
+    return {"ang vel x", "mot 1"} <= {name.strip() for name in header.split(",")}
 
 
-def _read_neurobem(path: Path) -> tuple[Table, tuple[str, ...]]:
-    return read_mapped(path, column_map("neurobem"))
-
-
-NEUROBEM = LogFormat("NeuroBEM", "NeuroBEM CSV", _is_neurobem, _read_neurobem, read_mapped)
+NEUROBEM = LogFormat(
+    "NeuroBEM", "NeuroBEM CSV", _is_neurobem, lambda path: read_mapped(path, column_map("neurobem")), read_mapped
+)
 CSV = LogFormat(
     "CSV",
     "flight CSV",
@@ -59,8 +55,6 @@ def read_table(
     """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
 
     The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored.
-
-    **Arguments:**
 
     - `skip`: number of lines before the header.
     - `missing`: cells that mean "not measured", in addition to the empty cell.
@@ -98,13 +92,10 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
     Reading the file gives back every bit of measured speeds and states; angles are unwrapped. If writing fails, an
     older file at `path` is unchanged.
 
-    **Arguments:**
+    `airframe`: its `max_rotor_speed` turns the rotor speeds of a `commanded` flight into `command1..4`. Without it, the
+    file has `omega1..4`, and a reader takes them for measured speeds.
 
-    - `airframe`: its `max_rotor_speed` turns the rotor speeds of a `commanded` flight into `command1..4`. Without it,
-      the file has `omega1..4`, and a reader takes them for measured speeds.
-
-    **Raises:** `InputError` for a batch of flights, or for values that a file cannot contain (an infinity, a rotor
-    speed that is not finite); `OSError` if the file cannot be written.
+    **Raises:** `InputError` for a batch of flights, an infinity, or a rotor speed that is not finite; `OSError`.
     """
     if flight.time.ndim != 1:
         shape = flight.time.shape[:-1]

@@ -31,6 +31,11 @@ Source = tuple[str, Sequence[str], float | Float[np.ndarray, " fields"]]
 """A kind of messages, the fields that hold some of our columns, and the factors to our units and frame."""
 
 
+def motor_order(functions: Sequence[int], motors: Sequence[int]) -> list[int] | None:
+    """The places of motors 1 to 4 among the outputs with these functions; `None` if one of them is missing."""
+    return [functions.index(motor) for motor in motors] if {*motors} <= {*functions} else None
+
+
 @dataclasses.dataclass(frozen=True)
 class Messages:
     """The decoded messages of a log. Its methods add to `names` and `notes`.
@@ -64,10 +69,7 @@ class Messages:
     def series(
         self, kind: str, fields: Sequence[str], instance: int | None = None, *, fewest: int = 2
     ) -> Series | None:
-        """Samples of the fields of a kind of message, in order of time; `None` if there are fewer than `fewest`.
-
-        **Raises:** `InputError` if the time runs backward.
-        """
+        """Samples of fields in order of time; `None` if there are fewer than `fewest`. Raises `InputError`."""
         raw = self.of(kind, instance)
         if not fields or not raw.keys() >= {"t", *fields}:
             return None
@@ -84,9 +86,9 @@ class Messages:
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
 
     def fastest(self, columns: Sequence[str], sources: Iterable[Source], *, faster: float = 1.1) -> Series | None:
-        """The columns that were logged most often, in our units and frame; `None` if no source was logged.
+        """The source that was logged most often, in our units and frame; `None` if none was.
 
-        A source is preferred to those before it if its rate is so many times as high.
+        One is preferred to those before it if it is so many times `faster`.
         """
         best, found = 0.0, None
         for kind, fields, factor in sources:
@@ -108,32 +110,24 @@ class Messages:
         """Note that commands are taken as they are."""
         self.notes.append(f"commands are {self.names['command1']}.., taken as fractions of full-scale rotor speed")
 
-    def sampling(self, column: str, series: Series) -> Sampling:
-        """How often a column was written."""
-        name = self.names[column]
-        return Sampling(name.partition(".")[0] if self.prefixed else name, logged_rate(series.t))
-
     def table(
         self, rates: Series, rotors: Series, others: Mapping[Names, Series | None], **facts: Any
     ) -> tuple[RowPositions, Table]:
-        """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
+        """The gyro's samples as rows, at 1 kHz at most, with rotors and `others` brought to them, without impossible samples.
 
-        Impossible samples are taken out before, so that no row takes a share of them. A gyro that is faster than 1 kHz
-        is averaged to 1 kHz. Rotor speeds are measured if `omega1` has a name, and else commands [0..1].
-
-        **Arguments:**
-
-        - `others`: the other sensors, by the names of their columns; `None`: not logged.
-        - `facts`: more fields of `LogFacts`.
+        Series are in our units and frame. Rotor speeds are measured if `omega1` has a name, and else commands [0..1].
+        `others`: by the names of their columns; `None`: not logged. `facts`: more fields of `LogFacts`.
 
         **Returns:** the times of the rows [s], and the table; `t` is 0 in the first row.
 
-        **Raises:** `InputError` if rates and rotors do not overlap in time, if there are more than `MAX_ROWS` rows, or
-        for too many impossible samples.
+        **Raises:** `InputError` if rates and rotors do not overlap, for too many rows or impossible samples.
         """
         measured = "omega1" in self.names
         rotor_names = SPEED_NAMES if measured else COMMAND_NAMES
-        about = LogFacts(self.sampling(rotor_names[0], rotors), self.sampling("p", rates), **facts)
+        sources = {name: self.names[name] for name in (rotor_names[0], "p")}
+        motors, gyro = (each.partition(".")[0] if self.prefixed else each for each in sources.values())
+        written = Sampling(motors, logged_rate(rotors.t)), Sampling(gyro, logged_rate(rates.t))
+        about = LogFacts(*written, **facts)
         table = Table(self.path, {}, first_row=None, names=self.names, remedy=self.remedy, facts=about)
         start = rates.t[min(np.count_nonzero(rates.t < rotors.t[0]), rates.t.size - 1)]
 

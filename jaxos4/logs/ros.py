@@ -3,6 +3,7 @@
 A column's source is `/topic.field.field[0]`. A topic may have a namespace before the name in the column map.
 """
 
+import functools
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -76,10 +77,7 @@ ROS = LogFormat(
 
 
 def _reader(path: Path) -> Any:
-    """The reader of rosbags for the bytes with which a file begins, or for a folder. It is not open yet.
-
-    Raises `InputError` for a file that is far larger when it is decompressed.
-    """
+    """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for what is far too large."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2.storage_mcap import McapReader
@@ -112,9 +110,11 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
 
     notes: list[str] = []
     if columns is None:
-        fitting = (each for each in map(column_map, PRESETS) if _fits(each.chosen(path, held, topics)))
-        columns = next(fitting, None)
-        if columns is None:
+        for columns in map(column_map, PRESETS):
+            found = columns.chosen(path, held, topics).keys()
+            if found >= {"p", "q", "r"} and found & {"omega1", "command1"}:
+                break
+        else:
             what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {listed(topics) or 'none'}"
             refuse(path, f"{what}: say in a column map which hold rates and motors, and give --columns map.toml")
         notes.append(f"columns are those of the preset {columns.name}")
@@ -122,10 +122,6 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
     found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
     log = Messages(path, found, _REMEDY, notes, prefixed=False)
     return _table(log, columns, chosen), tuple(notes)
-
-
-def _fits(chosen: dict[str, str]) -> bool:
-    return chosen.keys() >= {"p", "q", "r"} and bool(chosen.keys() & {"omega1", "command1"})
 
 
 def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
@@ -176,6 +172,7 @@ def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[byt
 def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
     """A function that takes a number out of a message; NaN if an array is shorter. It raises `InputError`."""
     steps = [int(each) if each.isdecimal() else each for each in _FIELD.findall(field)]
+    wrong = functools.partial(refuse, path, column=f"{topic}.{field}", kind="field")
 
     def get(message: Any) -> float:
         value = message
@@ -186,22 +183,11 @@ def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
                 return math.nan
             except (AttributeError, TypeError):
                 fields = [name for name in getattr(value, "__dataclass_fields__", ()) if name[:2] != "__"]
-                names = ", ".join(fields) or "a number"
-                refuse(
-                    path,
-                    f"has no {step} there, but {names}; correct the column map",
-                    column=f"{topic}.{field}",
-                    kind="field",
-                )
+                wrong(f"has no {step} there, but {', '.join(fields) or 'a number'}; correct the column map")
         try:
             return float(value)
         except (TypeError, ValueError):
-            refuse(
-                path,
-                "is not a number; name one of its fields in the column map",
-                column=f"{topic}.{field}",
-                kind="field",
-            )
+            wrong("is not a number; name one of its fields in the column map")
 
     return get
 
@@ -217,10 +203,7 @@ def _stamp(message: Any) -> int:
 def _timed(
     found: dict[str, _Topic], notes: list[str], *, recorded: bool, clock: float = 0.5
 ) -> dict[str, dict[int, Fields]]:
-    """The topics as messages. Times are stamps if all topics have some, of one clock; else those of the recorder.
-
-    Topics whose stamps are more than `clock` [s] apart from when they were recorded have clocks of their own.
-    """
+    """The topics as messages, with stamps if all have some of one clock (to `clock` [s]), or times of the recorder."""
     found = {topic: each for topic, each in found.items() if each.recorded}
     times = [(np.array(each.recorded, float), np.array(each.stamps, float)) for each in found.values()]
     apart = [float(np.median(stamps - at)) for at, stamps in times]
@@ -257,10 +240,18 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
         values = [s.values[:, 0] if s.t is t else np.interp(t, s.t, s.values[:, 0]) for s in same]
         return Series(t, np.column_stack(values))
 
+    def turning(names: Sequence[str]) -> Series | None:
+        """The samples with all four rotors; `None` if one of them never turns."""
+        rotors = together(names)
+        if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
+            return None
+        whole = np.isfinite(rotors.values).all(axis=1)
+        return Series(rotors.t[whole], rotors.values[whole]) if np.count_nonzero(whole) > 1 else None
+
     rates = needed(log.path, together(RATES), "body rates", f"name p, q and r in {columns.name}")
-    turning = (_turning(together(kind)) for kind in (SPEED_NAMES, COMMAND_NAMES))
     remedy = f"name omega1..4 or command1..4 in {columns.name}"
-    rotors = needed(log.path, next(filter(None, turning), None), "rotor speeds or commands", remedy)
+    rotors = turning(SPEED_NAMES) or turning(COMMAND_NAMES)
+    rotors = needed(log.path, rotors, "rotor speeds or commands", remedy)
     if "command1" in log.names:
         for name in SPEED_NAMES:  # named, but at rest
             log.names.pop(name, None)
@@ -272,11 +263,3 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
     single = found.keys() - {*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, *RATES, "t"}
     others: dict[Names, Series | None] = {ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)}
     return log.table(rates, rotors, others)[1]
-
-
-def _turning(rotors: Series | None) -> Series | None:
-    """The samples with all four rotors; `None` if one of them never turns."""
-    if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
-        return None
-    whole = np.isfinite(rotors.values).all(axis=1)
-    return Series(rotors.t[whole], rotors.values[whole]) if np.count_nonzero(whole) > 1 else None

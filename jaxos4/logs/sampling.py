@@ -33,7 +33,7 @@ class Series(NamedTuple):
 
 
 def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Columns]:
-    """The integral of each column from the first sample, as a function of the time. Before the first sample it is 0.
+    """The integral of each column from the first sample, as a function of the time; 0 before the first sample.
 
     A value is held until the next one, and the last one for ever. If `linear`, values are interpolated instead.
     """
@@ -96,11 +96,9 @@ def speeds_within(
 def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
     """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
 
-    Each measurement becomes the mean over a sample around its time, which removes vibration above the new rate without
-    a delay. The first sample begins half of a row before the first row, so that whole rows are averaged, and samples
-    share none, if their length is a multiple of the rows' step. A measurement is missing (NaN) if less than about half
-    of that time was measured. Each rotor speed becomes the root mean square over the sample that follows. `t`: times
-    [s]; `omega`: rotor speeds [rad/s], `held` from row to row, or those at the times.
+    Each measurement becomes the mean over a sample around its time, or NaN if less than about half of it was measured.
+    The first sample begins half of a row before the first row, so that samples of whole rows share none. Each rotor
+    speed becomes the root mean square over the sample that follows. `omega`: [rad/s], `held` from row to row or not.
     """
     own = (t[-1] - t[0]) / (t.size - 1)
     measured = np.isfinite(channels)
@@ -127,12 +125,10 @@ def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Calla
 def at_rows(rows: RowPositions, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
     """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
 
-    Values are interpolated linearly to the time of the row, but not across a gap: between neighbours more than 1.5
-    steps of the sensor apart. A sensor that is faster than the rows is averaged over the time from half a step before
-    the row to half a step after it. Angles must be unwrapped.
+    Values are interpolated linearly, but not across a gap: between neighbours more than 1.5 steps of the sensor apart.
+    A sensor that is faster than the rows is averaged over a step around the row. Angles must be unwrapped.
 
-    `step`: the rows are a uniform grid of this step [s]. Every row between neighbours within 1.5 steps then gets a
-    value, and nothing is averaged.
+    `step`: of a uniform grid [s]: all rows between neighbours within 1.5 steps get a value, and nothing is averaged.
     """
     own = step or median_step(rows)
     out = np.full((rows.size, series.values.shape[1]), np.nan)
@@ -170,14 +166,10 @@ def grid_size(t: Times, dt: float) -> float:
 
 
 def resample(t: Times, omega: Rotors, channels: Columns, dt: float, *, held: bool) -> tuple[Resampled, str]:
-    """Bring rows at uneven times [s] to the grid t_0, t_0 + dt, ...
+    """Bring rows at uneven times [s] to the grid t_0, t_0 + dt, ..., with a note if that changes any.
 
-    `omega` is `held` until the next row, or interpolated (`root_mean_square`); `channels` are interpolated linearly
-    (`at_rows`), with an error of second order in dt. A gap is NaN, except for samples within 1 % of dt of a time of the
-    grid. If all rows are within 1 % of a step of a uniform grid, their values stay, and so do times that are off by
-    rounding only.
-
-    **Returns:** time, rotor speeds, channels, and a note with the figures of the resampling, if there was any.
+    `omega` is `held` until the next row, or interpolated (`root_mean_square`); `channels` are interpolated (`at_rows`).
+    A gap is NaN, except within 1 % of dt of a sample. Rows within 1 % of a step of a uniform grid keep their values.
     """
     own, grid = (t[-1] - t[0]) / (t.size - 1), np.linspace(t[0], t[-1], t.size)
     off = np.abs(t - grid).max()
@@ -230,10 +222,7 @@ def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"
 
 
 def logged_rate(t: Times, *, pause: float = 0.9) -> float:
-    """How often samples at the times `t` [s] were written [Hz]. For half of the time, samples come at least this often.
-
-    A burst is no high rate. A longer time than `pause` [s] does not count, unless there is nothing else.
-    """
+    """How often samples at the times `t` [s] were written [Hz]: for half of the time, they come at least this often."""
     steps = np.diff(t)
     steps = np.sort(steps[(steps > 0) & (steps <= pause)] if (steps <= pause).any() else steps)
     total = np.cumsum(steps)
@@ -243,10 +232,7 @@ def logged_rate(t: Times, *, pause: float = 0.9) -> float:
 
 
 def held_regularly(t: Times, *, fewest: int = 20, regular: float = 0.6) -> bool:
-    """Whether values that change at the times `t` [s] were written at a fixed rate and held in between.
-
-    That is so for at least the `fewest` steps, most of which are equal up to the share `regular`.
-    """
+    """Whether values that change at the times `t` [s] were written at a fixed rate: `fewest` steps, nearly equal."""
     steps = np.diff(t)
     if steps.size < fewest:
         return False

@@ -20,9 +20,8 @@ MAX_ROWS = 5_000_000  # 83 minutes at 1 kHz; a longer flight does not fit in the
 SLOWEST_RATE = 40.0
 """The fewest samples a second of motors and gyro that identify a vehicle [Hz].
 
-Rotors follow their commands with a lag of 20 to 80 ms. Commands one lag apart or further say too little about speeds
-between them. In closed loop, with the lag and delay that fit best, commands at 10 Hz make inertias 1.4 to 2.1 times too
-large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
+Rotors follow their commands with a lag of 20 to 80 ms. In closed loop, commands at 10 Hz make inertias 1.4 to 2.1 times
+too large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 """
 
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
@@ -115,8 +114,6 @@ class Table(NamedTuple):
 class LogFormat(NamedTuple):
     """A log format. To add one, write a file that makes a `LogFormat`, and add a line to `jaxos4.logs.FORMATS`.
 
-    **Arguments:**
-
     - `name`: short name, as in the JSON of `jaxos4 inspect`.
     - `label`: the name that users see.
     - `recognises`: takes the first bytes of a file; returns whether the file has this format.
@@ -140,12 +137,10 @@ _ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocit
 class Recording(NamedTuple):
     """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
 
-    The arrays, `commanded`, `held` and `averaging_time` are as in `Flight`, in SI units. A recording is cleaned, cut
-    and joined as it is, and becomes a `Flight` once, at the end.
+    Fields are as in `Flight`, in SI units. A recording is cleaned, cut and joined, and becomes a `Flight` at the end.
 
     - `name`: in messages and in the provenance. Usually the path of the file.
-    - `notes`: what the reader changed in the data, one line each.
-    - `facts`: what the log says beside the flight, such as how often motors and gyro were written.
+    - `notes`: what the reader changed in the data, one line each. `facts`: what the log says beside the flight.
     """
 
     time: Float[np.ndarray, " samples"]
@@ -197,11 +192,7 @@ class Recording(NamedTuple):
 
     @property
     def vehicle_evidence(self) -> str:
-        """The evidence that this is the log of a real vehicle, as the end of a sentence; empty if there is none.
-
-        A simulation of the OS4 has rotor speeds and states. A vehicle logs commands, or has an accelerometer, or writes
-        a format of its own.
-        """
+        """The evidence that this is the log of a real vehicle, as the end of a sentence; empty if there is none."""
         if self.commanded:
             return "has commands, not rotor speeds"
         if self.specific_force is not None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import BROKEN
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, Names
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Names, motor_order
 from .sampling import HALF_TURN, Series, euler_angles, logged_rate
 from .table import LogFormat, Path, Table, fast_enough, in_words, needed, order_note, read_bytes, refuse
 
@@ -48,11 +48,7 @@ _REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 
 
 class _Protocol(NamedTuple):
-    """How the outputs of motors are coded: idle and full speed by default, and parameters that hold others.
-
-    - `possible`: the smallest and the largest value of such a parameter.
-    - `parameters`: the beginnings of their names, before MIN or MAX.
-    """
+    """The coding of motors' outputs: idle and full speed, and parameters that hold others within `possible`."""
 
     name: str
     ends: tuple[float, float]
@@ -77,7 +73,10 @@ def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
     remedy = "log esc_status, actuator_motors or actuator_outputs"
     rotors = needed(path, _rotors(log), "rotor speeds or commands", remedy)
     log.name([f"{'omega' if rotors.measured else 'command'}{i}" for i in range(1, 5)], rotors.topic, rotors.fields)
-    found |= {ANGLES: _attitude(log), tuple(_MOVING): _position(log)}
+    log.names.update(dict.fromkeys(ANGLES, "vehicle_attitude.q"))
+    turned = log.series("vehicle_attitude", _items("q", 4))
+    found[ANGLES] = None if turned is None else Series(turned.t, euler_angles(turned.values) * HALF_TURN)
+    found[tuple(_MOVING)] = _position(log)
     rows, table = log.table(rates, rotors.series, found, **_facts(log))
     table = table._replace(facts=table.facts._replace(landed=_landed(log, rows)))
     log.notes.extend(filter(None, (rotors.note, order_note(f"{rotors.topic}.{rotors.fields[0]}"))))
@@ -105,12 +104,6 @@ def _check_vehicle(log: Messages) -> None:
             refuse(log.path, f"{place}: this is no quadrotor; give the log of a quadrotor")
 
 
-def _attitude(log: Messages) -> Series | None:
-    log.names.update(dict.fromkeys(ANGLES, "vehicle_attitude.q"))
-    series = log.series("vehicle_attitude", _items("q", 4))
-    return None if series is None else Series(series.t, euler_angles(series.values) * HALF_TURN)
-
-
 def _position(log: Messages) -> Series | None:
     topic = "vehicle_local_position"
     flags = {column: flag for column, flag in _MOVING.items() if flag in log.of(topic)}
@@ -125,7 +118,7 @@ def _position(log: Messages) -> Series | None:
 
 
 def _facts(log: Messages) -> dict[str, Any]:
-    """What the parameters say beside the flight, as fields of `LogFacts`."""
+    """Fields of `LogFacts` that the parameters state."""
     get = log.parameters.get
     positions = [[get(f"CA_ROTOR{i}_P{axis}", math.nan) for axis in "XY"] for i in range(4)]
     moments = [get(f"CA_ROTOR{i}_KM", math.nan) for i in range(4)]
@@ -166,21 +159,16 @@ class _Rotors(NamedTuple):
     note: str = ""
     measured: bool = False
 
-    @property
-    def rate(self) -> float:
-        return logged_rate(self.series.t)
-
 
 def _rotors(log: Messages) -> _Rotors | None:
-    """Measured speeds, or the motors' commands, or the outputs: the first that was logged often enough.
-
-    If none was, the one that was logged most often.
-    """
+    """Measured speeds, the motors' commands or the outputs: the first that is fast enough, or else the fastest."""
     every = [found for find in (_speeds, _motors, _outputs) if (found := find(log)) is not None]
-    rarely = max(every, key=lambda each: each.rate, default=None)
-    chosen = next((each for each in every if fast_enough(each.rate)), rarely)
-    if chosen is not None and every[0].measured and not chosen.measured:
-        log.notes.append(f"measured speeds (esc_status) were logged at {every[0].rate:.2g} Hz only: commands are used")
+    rates = [logged_rate(each.series.t) for each in every]
+    if not every:
+        return None
+    chosen = every[next((i for i, rate in enumerate(rates) if fast_enough(rate)), rates.index(max(rates)))]
+    if every[0].measured and not chosen.measured:
+        log.notes.append(f"measured speeds (esc_status) were logged at {rates[0]:.2g} Hz only: commands are used")
     return chosen
 
 
@@ -193,7 +181,7 @@ def _speeds(log: Messages) -> _Rotors | None:
         log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
         return None
     functions = [int(log.latest("esc_status", f"esc[{i}].actuator_function") or 0) for i in range(4)]
-    order = _motor_order(functions) or range(4)
+    order = motor_order(functions, _MOTORS) or range(4)
     measured = np.isfinite(series.values).all(axis=1)
     if np.count_nonzero(measured) < 2:
         return None
@@ -242,21 +230,14 @@ def _thrust_curve(log: Messages) -> tuple[float, str]:
 
 
 def _bank_of_motors(log: Messages) -> tuple[str, list[int]] | None:
-    """The beginning of the parameters' names of the outputs of motors 1 to 4, and these outputs.
-
-    None if the log says which motor an output drives, but no driver has all four motors. Old PX4: the first of MAIN.
-    """
+    """The bank of outputs that drives motors 1 to 4, and these outputs; `None`: no bank has all. Old PX4: MAIN."""
     for bank in _BANKS:
-        order = _motor_order([int(log.parameters.get(f"{bank}_FUNC{output}", 0.0)) for output in range(1, 17)])
+        functions = [int(log.parameters.get(f"{bank}_FUNC{output}", 0.0)) for output in range(1, 17)]
+        order = motor_order(functions, _MOTORS)
         if order is not None:
             return bank, order
     unknown = not any(f"{bank}_FUNC1" in log.parameters for bank in (*_BANKS, *_OTHER_BANKS))
     return ("PWM_MAIN", [0, 1, 2, 3]) if unknown else None
-
-
-def _motor_order(functions: list[int]) -> list[int] | None:
-    """The places of motors 1 to 4 among the outputs with these functions; None if one of them is missing."""
-    return [functions.index(motor) for motor in _MOTORS] if {*_MOTORS} <= {*functions} else None
 
 
 def _limits(log: Messages, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
@@ -314,10 +295,7 @@ def _decoded(path: Path) -> Messages:
 
 
 class _Content(io.BytesIO):
-    """Ends the search for the next message in a corrupt file, because pyulog tries every byte.
-
-    pyulog seeks for each corrupt byte, and a few times in an intact file.
-    """
+    """Ends the search in a corrupt file: pyulog seeks for each corrupt byte, and a few times in an intact file."""
 
     seeks = 0
 
@@ -329,10 +307,7 @@ class _Content(io.BytesIO):
 
 
 def _check_formats(formats: Mapping[str, Any], *, most: int = 1024, deepest: int = 3) -> None:
-    """Refuse formats with too many fields, or levels: pyulog makes an object of each, also of arrays inside arrays.
-
-    The largest messages of PX4 have about 200 fields.
-    """
+    """Refuse formats with too many fields or levels, as pyulog makes an object of each; PX4 has about 200 fields."""
 
     @functools.cache
     def count(name: str, depth: int) -> int:

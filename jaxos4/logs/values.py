@@ -56,12 +56,8 @@ def without_impossible(
 ) -> Table:
     """The table without the values outside of `limits`: they count as not measured.
 
-    **Arguments:**
-
-    - `most`: the share of the values of a column that can be impossible. More are a wrong unit.
+    - `most`: the share of the values of a column that can be impossible. More are a wrong unit: `InputError`.
     - `farthest`: a rotor turns at most so many times as fast as in all but this share of its flight.
-
-    **Raises:** `InputError` if more than this share of a column are impossible.
     """
     columns, impossible = dict(table.columns), dict(table.impossible)
     for name, limit in limits.items():
@@ -122,10 +118,7 @@ RULES = Rules()
 
 
 def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
-    """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before.
-
-    A rotor at its limit is a fact, and not an error of its sensor.
-    """
+    """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before."""
     channels, omega = recording.channels.copy(), recording.omega.copy()
     impossible, clipped = {}, {}
     names = (*CHANNEL_NAMES, *(f"rotor {i + 1}" for i in range(4)))

@@ -148,10 +148,7 @@ class AbstractModel(eqx.Module):
         return tuple(i for i, parameter in enumerate(self.parameters) if parameter.in_forcing)
 
     def derivative(self, state: StateVector, omega: Float[Array, "4"], parameters: Parameters) -> StateVector:
-        """dX/dt in the paper's order, Eq. (14), in SI units.
-
-        **Arguments:** `state` X, `omega` [rad/s], and `parameters` in the order of `parameter_names`.
-        """
+        """dX/dt in the paper's order, Eq. (14), in SI units, from the state X, `omega` [rad/s] and the parameters."""
         rows = self.forcing(Inputs(omega[None], jnp.ones(())), parameters)
         forcing = jax.tree.map(lambda leaf: leaf[0], rows)
         derivative = stack(self.cascade(unstack(state[CASCADE_ORDER]), forcing, parameters))

@@ -47,8 +47,6 @@ class FlightModel(AbstractModel):
     alpha6 m x_c (`jaxos4.center_of_mass`). Only thrust above hover counts, so that an estimate can distinguish it from
     a constant torque. Rotors of unequal thrust cause the same torque.
 
-    **Arguments:**
-
     - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity`, `inflow` and `drag`
       need `Flight.body_velocity`, or states with a velocity. `gyro_bias` and `offset` can be distinguished only if the
       attitude is compared too.
@@ -153,10 +151,7 @@ class FlightModel(AbstractModel):
         return not any(term.gyro or term.accelerometer for term in self._terms)
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The chain from commands to torque and thrust: each term acts at its place.
-
-        If the flight is padded (`Inputs.length`), batches that are padding alone are not computed: they are 0.
-        """
+        """The chain from commands to torque and thrust: each term acts at its place. Padding takes no time."""
         if inputs.within is None:
             return self._beside(inputs, self._rotors(inputs, parameters))
         samples, parts, _ = inputs.within.shape

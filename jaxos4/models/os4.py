@@ -20,10 +20,7 @@ from .state import Attitude, Forcing, Rates, State, Translation, attitude_rates,
 
 
 class AbstractOS4(AbstractModel):
-    """The common part of the two OS4 models: their parameters are alpha_1..8, and their sensors show the states.
-
-    `gyroscopic_unit`: the unit of alpha2 and alpha5.
-    """
+    """The common part of the OS4 models, of alpha_1..8. `gyroscopic_unit`: the unit of alpha2 and alpha5."""
 
     gyroscopic_unit: ClassVar[str]
 
@@ -100,9 +97,8 @@ class AbstractOS4(AbstractModel):
 class PublishedOS4(AbstractOS4):
     """The model exactly as the paper prints it: Eqs. (1)-(13), kept as a benchmark.
 
-    It departs from the physics of a rigid body, which is `CorrectedOS4`, in three places: the gyroscopic terms lack the
-    rotor speed, so that alpha2 = J_R d / Ix multiplies q alone, in 1/s; Eq. (2) has alpha5 r, physics has alpha5 p;
-    Eqs. (7)-(9) mix two earth frames.
+    It departs from a rigid body (`CorrectedOS4`) in three places: the gyroscopic terms lack the rotor speed, so that
+    alpha2 = J_R d / Ix [1/s]; Eq. (2) has alpha5 r, physics has alpha5 p; Eqs. (7)-(9) mix two earth frames.
     """
 
     gyroscopic_unit: ClassVar[str] = "1/s"

@@ -25,9 +25,8 @@ def of_stretches(recordings: tuple[int, ...], stretch: Int[Numeric, " samples"])
 class Grid(NamedTuple):
     """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
 
-    `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by
-    `battery_voltage`, to which the airframe's rotor speeds belong. `are_parts`: the samples are parts of those of the
-    flight (`Flight.within`), with their mean speeds.
+    `elapsed`: the fitted time in the recording before it [s]. `voltage`: of the battery over `battery_voltage`.
+    `are_parts`: the samples are parts of those of the flight (`Flight.within`), with their mean speeds.
     """
 
     dt: Scalar
@@ -177,10 +176,7 @@ class Motor(NamedTuple):
         return 2 * command / jnp.maximum(self.curve + root, self.least)
 
     def step(self, omega: Speed, command: Speed, dt: Scalar, steps: int = 2) -> Speed:
-        """The speed after a time `dt` [s], by so many exponential Euler steps.
-
-        They are exact for a first-order system, stable for any `dt`, and of second order.
-        """
+        """The speed after `dt` [s], by exponential Euler steps: stable, and exact for a first-order system."""
         w, u, lag = omega / self.full, command / self.full, jnp.maximum(self.lag, self.shortest_lag * dt)
         for _ in range(steps):
             x, load = u - self.curve * w, (1 - self.curve) * w

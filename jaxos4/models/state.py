@@ -1,8 +1,7 @@
 """The state of a quadrotor as a cascade, and the forcing: rotors -> torque -> rates -> attitude -> translation.
 
-The parameters enter only the forcing and the rate equations, and no level feeds back. So a `State` may stop at any
-level: a level that is `None` is not simulated. States are separate scalars because a batch of scalars vectorises and a
-batch of 12-vectors does not.
+Parameters enter the forcing and the rates alone, and no level feeds back: a `State` may stop at any level, and what
+is `None` is not simulated. States are scalars, because a batch of scalars vectorises.
 """
 
 from typing import NamedTuple
@@ -64,8 +63,8 @@ class Forcing(NamedTuple):
     - `specific_thrust`: U_c/m around the time of the sample [m/s^2], as an accelerometer measures it.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
     - `velocity`: along the body's axes, measured or by dead reckoning [m/s].
-    - `early`: the same quantities, weighted by the time that is left in the sample: what they add to a mean over the
-      sample. `None`: measurements are those at the beginning of a sample.
+    - `early`: the same, weighted by the time that is left in the sample: what they add to a mean over it. `None`:
+      instants.
     """
 
     roll: Samples

@@ -95,10 +95,7 @@ class Term:
 
 
 def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
-    """A fifth of the hover torque of one pair of rotors over the inertia [rad/s^2], divided by `per`.
-
-    The yaw torque of rotors is about a fifth of their roll torque.
-    """
+    """A fifth of the hover torque of two rotors (in yaw a fifth of it) over the inertia [rad/s^2], divided by `per`."""
 
     def share(airframe: Airframe) -> Scalar:
         arm = jnp.abs(jnp.asarray(airframe.rotor_positions)).mean()

@@ -41,10 +41,9 @@ class Scaling(eqx.Module):
 
 
 class GatedPerceptron(eqx.Module):
-    """A multilayer perceptron whose last hidden layer multiplies a linear map of the inputs.
+    """A multilayer perceptron whose last hidden layer multiplies a linear map of the inputs (GLU; Dauphin et al. 2017).
 
-    The output is a linear map of the inputs with coefficients that depend on the inputs. Parameters act on a flight in
-    products, so that such a map needs fewer neurons than a perceptron (GLU; Dauphin et al. 2017).
+    Parameters act on a flight in products, so that such a map needs fewer neurons than a perceptron.
     """
 
     hidden: eqx.nn.MLP
@@ -65,14 +64,12 @@ class GatedPerceptron(eqx.Module):
 class CMAC(eqx.Module):
     """The cerebellar model articulation controller: a table of weights, of which an input selects a few.
 
-    The output is a sum over all pairs of inputs; each pair adds the mean of one weight from each of its tilings.
+    A tiling divides the plane of two inputs into square cells, each with a weight. The output is a sum over all pairs
+    of inputs; a pair adds the mean of one weight from each of its tilings, which are shifted, so that inputs that are
+    close share most weights. It is piecewise constant. The outermost cells also hold everything beyond them.
 
-    A tiling divides the plane of two inputs into square cells, and each cell has a weight. The tilings of a pair are
-    shifted against each other, so that inputs that are close share most of their weights. The output is piecewise
-    constant in the inputs. The outermost cells also hold everything beyond them.
-
-    Albus tiles all inputs together and hashes the cells. In nine dimensions two flights rarely share a cell, so that
-    little is learnt; pairs can represent the products in which parameters act on a flight.
+    Albus tiles all inputs together and hashes the cells. In nine dimensions two flights rarely share a cell; pairs can
+    represent the products in which parameters act on a flight.
 
     - `extent`: cells cover inputs from minus this to this: twice what a flight without noise has.
 
@@ -168,10 +165,7 @@ def first_regressor(
 
 
 def compress(x: Float[Array, "*batch features"], linear: float = 4.0) -> Float[Array, "*batch features"]:
-    """Features as the network takes them: linear up to the size `linear`, logarithmic beyond.
-
-    Flights that nearly diverge have huge features.
-    """
+    """Features as the network takes them: linear up to the size `linear`, logarithmic beyond, as some are huge."""
     size = jnp.abs(x)
     return jnp.where(size < linear, x, jnp.sign(x) * (linear + jnp.log1p(jnp.maximum(size - linear, 0))))
 
@@ -181,9 +175,8 @@ def loss(
 ) -> Scalar:
     """The loss of one flight: weighted square error in units of `Scaling.bound`, plus the likelihood of the spread.
 
-    Some flights cannot be identified well. The weight 1 / spread keeps their errors from hiding the others. With the
-    likelihood's weight, 1 / spread^2, training could settle at a bad answer with a large spread (beta-NLL; Seitzer et
-    al. 2022). The likelihood trains the spread alone.
+    The weight 1 / spread keeps flights that cannot be identified from hiding the others (beta-NLL; Seitzer et al.
+    2022). The likelihood trains the spread alone.
     """
     found, log_spread = regressor(features, scale, scaling)
     error = (found - u) / scaling.bound(scale)
@@ -219,8 +212,5 @@ class ErrorTable(NamedTuple):
 
 
 def calibrated_scales(noise: tuple[float, float], count: int = 9) -> Float[Array, " scales"]:
-    """The noise scales at which a network is calibrated, from the lowest to the highest of its training.
-
-    There are `count`, evenly spaced in the logarithm; one if the lowest is the highest.
-    """
+    """The `count` noise scales of a calibration, evenly spaced in the logarithm; one if the lowest is the highest."""
     return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else count))

@@ -1,7 +1,4 @@
-"""The paper's neural network (ANN): settings, training, and the trained network as an estimator.
-
-The paper does not describe its network; architecture, features and training are our choice.
-"""
+"""The paper's neural network (ANN): settings, training, and estimator. The paper does not describe it."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -44,8 +41,6 @@ _QUANTITIES: dict[str, Callable[[ShootingProblem], Any]] = {
 
 class NetworkEstimator(eqx.Module):
     """The settings of a network and of its training; `fit` trains it.
-
-    **Arguments:**
 
     - `features`: `"score"`: one Gauss-Newton step at the bracket's center, a number for each unknown; `"raw"`: the
       normalised trajectory, as in the paper.
@@ -107,8 +102,6 @@ class NetworkEstimator(eqx.Module):
     def fit(self, problem: ShootingProblem, bracket: Bracket, *, key: Key) -> "TrainedNetwork":
         """Trains a network for the inputs, sampling, start and missing samples of a problem, and calibrates it.
 
-        **Arguments:**
-
         - `problem`: its measured values are not used, except the first if the initial state is free.
         - `bracket`: parameters of the simulated flights are uniform in it.
         - `key`: the random key: the same key gives the same network.
@@ -146,9 +139,8 @@ def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: 
 class TrainedNetwork(AbstractEstimator):
     """A network that identifies flights of the inputs that it was trained for. Made by `NetworkEstimator.fit`.
 
-    Its intervals contain the truth in the share of flights that their level gives, even if the network is bad: they
-    are calibrated on simulated flights that training did not use (split-conformal prediction). The share is an average
-    over flights that do not diverge, with parameters and initial states uniform in the bracket of training.
+    Its intervals are calibrated on simulated flights that training did not use (split-conformal prediction): they hold
+    the truth in the share of their level, over flights that do not diverge, uniform in the bracket of training.
 
     - `largest_inflation`: if missing samples enlarge a standard deviation by more, the problem is another one.
     - `same`: relative tolerance of equal numbers, because files round them.
@@ -185,16 +177,16 @@ class TrainedNetwork(AbstractEstimator):
         return Bracket.around(self.features.coordinates.center[:count], self.features.coordinates.width[:count])
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. The network looks in its own bracket; that of the problem must only be valid.
+        """Identifies one flight in the network's own bracket; that of the problem must only be valid.
 
-        A network is trained with all parameters free. If the problem holds some, the answer is that for their values.
+        If the problem holds parameters, the answer is that for their values.
 
-        **Returns:** an estimate, whose result is `at_bound` if the answer lies outside the bracket of training by more
-        than its interval, `unidentifiable` if the interval of a parameter is hardly narrower than the bracket, and
-        `network_mismatch` if the flight has more noise than in training, or too many missing samples.
+        **Returns:** an estimate, `at_bound` if the answer lies outside of the bracket of training by more than its
+        interval, `unidentifiable` if an interval is hardly narrower than the bracket, and `network_mismatch` for more
+        noise than in training, or too many missing samples.
 
-        **Raises:** `ValueError` if the network was trained for another problem, with what differs. Inside `jit` or
-        `vmap`, numbers that differ give the result `network_mismatch` instead.
+        **Raises:** `ValueError` with what differs from the problem of training. Inside `jit` or `vmap`, numbers that
+        differ give `network_mismatch` instead.
         """
         answer = self._compare(problem.within(bracket))
         if isinstance(answer, str):

@@ -1,7 +1,6 @@
-"""The features of a flight: a few numbers in place of a trajectory, from a measured flight or from simulated ones.
+"""The features of a flight: a few numbers in place of a measured or simulated trajectory.
 
-Unknowns are the parameters and, if it is free, the initial state. They are in *bracket coordinates*: 0 at the center
-of the bracket, +-1 at its ends.
+Unknowns, parameters and a free initial state, are in *bracket coordinates*: 0 at the center, +-1 at the ends.
 """
 
 import enum
@@ -102,10 +101,7 @@ class Features(eqx.Module):
         return self.reference.size if self.noise_factor is None else self.noise_factor.shape[0]
 
     def __call__(self, problem: ShootingProblem) -> tuple[Float[Array, " features"], Parameters]:
-        """Features of a measured flight, and the factor by which missing samples enlarge each standard deviation.
-
-        Features are NaN if the flight's numbers are not finite. Raw features need all samples of training.
-        """
+        """Features of a measured flight, NaN if it is not finite, and the growth of errors by missing samples."""
         needed, measured = _measured(self.problem), _measured(problem)
         mismatch = jnp.where(needed, self._weighted(problem, problem.measured()), 0.0)
         parameters = len(self.problem.model.parameter_names)
@@ -193,10 +189,7 @@ def _chunk(features: Features, key: Key, place: Int[Numeric, ""], uniform: Bool[
 def with_noise(
     features: Features, flights: Flights, scales: Float[Numeric, "2"], uniform: Float[Array, "flights random"]
 ) -> Flights:
-    """Adds noise to flights, with scales that are log-uniform between `scales`.
-
-    `uniform`: random numbers between -1 and 1, one for the scale and one for each feature.
-    """
+    """Adds noise to flights, of scales log-uniform between `scales`. `uniform`: in -1 to 1, for scale and features."""
     low, high = jnp.log(jnp.asarray(scales, uniform.dtype))
     scale = jnp.exp((low + high + (high - low) * uniform[:, 0]) / 2)
     most = 1 - jnp.finfo(uniform.dtype).eps  # a finite number of standard deviations

@@ -66,10 +66,7 @@ def encode_network(network: TrainedNetwork) -> bytes:
 
 
 def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
-    """Reads a network that `save_network` wrote, in the current precision. `path` can also be the open file.
-
-    Raises `InputError` if it is no complete network file of this version; `OSError` if it cannot be read.
-    """
+    """Reads a file of `save_network`, by its path or open. Raises `InputError` for another one, or `OSError`."""
     content = path if isinstance(path, io.BytesIO) else io.BytesIO(Path(path).read_bytes())
     place = "the network" if isinstance(path, io.BytesIO) else path
     try:

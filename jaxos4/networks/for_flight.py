@@ -72,6 +72,6 @@ def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str
 
 
 def seen_channels(problem: ShootingProblem) -> str:
-    """What a network looks at by default: the rates, and the attitude if a rate was not measured."""
+    """The channels of a network by default: the rates, and the attitude if a rate was not measured."""
     rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
     return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"

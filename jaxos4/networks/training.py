@@ -102,12 +102,9 @@ def _untrained(
 def train(
     regressor: Regressor, scaling: Scaling, features: Features, schedule: Schedule, key: Key
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
-    """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
+    """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count. Each step has new noise.
 
-    Between two checks, training simulates new flights. Each step takes some of them, with new noise.
-
-    **Returns:** the regressor as it was at the check with the best validation loss, and the losses of training and
-    validation at every check.
+    **Returns:** the regressor at the check with the best validation loss, and the losses at every check.
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
@@ -217,9 +214,8 @@ def calibrate(
 ) -> ErrorTable:
     """Measures a network's errors on `count` new simulated flights, with new noise at each noise scale.
 
-    Each quantile is the smallest that holds its level for one more flight. Flights that diverge do not count.
-
-    **Raises:** `TrainingError` if too few flights can be flown.
+    Each quantile is the smallest that holds its level for one more flight. Raises `TrainingError` if too few can be
+    flown.
     """
     parameters, tables, purpose = len(features.problem.model.parameter_names), [], Purpose.CALIBRATION
     flights = draw_chunks(features, count, key=key, purpose=purpose, uniform=True)

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from .._templates import templates
+from .._files import templates
 from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
 from ..flight import CHANNEL_NAMES
@@ -69,12 +69,7 @@ class Inspection(msgspec.Struct, frozen=True):
 
 
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
-    """Describe a log. Without an airframe, torques are unknown.
-
-    **Arguments:**
-
-    - `recording`: of a file, read with the same `airframe`, and with `full_scale=1.0`.
-    """
+    """Describe a log that was read with this airframe and `full_scale=1.0`. Without one, torques are unknown."""
     evidence, flown, parts = Evidence(recording, airframe), [], []
     for stretch in evidence.every:
         if not stretch.reason:
@@ -119,11 +114,9 @@ def _measured(recording: Recording) -> dict[str, Channel]:
 def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     """Begin the file of an airframe with what a log knows: spins, hover speed, sometimes the rotors' positions.
 
-    What must be weighed or measured is a comment, so that `load_airframe` names the first of these keys as missing.
-
     **Arguments:** `recording`: read without an airframe, and with `full_scale=1.0`.
 
-    **Returns:** the text, and the keys that must be filled in before it can be used.
+    **Returns:** the text, in which what must be weighed or measured is a comment, and the keys that are missing.
     """
     facts, full = recording.facts, FULL_SCALE if recording.commanded else 1.0
     flown = usable(recording)
@@ -151,10 +144,9 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
 
 
 def _hover(flown: Sequence[Recording]) -> tuple[float, bool] | None:
-    """The rotor speed at which thrust is as large as the weight, in the unit of the flight, and whether it was felt.
+    """The rotor speed that carries the weight, in the unit of the flight, and whether an accelerometer felt it.
 
-    It is felt by an accelerometer with a median of half to twice gravity in flight. If there is none, the median thrust
-    in flight counts as the weight.
+    Without one, or if its median is not half to twice gravity, the median thrust in flight counts as the weight.
     """
     if not flown:
         return None

@@ -1,7 +1,4 @@
-"""The motion of a vehicle: how much each axis is excited, whether it follows the rotors, and its velocity.
-
-The signs of the answer to the rotors also show where the rotors of an X are, and how they turn.
-"""
+"""The motion of a vehicle: how much each axis is excited, whether and how it follows the rotors, its velocity."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -112,12 +109,10 @@ def excitation(
 
 
 def opposite_axes(flown: Sequence[Recording], airframe: Airframe, *, signs: SignRules = SIGNS) -> dict[str, float]:
-    """The axes about which the vehicle turns against the torque that the airframe gives to its rotors.
+    """The axes about which vehicles turn against the torque that the airframe gives to the rotors, in usable stretches.
 
     For each, the correlation of torque and angular acceleration with the opposite sign. Axes without clear motion and
     torque are not judged. The clocks of motors and gyro may be shifted.
-
-    **Arguments:** usable stretches of flights, each of one vehicle.
     """
     mixer = np.asarray(airframe.mixer, dtype=float)[:3]
     found = np.diagonal(_correlations(flown, mixer, signs.shifted, signs), axis1=1, axis2=2)
@@ -143,8 +138,6 @@ def refused_note(axes: Mapping[str, float]) -> str:
 def rotor_signs(flown: Sequence[Recording], *, signs: SignRules = SIGNS) -> tuple[Signs, Signs, Signs | None] | None:
     """The places and spins of four rotors in an X, by how the vehicle turns after each pair of rotors speeds up.
 
-    **Arguments:** usable stretches of flights, each of one vehicle, with motors and gyro logged fast.
-
     **Returns:** the signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from
     above; `None`: the vehicle hardly yawed). `None`: the flight does not show it, or the rotors are no X.
     """
@@ -165,10 +158,8 @@ def _correlations(
 ) -> Float[np.ndarray, "delays rows 3"]:
     """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
 
-    A controller that answers gusts does not change the sign. One number for each delay, each row of `mixer` (the weight
-    of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion.
-
-    **Arguments:** `between`: the first and the last delay of the gyro after the motors [s].
+    By delay of the gyro, `between` two [s], by row of `mixer`, and by axis; NaN: no clear motion. A controller that
+    answers gusts does not change the sign.
     """
     step = max([signs.step, *(each.dt for each in flown)])
     pairs = [_response(each, mixer, step, signs) for each in flown if np.ptp(each.time) > 2 * signs.slow * step]
@@ -229,8 +220,7 @@ def velocity_of(
     """How a vehicle moved through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
-    this sum are forgotten, and so are slow changes of the velocity. Torque and thrust answer a change of
-    velocity faster than this.
+    this sum, and slow changes of the velocity, are forgotten; torque and thrust answer faster ones.
 
     **Arguments:**
 
@@ -240,7 +230,7 @@ def velocity_of(
       errors of the gyro sooner, the second holds in longer turns.
 
     **Returns:** the velocity along the body's axes [m/s], and the upright direction in these axes by each time
-    constant. They differ in long turns, and if the gyro errs. Both are the same if the attitude was measured.
+    constant. Both are the same if the attitude was measured.
     """
     angles, velocity = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY))
     to_body = None if angles is None else rotations_to_body(*angles.T)
@@ -296,10 +286,7 @@ def _dead_reckoned(
     dt: float,
     forgets: float,
 ) -> Float[np.ndarray, "samples 3"]:
-    """The velocity; each sample uses measurements until then, and the accelerometer's mean error.
-
-    Plain numbers: in a loop of few operations they are ten times faster than arrays.
-    """
+    """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays."""
     push = force - GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
     kept, (vx, vy, vz), velocities = math.exp(-dt / forgets), (0.0, 0.0, 0.0), []
@@ -316,10 +303,7 @@ def _dead_reckoned(
 def _upright(
     rates: Float[np.ndarray, "samples 3"], force: Float[np.ndarray, "samples 3"], dt: float, level: float
 ) -> Float[np.ndarray, "samples 3"]:
-    """The upright direction: fixed in the earth, so it turns against the body; slowly drawn to the specific force.
-
-    `level`: the time constant of this [s].
-    """
+    """The upright direction: fixed in the earth, and drawn to the specific force with the time constant `level` [s]."""
     x, y, z, turn, directions = 0.0, 0.0, 1.0, dt / level, []
     drawn = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-3)
     for (p, q, r), (ax, ay, az) in zip(rates.tolist(), drawn.tolist(), strict=True):

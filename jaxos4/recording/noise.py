@@ -1,11 +1,9 @@
 """White noise of sensors, and the rotor speeds that are expected given all measured ones.
 
-A noisy input makes the slope of a regression too small: moments of inertia come out too large, and true parameters
-predict worse than shrunken ones. The expectation of the speeds given the measurements has no such bias: what it misses
-does not correlate with it, and acts as a disturbance. It is the Wiener filter, which has no delay.
-
-Thrust and the torques of roll, pitch and yaw are filtered separately: rotors answer some of them more than others, and
-the noise is the same in all.
+A noisy input makes the slope of a regression too small: moments of inertia come out too large. The expectation of the
+speeds given the measurements, by a Wiener filter without delay, has no such bias: what it misses does not correlate
+with it, and acts as a disturbance. Thrust and torques are filtered separately: rotors answer some of them more than
+others, and the noise is the same in all.
 
 Reference: Carroll, Ruppert, Stefanski and Crainiceanu 2006, Measurement Error in Nonlinear Models, ch. 4.
 """
@@ -79,8 +77,7 @@ def without_noise(
 ) -> tuple[list[Recording], float, float]:
     """The stretches of one recording with the expected rotor speeds. Commands have no noise.
 
-    **Returns:** also the standard deviation of the noise [rad/s], and the share of its power in the changes from sample
-    to sample.
+    **Returns:** also the noise's standard deviation [rad/s], and its share of the power of changes between samples.
     """
     if any(each.commanded for each in stretches):
         return list(stretches), 0.0, 0.0
@@ -116,11 +113,10 @@ def _power(signals: Sequence[Float[np.ndarray, "samples 4"]], dt: float, setting
 
 
 def _noise(power: Changes, settings: SpeedNoise) -> Float[np.ndarray, " frequencies"]:
-    """The power of the noise in the changes of each direction.
+    """The power of the noise in the changes of each direction, by frequency.
 
-    Motors follow their commands with a lag, so the power of the changes of true speeds does not grow with frequency: it
-    is taken as a constant and a part that falls with the square, for each direction. That of white noise grows, and
-    falls again near the highest frequency if the speeds were interpolated between packets.
+    The changes of true speeds do not grow with frequency, because of the motors' lag: a constant, and a part that falls
+    with the square. Those of white noise grow, and fall again if the speeds were interpolated between packets.
     """
     from scipy.optimize import nnls  # slow to import
 

@@ -198,10 +198,7 @@ def at_limit(recording: Recording, airframe: Airframe, rules: Preparation = RULE
 def _usable(
     evidence: Evidence, begin: float | None, end: float | None, slow: str, *, predicted: bool
 ) -> tuple[list[Recording], list[str]]:
-    """The usable stretches, or what `begin` and `end` ask for; and notes about the stretches that are not used.
-
-    `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
-    """
+    """The usable stretches, or those from `begin` to `end`; notes on the others. `slow`: why the log is too slow."""
     recording = evidence.plausible.recording
     name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
     if begin is not None or end is not None:
@@ -310,13 +307,8 @@ def _level(
 ) -> tuple[float, float] | None:
     """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
 
-    Over a stretch of flight a vehicle gains little velocity, so all forces together carry its weight.
-
-    **Arguments:**
-
-    - `gained`: the velocity that a stretch gains [m/s].
-    - `carried`: the share of the weight that is carried by other causes.
-    - `upright`: the least mean cosine of the tilt of a vehicle whose weight says how its accelerometer errs.
+    A vehicle gains little velocity over a stretch, at most `gained` [m/s], so all forces together carry its weight, but
+    for the share `carried`. `upright`: the least mean cosine of the tilt.
     """
     force = fitted.specific_force
     if force is None or not (known := np.isfinite(force).all(axis=1)).any():

@@ -1,8 +1,7 @@
 """The stretches of a flight: which can be used for identification, and why not the others.
 
-A stretch is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, no
-samples are lost, and the vehicle does not crash. The rotors do not carry it if they are idle, or if the accelerometer
-does not feel them.
+A stretch is usable if the rotors carry the vehicle, and the accelerometer feels it, no rotor rests or is at its limit
+for longer than a moment, no samples are lost, and the vehicle does not crash.
 """
 
 import itertools
@@ -27,10 +26,7 @@ Samples = Bool[np.ndarray, " samples"]
 
 
 class Stretch(NamedTuple):
-    """A stretch of a flight, from the sample at `begin` to the sample at `end` [s].
-
-    `reason`: why it is not usable; empty if it is.
-    """
+    """A stretch of a flight from the sample at `begin` to that at `end` [s]. `reason`: why it is not usable, or ""."""
 
     begin: float
     end: float
@@ -99,11 +95,8 @@ def stretches(
 ) -> tuple[Stretch, ...]:
     """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
-    **Arguments:**
-
-    - `flight`: one flight, not a batch.
-    - `airframe`: the weight, and the largest rotor speed. If there is none, or if it is evidently another vehicle's
-      (thrust below a third or above three times the weight), the median thrust is taken as the weight.
+    `airframe`: the weight and the largest rotor speed. Without it, or if the thrust is below a third or above three
+    times the weight, the median thrust is taken as the weight.
     """
     recording = as_recording(flight)
     time, omega, dt, force = recording.time, recording.omega, recording.dt, recording.specific_force
@@ -147,10 +140,7 @@ def nothing_usable(every: Sequence[Stretch]) -> str:
 
 
 def cut(flight: Recording, stretch: Stretch) -> Recording:
-    """The samples of a flight from `stretch.begin` to `stretch.end`; their time stays as recorded.
-
-    **Raises:** `InputError` if there are fewer than two samples.
-    """
+    """The samples from `stretch.begin` to `stretch.end`; times stay. Raises `InputError` for fewer than two."""
     time, half = flight.time, flight.dt / 2
     inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
     if inside.size < 2:
@@ -256,11 +246,10 @@ def _crashed(
 def _resting(
     omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: Samples, dt: float, rules: StretchRules
 ) -> Samples:
-    """Which samples are of a vehicle at rest, by its accelerometer; judged are those that may be in flight.
+    """Which of the `airborne` samples are of a vehicle at rest, by its accelerometer.
 
-    In flight the specific force along z is the thrust, divided by the mass. On the ground and in a hand it is that of
-    gravity, whatever the rotors do. And a vehicle that lies on its side or back measures gravity across its rotors'
-    axes. A window without changes of thrust proves nothing.
+    In flight the specific force along z is the thrust over the mass; on the ground and in a hand it is that of gravity,
+    whatever the rotors do, and on its side or back it is across their axes. Constant thrust proves nothing.
     """
     size = omega.shape[0]
     length = max(round(rules.bin / dt), 1)

@@ -43,15 +43,9 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:
-    """Put stretches of flight one after the other, as one flight of whole windows.
+    """Put stretches of flight one after the other, as one flight of whole windows of `length` samples.
 
-    Samples at the end of a stretch that do not fill a window are dropped, as are stretches shorter than one window.
-    Time becomes a count of samples from 0. Measurements do not change.
-
-    **Arguments:**
-
-    - `flights`: the stretches.
-    - `length`: of a window, in samples.
+    Samples at the end of a stretch that do not fill a window are dropped. Time becomes a count of samples from 0.
 
     **Raises:** `ValueError` if the sample times differ, or if no stretch is as long as one window.
     """
@@ -68,10 +62,7 @@ def whole_windows(recording: Recording, length: int) -> Recording:
 
 
 def joined(stretches: Sequence[Recording]) -> Recording:
-    """Stretches of recordings one after the other; time becomes a count of samples from 0.
-
-    **Raises:** `ValueError` if the sample times differ.
-    """
+    """Stretches one after the other; time counts samples from 0. Raises `ValueError` if the sample times differ."""
     steps = [stretch.dt for stretch in stretches]
     if np.ptp(steps) > _SAME * steps[0]:
         raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
@@ -105,13 +96,12 @@ def hold_out(
 
     **Arguments:**
 
-    - `recording`: whole windows, see `whole_windows`.
-    - `length`: of a window, in samples.
+    - `recording`: whole windows, see `whole_windows`, of `length` samples.
     - `share`: of the windows to hold out, 0 to 0.5.
     - `seconds`: about how long a batch is [s]: short enough for all phases of a flight to have batches of both kinds.
 
-    **Returns:** two recordings of the same samples: in each, the measurements of the other are missing (NaN). The
-    second keeps the specific force everywhere, because a model may use it as an input. `None`: nothing is held out.
+    **Returns:** two recordings of the same samples: in each, the measurements of the other are NaN. The second keeps
+    the specific force, because a model may use it as an input. `None`: nothing is held out.
     """
     if not share:
         return recording, None

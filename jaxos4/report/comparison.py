@@ -68,10 +68,7 @@ def quantity_cells(found: Comparison, each: ComparedQuantity) -> Iterator[tuple[
 
 
 def forest(found: Comparison, look: Style) -> Figure:
-    """Each quantity of each result with its 95 % interval, from top to bottom; band: the pooled value.
-
-    Hollow and grey: does not count. Results are numbered in the order of `found.names`.
-    """
+    """The 95 % intervals of each quantity by result, from top to bottom; band: pooled; grey, hollow: does not count."""
     count = len(found.names)
     figure, panels = grid(len(found.quantities), columns=3, height=0.9 + 0.19 * count)
     for panel, each in zip(panels, found.quantities, strict=True):
@@ -99,10 +96,7 @@ def forest(found: Comparison, look: Style) -> Figure:
 
 
 def write_comparison(path: str | os.PathLike[str], found: Comparison, *, command: str = "") -> None:
-    """Writes the page of a comparison, completely or not at all. `command`: that makes it again.
-
-    **Raises:** `OSError` if the page cannot be written.
-    """
+    """Writes the page of a comparison, completely or not at all. `command`: that makes it again. Raises `OSError`."""
     check_writable(path)
     figures = []
     if found.quantities:

@@ -52,29 +52,24 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
     console.print(f"geometric mean of the bounds {targets}: {'; '.join(gains)}; {compared}.")
     uses = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.designed.uses.items())
     console.print(f"largest share of each limit, of {task.vehicles} vehicles from the bracket: {uses}.")
-    console.print(_lengths(found, accuracy))
-
-
-def _lengths(found: Design, accuracy: float) -> str:
-    """The flight time for an accuracy of the targets."""
-    task, designed = found.task, found.designed
+    designed = found.designed
     times = designed.shortest(accuracy * task.scale)
     longest = float(np.max(times))
     if task.kind == "references":
         after = ", ".join(f"{name} after {x:.3g} s" for name, x in zip(task.names, times, strict=False))
         so = f"So fly at least {longest:.3g} s; the references repeat every {designed.period:.3g} s."
-        return f"known to {100 * accuracy:g} %: {after}. {so}"
+        console.print(f"known to {100 * accuracy:g} %: {after}. {so}")
+        return
     repeats, how = longest / designed.duration, "not by this input"
     if repeats < 1e4:
         how = f"the first {longest:.2f} s are enough" if repeats <= 1 else f"fly it {math.ceil(repeats)} times"
-    return f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}."
+    console.print(f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}.")
 
 
 def write_design(found: Design, accuracy: float, out: Path) -> None:
     """Write the figure as SVG: above what to fly, below the bound of each target against the time of flight.
 
-    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds). The inputs are drawn
-    for two periods. Bounds that fall with the root of the duration are drawn up to ten times the flight.
+    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds).
     """
     from .style import INK, drawing, grid, label, log_axis, styles, svg  # a second that the table does not need
 

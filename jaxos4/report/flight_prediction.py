@@ -38,10 +38,9 @@ def print_prediction(console: Console, found: FlightPrediction) -> None:
 
 
 def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction, *, most: float = 10.0) -> None:
-    """Writes a figure as SVG. Raises `OSError` if it cannot be written.
+    """Writes measured lines, and predictions with their band from starts one horizon apart, as SVG. Raises `OSError`.
 
-    It shows measured lines, and predictions with their band from starts that are one horizon apart; `most`: the
-    longest time that it shows [s], but two horizons at least.
+    `most`: the longest time that it shows [s], but two horizons at least.
     """
     from .style import BOUND_DASHES, INK, drawing, grid, style, svg  # a second that the table does not need
 
@@ -58,7 +57,10 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
                 shown.append(start)
         # Lines break between predictions.
         x = np.pad(found.time[shown, None] + found.horizons, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
-        measured, predicted = (_angles(states[shown]) for states in (found.measured, found.predicted))
+        both = (found.measured[shown], found.predicted[shown])  # with angles in the place of the quaternion
+        measured, predicted = (
+            np.concatenate([x[..., :6], euler_angles(x[..., 6:10]), x[..., 10:]], axis=-1) for x in both
+        )
         # The same turn of an angle.
         predicted[..., 6:9] = np.unwrap(predicted[..., 6:9], axis=-2)
         measured[..., 6:9] -= 2 * np.pi * np.nan_to_num(np.round((measured - predicted)[..., 6:9] / (2 * np.pi)))
@@ -87,8 +89,3 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
         figure.legend(handles, labels, loc="lower left", ncols=3)
         drawn = svg(figure)
     write_file(path, drawn)
-
-
-def _angles(states: np.ndarray) -> np.ndarray:
-    """The states with roll, pitch and yaw [rad] in the place of the quaternion."""
-    return np.concatenate([states[..., :6], euler_angles(states[..., 6:10]), states[..., 10:]], axis=-1)

@@ -9,7 +9,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 
-from .._templates import templates
+from .._files import templates
 from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
 from .text import MISSING, plain
 
@@ -43,9 +43,7 @@ def _number(value: float | None, digits: int = 4) -> str:
 
 
 def inline(drawing: Drawing, description: str, estimators: Sequence[str] = ()) -> Markup:
-    """The panels of a drawing, each as an element `<svg>`: the page puts as many side by side as its width allows.
-
-    What belongs to no panel, such as a legend, is left out: the page says it.
+    """The panels of a drawing, each as an element `<svg>`, as many side by side as the page's width allows; no legend.
 
     `description`: what a screen reader says. `estimators`: their names, for tooltips.
     """

@@ -1,20 +1,25 @@
-"""Figures of what stands behind an estimate: priors, correlations of parameters and of residuals, and the path."""
+"""Figures of what stands behind an estimate, for its page; and of the estimate, for notebooks: `found.plot`."""
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from markupsafe import Markup, escape
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..analysis.diagnostics import Correlations
+from ..analysis.frequency_response import HIGHEST, AxisResponse
+from ..analysis.prediction import decisive_horizon
 from ..analysis.traces import Traces
+from ..errors import InputError
 from ..flight import STATE_NAMES
+from ..identification.physical import physical_quantities
 from ..identification.results import Identification
 from ..models.state import CASCADE_ORDER
-from .style import BOUND_DASHES, FAINT, INK, Style, grid, label, style
+from .style import BOUND_DASHES, FAINT, INK, Style, grid, label, log_axis, style, styles
 
 
 def priors(found: Identification, look: Style) -> Figure | None:
@@ -124,10 +129,9 @@ def correlations(found: Identification) -> Float[np.ndarray, "parameters paramet
 
 
 def correlation_matrix(found: Identification, *, least: float = 0.05, most: int = 400) -> Markup:
-    """The correlations of the parameters as an SVG: a square for each pair, as large as the correlation.
+    """The correlations of the parameters as an SVG: a square for each pair, hollow if negative.
 
-    Filled: positive; hollow: negative. Correlations below `least` are left out; if there are more than `most`, the
-    smallest too.
+    Those below `least` are left out; if there are more than `most`, the smallest too.
     """
     names, cell, matrix = list(found.parameters), 18, correlations(found)
     room = 10 + 7 * max(map(len, names))
@@ -154,3 +158,114 @@ def strongest(found: Identification, *, least: float = 0.9, most: int = 5) -> li
     rows, columns = np.tril_indices(len(names), -1)
     pairs = [(names[j], names[i], float(matrix[i, j])) for i, j in zip(rows, columns, strict=True)]
     return sorted((pair for pair in pairs if abs(pair[2]) > least), key=lambda pair: -abs(pair[2]))[:most]
+
+
+GAINS = (0.2, 5.0)
+"""The gains that a figure of the response shows."""
+
+INERTIAS: tuple[str, ...] = ("Ix", "Iy", "Iz")
+_RATES = ("p", "q", "r")
+
+
+def gaps(start: Int[np.ndarray, " starts"]) -> tuple[Int[np.ndarray, " gaps"], float]:
+    """The places before which a line breaks, because another stretch begins; and the usual step between starts."""
+    usual = float(np.median(np.diff(start))) if start.size > 1 else 1.0
+    return np.flatnonzero(np.diff(start) > 1.5 * usual) + 1, usual
+
+
+def gain_band(one: AxisResponse) -> Float[np.ndarray, "2 frequencies"]:
+    """The ends of the 95 % interval of the gain, finite."""
+    factor = np.exp(np.minimum(one.half_width, 50.0))  # beyond every figure
+    return np.array([one.gain / factor, one.gain * factor])
+
+
+def draw_response(
+    panel: Axes,
+    one: AxisResponse,
+    values: Float[np.ndarray, " frequencies"],
+    band: Float[np.ndarray, "2 frequencies"],
+    model: float,
+    color: str,
+) -> None:
+    """Draws gain or phase with its band; faintly at frequencies without a clear response; dashed: the model."""
+    panel.plot(one.frequency, values, color=FAINT, linewidth=0.8)
+    low, high = np.where(one.clear, band, np.nan)
+    panel.fill_between(one.frequency, low, high, color=color, alpha=0.25, linewidth=0)
+    panel.plot(one.frequency, np.where(one.clear, values, np.nan), color=color)
+    panel.axhline(model, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
+
+
+class Plots(NamedTuple):
+    """Figures of an identification. Each method draws on `ax`, or a new one, and returns it, or raises `InputError`."""
+
+    found: Identification
+
+    def rates(self, rate: str = "p", *, horizon: float | None = None, ax: Axes | None = None) -> Axes:
+        """A measured body rate, and what was predicted at the nearest `horizon` [s] before, by default 0.25 s.
+
+        Data that were not fitted. `rate`: `"p"`, `"q"` or `"r"`.
+        """
+        if (ahead := self.found.predictions) is None:
+            raise InputError(
+                "the result has no predictions of data that were not fitted; give `holdout` or `validate`."
+            )
+        column = _place("rate", rate, _RATES)
+        known = np.isfinite(ahead.measured).any(axis=(0, 2))
+        far = None if horizon is None else np.abs(ahead.horizons - horizon)
+        nearest = decisive_horizon(ahead.horizons, known) if far is None else int(far.argmin())
+        time = ahead.start * self.found.provenance.sample_time + ahead.horizons[nearest]
+        columns = np.stack([time, ahead.measured[:, nearest, column], ahead.predicted[:, nearest, column]])
+        time, measured, predicted = np.insert(columns, gaps(ahead.start)[0], np.nan, axis=1)
+        ax = _axes(ax)
+        ax.plot(time, measured, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1], label="measured")
+        label = f"predicted {ahead.horizons[nearest]:.3g} s ahead"
+        ax.plot(time, predicted, color=self._color, linewidth=1.2, label=label)
+        ax.set(xlabel="time [s]", ylabel=f"{rate} [rad/s]")
+        ax.legend()
+        return ax
+
+    def inertias(self, *, ax: Axes | None = None) -> Axes:
+        """The moments of inertia with 95 % intervals, and those of the airframe's file (crosses)."""
+        rows = [row for row in physical_quantities(self.found) if row.name in INERTIAS]
+        if not rows:
+            raise InputError("the result has no moments of inertia.")
+        ax, given = _axes(ax), dict(zip(INERTIAS, np.asarray(self.found.airframe.inertia), strict=True))
+        for place, row in enumerate(rows):
+            ax.plot([place, place], row.ci95, color=self._color if row.trusted else FAINT)
+            ax.plot(place, row.value, "o", color=self._color if row.trusted else FAINT)
+            ax.plot(place, given[row.name], "x", color=INK)
+        ax.set_xticks(range(len(rows)), [row.name for row in rows])
+        ax.set(ylabel="kg m²", xlim=(-0.5, len(rows) - 0.5))
+        return ax
+
+    def response(self, axis: str = "roll", *, ax: Axes | None = None) -> Axes:
+        """The gain of the measured over the modelled angular acceleration, with its 95 % band where it is clear.
+
+        `axis`: `"roll"`, `"pitch"` or `"yaw"`. Dashed: the model.
+        """
+        if (response := self.found.response) is None:
+            raise InputError("the result has no frequency response: it is of an OS4, has no answer, or is older.")
+        one, ax = response[_place("axis", axis, response._fields)], _axes(ax)
+        draw_response(ax, one, one.gain, gain_band(one), 1.0, self._color)
+        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, HIGHEST), ylim=GAINS)
+        for which in ("x", "y"):
+            log_axis(ax, which)
+        return ax
+
+    @property
+    def _color(self) -> str:
+        return styles([self.found.estimator])[self.found.estimator].color
+
+
+def _place(argument: str, value: str, names: tuple[str, ...]) -> int:
+    if value not in names:
+        raise InputError(f"`{argument}`: must be one of {', '.join(names)}, got {value!r}.")
+    return names.index(value)
+
+
+def _axes(ax: Axes | None) -> Axes:
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot  # chooses how figures are shown
+
+    return pyplot.subplots()[1]

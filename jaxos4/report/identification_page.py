@@ -23,12 +23,21 @@ from ..identification.results import Constant, Identification, SampleTime
 from ..identification.verdict import RIGID_BODY, headline, reasons
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
-from .identification_figures import correlation_matrix, path_in_space, priors, residual_figure, strongest
-from .identification_plots import GAINS, INERTIAS, draw_response, gain_band
-from .identification_signals import BAND, identified_signals
-from .identification_text import quantity_rows
+from .identification_figures import (
+    GAINS,
+    INERTIAS,
+    correlation_matrix,
+    draw_response,
+    gain_band,
+    path_in_space,
+    priors,
+    residual_figure,
+    strongest,
+)
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
+from .terminal import quantity_rows
 from .text import MISSING, plain
+from .timeline import BAND, identified_signals
 
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
@@ -36,12 +45,9 @@ _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 
 
 
 def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
-    """Writes the page of an identification, completely or not at all.
+    """Writes the page of an identification, fresh or read, completely or not at all. Raises `OSError`.
 
-    It shows what the result's file holds, so that a result that was read makes the same page. `title`: by default the
-    names of the logs.
-
-    **Raises:** `OSError` if the page cannot be written.
+    `title`: by default the names of the logs.
     """
     check_writable(path)
     look, used = styles([found.estimator])[found.estimator], found.provenance
@@ -69,7 +75,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         found=found,
         verdict=verdict(found),
         headline=headline(found.verdicts, found.doubts),
-        center=[f"{each.axis} {_plus_minus(1e3 * each.value, 1e3 * each.std)} mm" for each in center],
+        center=[f"{x.axis} {plain(1e3 * x.value)} ± {plain(NINETY_FIVE * (1e3 * x.std), 2)} mm" for x in center],
         quantities=quantities(found),
         signals=identified_signals(found, look),
         band=f"{100 * BAND:g}",
@@ -88,10 +94,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
 
 
 def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
-    """The cells of each physical quantity, and a note: what must be right, and what is wrong.
-
-    A moment of inertia that was not identified is in the table too.
-    """
+    """The cells of each quantity, and of each moment of inertia even if it was not identified; and a note on each."""
     every, rows = physical_quantities(found), []
     for row, cells, note in zip(every, *quantity_rows(every), strict=True):
         own = found.parameters.get(row.name.replace(" ", "_"))
@@ -131,14 +134,8 @@ def _joined(words: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _plus_minus(value: float, std: float) -> str:
-    return f"{plain(value)} ± {plain(NINETY_FIVE * std, 2)}"
-
-
 def _text(x: Any) -> str:
-    if isinstance(x, str):
-        return x
-    return MISSING if x is None else json.dumps(x, ensure_ascii=False)
+    return x if isinstance(x, str) else MISSING if x is None else json.dumps(x, ensure_ascii=False)
 
 
 def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:
@@ -180,10 +177,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
 
 
 def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
-    """Gain, phase and coherence of roll, pitch and yaw, with 95 % bands; dashed: the model.
-
-    A frequency without a clear response is drawn faintly.
-    """
+    """Gain, phase and coherence of each axis with 95 % bands, faint where they are not clear; dashed: the model."""
     figure, panels = grid(9, columns=3, height=1.9)
     top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
     for row, (name, axis) in enumerate(found._asdict().items()):
@@ -208,10 +202,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
 
 
 def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: Style) -> Figure:
-    """Ix, Iy and Iz at each sample time with 95 % intervals. Lines: the chosen one, and its moments of inertia.
-
-    **Arguments:** `chosen`: the sample time of the estimate [s].
-    """
+    """Ix, Iy, Iz at each sample time with 95 % intervals. Lines: the `chosen` one [s], and its moments of inertia."""
     figure, panels = grid(3, columns=3, height=2.4)
     ticks = [1e3 * each.sample_time for each in answers]
     for panel, name in zip(panels, INERTIAS, strict=True):

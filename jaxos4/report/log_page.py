@@ -22,20 +22,18 @@ from ..recording.inspection import Inspection, inspect_log
 from ..recording.prepared import prepare
 from ..recording.stretches import Stretch, cut
 from .html import draw, render
-from .log_text import unit_of
 from .style import BOUND_DASHES, FAINT, INK, drawing, grid, label, log_axis, style
+from .terminal import unit_of
 from .timeline import Axis, Line, Panel, View, signals, spans, thinned
 
 
 class PageRules(NamedTuple):
-    """What the page of a log shows.
+    """The content of the page of a log.
 
     - `samples`: of each signal at most; a page then has less than 600 kB.
     - `parts`: rows of the table of parts at most, the longest parts.
-    - `segment`: of which the spectra are means [s].
-    - `slowest`: the lowest frequency of a spectrum [Hz].
-    - `bins`: of the motors' speeds.
-    - `usual`: the share of the time in which the rotors' speeds lie in the band of the spectra.
+    - `segment`: of which the spectra are means [s]. `slowest`: the lowest frequency of a spectrum [Hz].
+    - `bins`: of the motors' speeds. `usual`: the share of the time of the speeds in the band of the spectra.
     """
 
     samples: int = 5000
@@ -67,8 +65,6 @@ def write_log_page(
     rules: PageRules = RULES,
 ) -> None:
     """Writes the page of a log, completely or not at all.
-
-    **Arguments:**
 
     - `log`: a recording, or the path of a log. `airframe`: of its vehicle; without it, torques are unknown.
     - `found`: of `inspect_log`, if it was computed before. `command`: that makes the page again.
@@ -165,7 +161,7 @@ def bridged(
 
 
 def fitted(recording: Recording, airframe: Airframe | None) -> str:
-    """What `jaxos4 estimate` would fit and hold out, in words."""
+    """The parts that `jaxos4 estimate` would fit and hold out, in words."""
     if airframe is None:
         return "Give the airframe (--airframe) to see here what would be fitted, and what held out."
     if recording.commanded and not airframe.has_full_scale:
@@ -239,9 +235,7 @@ def amplitude_density(
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies channels"]]:
     """Frequencies [Hz] and the amplitude spectral density of signals, by Welch's means of overlapping segments.
 
-    Each channel has the mean over the segments in which it was measured; NaN if there are none.
-
-    Reference: Welch, IEEE Trans. Audio Electroacoustics 15 (1967).
+    A channel has the mean over the segments in which it was measured, or NaN. Reference: Welch 1967, IEEE Trans. AU 15.
     """
     size = max(round(rules.segment / dt), 8)
     window = np.hanning(size)[:, None]

@@ -26,10 +26,7 @@ _COLUMNS = 4
 
 
 def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
-    """Writes `report.html` and `figures/*.svg` into `directory`; returns their paths, the page first.
-
-    All figures are drawn before the first file is written.
-    """
+    """Draws all figures, then writes `report.html` and `figures/*.svg`; returns their paths, the page first."""
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
     every, drawings, sections = list(scenarios(dataset)), [], []
@@ -221,10 +218,7 @@ def overview(data: xr.Dataset) -> Figure | None:
 
 
 def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
-    """The noise scales, shifted for the estimator `place` of `count`, so that markers do not cover each other.
-
-    Those of all estimators are spread over 0.3 of the gap between two noise scales.
-    """
+    """The noise scales for estimator `place` of `count`, spread over 0.3 of the gap between two, so that marks show."""
     gap = np.diff(np.log(np.sort(scales))).min() if len(scales) > 1 else np.log(3.0)
     return scales * np.exp(0.3 * gap * (place / max(count - 1, 1) - 0.5))
 

@@ -70,10 +70,7 @@ def positive_scales(data: xr.Dataset) -> xr.Dataset:
 
 
 def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
-    """The scale of a parameter's errors: "percent" or "absolute", the unit, and why not percent.
-
-    Absolute if the percentage of any point is meaningless, so that a panel has one scale.
-    """
+    """The scale of a parameter's errors, absolute if any percentage has no meaning; the unit; and why not percent."""
     reason = metrics.no_percentage(data).isel(parameter=parameter)
     if not (reason > 0).any():
         return "percent", "%", ""

@@ -177,10 +177,7 @@ def svg(figure: Figure) -> bytes:
 
 
 def panel_boxes(figure: Figure) -> np.ndarray:
-    """The box of each panel with its labels in the SVG of a figure that was just drawn: x, y, width, height [pt].
-
-    The margins around all panels are the same, so that panels of one size have boxes of one size.
-    """
+    """The box of each panel with its labels in an SVG just drawn: x, y, width, height [pt], with equal margins."""
     resolution, figure.dpi = figure.dpi, 72  # of SVG: a pixel is a point
     inner = np.array([panel.bbox.extents for panel in figure.axes])
     outer = np.array([(panel.get_tightbbox() or panel.bbox).extents for panel in figure.axes])

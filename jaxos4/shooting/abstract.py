@@ -79,20 +79,15 @@ class Unknowns(eqx.Module):
         return len(self.names)
 
     def within(self, bracket: Bracket) -> "Unknowns":
-        """The same unknowns, looked for in another bracket. A fixed unknown keeps its value.
-
-        **Raises:** `ValueError` for a bracket of another length.
-        """
+        """The unknowns in another bracket; a fixed one keeps its value. Raises `ValueError` for another length."""
         if bracket.lower.shape != (self.count,):
             raise ValueError(f"`bracket` must hold {self.count} parameters, got {bracket.lower.shape[0]}.")
-        center = bracket.center if _all(self.free) else jnp.where(self.free, bracket.center, self.center)
+        known_free = not isinstance(self.free, Tracer) and bool(np.asarray(self.free).all())
+        center = bracket.center if known_free else jnp.where(self.free, bracket.center, self.center)
         return dataclasses.replace(self, center=center, half_width=bracket.half_width)
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
-        """The same unknowns, some of them fixed at known values.
-
-        **Raises:** `ValueError` for a name that is no unknown, or if no unknown remains free.
-        """
+        """The same unknowns, some fixed at known values. Raises `ValueError` for a strange name, or if none is free."""
         strangers = [name for name in values if name not in self.names]
         if strangers:
             raise ValueError(f"`values`: {strangers[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
@@ -111,10 +106,7 @@ class Unknowns(eqx.Module):
 
     @property
     def usable(self) -> "Unknowns":
-        """The unknowns themselves if they are valid; otherwise 0 +- 1, so that a batch stays finite.
-
-        The half-width of a fixed unknown is 1 if it was 0.
-        """
+        """The unknowns if they are valid, else 0 +- 1, so that a batch stays finite. No half-width is 0, but 1."""
         center = jnp.where(self.valid, self.center, 0.0)
         half_width = jnp.where(self.valid & (self.half_width > 0), self.half_width, 1.0)
         return dataclasses.replace(self, center=center, half_width=half_width)
@@ -135,16 +127,8 @@ class Unknowns(eqx.Module):
         return jnp.maximum(lower, self.lowest), jnp.minimum(upper, self.highest)
 
     def identifiable(self, std: Float[Array, " unknowns"], prior: float | None = None) -> Bool[Array, " unknowns"]:
-        """Whether each unknown is identifiable, see `jaxos4.bracket.is_identifiable`; fixed ones count as known.
-
-        `prior`: how an estimator used the bracket; by default as the cost does.
-        """
+        """Whether each is identifiable or fixed. `prior`: of an estimator; by default as the cost uses the bracket."""
         return jnp.asarray(is_identifiable(std, self.half_width, self.prior if prior is None else prior)) | ~self.free
-
-
-def _all(mask: Bool[Array, "..."]) -> bool:
-    """Whether all values are true and known while a program is traced."""
-    return not isinstance(mask, Tracer) and bool(np.asarray(mask).all())
 
 
 @eqx.filter_jit  # one compiled program instead of one for each operation
@@ -155,12 +139,9 @@ def _fixed(
 
 
 class Shot(NamedTuple):
-    """One simulated window.
+    """One simulated window: the cost of the samples before it fails, and whether it is `feasible`.
 
-    - `cost`: of the samples before the trajectory fails.
-    - `feasible`: whether no sample fails, by a pitch angle beyond +-90 degrees or a body rate above `FASTEST` in
-      `scans.py`. The cost of a failed shot means nothing, but its derivative still points back to feasible
-      trajectories.
+    It fails at a pitch of 90 degrees or a rate above `FASTEST`. The derivative still points back to feasible ones.
     """
 
     cost: Scalar
@@ -290,11 +271,10 @@ class Stages(NamedTuple):
 
 
 class AbstractProblem(eqx.Module):
-    """The negative log-likelihood of a flight.
+    """The negative log-likelihood of a flight, which may be cut into windows.
 
-    A flight may be cut into windows. All windows share the unknowns in `unknowns`; in addition, each window may have a
-    free initial state of its own. The unknowns of all windows are one array: a row for each window, which holds the
-    shared unknowns and then the window's own. The number of rows and columns is that of the `initial_guess`.
+    Windows share the unknowns in `unknowns`; each may have a free initial state too. The unknowns of all windows are
+    one array: a row for each window, with the shared unknowns first. `initial_guess` has its shape.
     """
 
     unknowns: eqx.AbstractVar[Unknowns]
@@ -314,11 +294,9 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def fix(self: Problem, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> Problem:
-        """The same likelihood, with some unknowns fixed at known values: `problem.fix({"rotor_lag": 0.06})`.
+        """The same likelihood, with some unknowns fixed at known values. `bracket`: where the others are looked for.
 
-        `bracket`: where the parameters are looked for instead.
-
-        **Raises:** `ValueError` for a name that is no unknown, if no unknown remains free, or for a bracket of another
+        **Raises:** `ValueError` for a name that is no unknown, if none remains free, or for a bracket of another
         length.
         """
 
@@ -326,8 +304,7 @@ class AbstractProblem(eqx.Module):
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The likelihood in stages.
 
-        `shares`: before the whole, a likelihood that simulates fits the body rates to these shares of the flight, one
-        after the other. By default it is fitted as a whole.
+        `shares`: of the flight, to which a likelihood that simulates fits the body rates first, one after the other.
         """
 
     def hold(self: Problem, values: Mapping[str, Float[ArrayLike, ""]]) -> Problem:

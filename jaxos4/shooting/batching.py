@@ -1,8 +1,7 @@
 """A batch of flights in lanes: how `jax.vmap` computes what takes long.
 
-By itself, `jax.vmap` computes all flights of a batch together, with the batch along the first axis. Its loops then
-take as long as the slowest flight, its arrays do not fit the cache, and the processor's vectors hold the unknowns of
-one flight instead of one unknown of several flights.
+By itself, `jax.vmap` has the batch along the first axis: its loops take as long as the slowest flight, its arrays do
+not fit the cache, and vectors hold the unknowns of one flight instead of one unknown of several.
 """
 
 import functools
@@ -30,9 +29,8 @@ _CHUNK = 4 * _BLOCK
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
     """`function(*arguments)`, of which `jax.vmap` computes a batch by `of_batch`.
 
-    `of_batch` receives the number of lanes, the arguments that differ between the lanes, with the lanes along their
-    first axis, and the arguments that the lanes share. Each is `None` in the place of the other. It returns the results
-    with the lanes along their first axis.
+    `of_batch` takes the number of lanes, the arguments that differ between lanes, with the lanes first, and those that
+    they share, each `None` in the place of the other. It returns the results with the lanes first.
     """
     arrays, settings = eqx.partition(arguments, eqx.is_array)
 
@@ -56,10 +54,9 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *ar
 
 
 def in_blocks(function: Callable, *arguments: Any) -> Any:
-    """`function(*arguments)`, of which `jax.vmap` computes a batch in blocks, one after the other.
+    """`function(*arguments)`, of which `jax.vmap` computes a batch in blocks, one after the other; on a CPU only.
 
-    A slow flight then holds up its block only. The last lane is repeated until all blocks are full. An accelerator
-    computes the whole batch at once. `function` may be a method; the arrays of its module are batched as arguments are.
+    A slow flight then holds up its block only. `function` may be a method; its module's arrays are batched too.
     """
     arrays, settings = eqx.partition((function, *arguments), eqx.is_array)
 
@@ -126,8 +123,7 @@ def for_threads(function: Callable[P, R]) -> Callable[P, R]:
 def on_all_cores(function: Callable) -> Callable:
     """A batch on all cores of a CPU: threads run one compiled program. Results are the same on any number of cores.
 
-    The returned function takes a batch of `function`'s first argument, all arrays of which have the flights as their
-    first axis, and the other arguments as they are. On an accelerator, and inside of `jax.jit`, it is one call.
+    The first argument of the result is a batch with flights first; the others are those of one call of `function`.
     """
 
     @eqx.filter_jit

@@ -1,11 +1,9 @@
 """The answer of a controller within a sample.
 
-A sample of filter error may last longer than the controller takes to answer. Then the torque in the sample holds
-answers to the noise of what is measured in it, so torque and innovation correlate, and a likelihood that takes this
-torque for an input is biased. All of the torque is known before the sample, but for its *input innovation* v: the
-answers, and what a pilot does. With white noise in the rows of the log, v depends on what is measured through the
-filter's innovation e alone. So the filter stays as it is, and its innovation is compared given v: as e - k v, with an
-unknown *feedthrough* k. See "Controllers that are faster than a sample" in `docs/method/filter_error.md`.
+If a sample lasts longer than the controller takes to answer, its torque holds answers to the noise of what is measured
+in it, and a likelihood that takes this torque for an input is biased. All of the torque is known before the sample, but
+for its *input innovation* v. With white noise in the log's rows, v depends on what is measured through the filter's
+innovation e alone. So e - k v is compared, with an unknown *feedthrough* k: see `docs/method/filter_error.md`.
 """
 
 from collections.abc import Iterator
@@ -28,10 +26,8 @@ def input_innovations(
 ) -> Float[np.ndarray, "samples feedthroughs 3"]:
     """The part of the torque within each sample that the past does not tell, about each axis, of mean square 1.
 
-    A linear regression on the samples before, of the torque and the rate about the same axis. Of the parts of a sample,
-    `FEEDTHROUGHS` combinations are left, in which most of the rest lies. 0 at the beginning of a stretch.
-
-    **Arguments:**
+    A linear regression on earlier samples of torque and rate about the same axis leaves `FEEDTHROUGHS` combinations of
+    the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch.
 
     - `torque`: in equal parts of each sample, in any unit. `rates`: measured [rad/s]; NaN counts as 0.
     - `stretch`: the number of the uninterrupted stretch of each sample.

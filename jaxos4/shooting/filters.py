@@ -59,7 +59,7 @@ class _Row(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What the filters know at the beginning of a sample: rates and disturbances."""
+    """The knowledge of the filters at the beginning of a sample: rates and disturbances."""
 
     rates: Rates
     disturbance: tuple[Segments, ...]
@@ -74,6 +74,11 @@ class _Feedback(NamedTuple):
     seen: tuple[Segments, ...]
     reach: tuple[Segments, ...]
     kept: tuple[Segments, ...]
+
+    @classmethod
+    def of(cls, gains: Gains, step: Step) -> "_Feedback":
+        fields = gains.rate, gains.rate_later, gains.disturbance_later, step.seen, step.reach, step.kept
+        return cls(*map(tuple, fields))
 
 
 def _advance(
@@ -134,19 +139,15 @@ def innovate(
 
     A change of one channel's noise is taken to change no other channel's innovations.
 
-    **Arguments:**
-
-    - `functions`: each takes a state, the forcing and the parameters. The first returns the state one sample later, the
-      second its mean over what a measurement averages, the third the outputs of the sensors.
-    - `observed`: its number of rows is a multiple of `BLOCK`.
+    - `functions`: of a state, the forcing and the parameters: the state one sample later, its mean over what a
+      measurement averages, and the outputs of the sensors.
+    - `observed`: its number of rows is a multiple of `BLOCK`, of which `rows` are filtered; the others are padding.
     - `input_innovations`, `feedthrough`: what they explain of the innovations of the same samples, see
       `jaxos4.shooting.feedthrough`. `passed`: feedthroughs that were found before; what they explain counts as noise.
     - `parameters`: of all segments, or of each.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters at the positions `forcing_parameters`.
     - `window`: what a measurement averages.
-    - `rows`: how many rows are filtered; the others are padding. It is data, so that flights of different lengths share
-      a program.
     """
     flight, at = (
         (observed, input_innovations, forcing, forcing_tangents, rows, dt, window),
@@ -272,10 +273,6 @@ def _filter_rows(
     scalars, own = tuple(parameters), parameters.shape[1:]
     units = tuple(np.eye(count, dtype=parameters.dtype))
 
-    def feedback(gains: Gains, step: Step) -> _Feedback:
-        fields = gains.rate, gains.rate_later, gains.disturbance_later, step.seen, step.reach, step.kept
-        return _Feedback(*map(tuple, fields))
-
     def body(carry, rows):
         (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry
         forcing, tangents, row = rows
@@ -285,10 +282,10 @@ def _filter_rows(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
-        fed = feedback(gains, steps[0])
+        fed = _Feedback.of(gains, steps[0])
         # The noise acts by the feedback alone, and the parameters do not act on it.
         _, push = jax.linearize(lambda known, fed: advance(known, forcing, scalars, fed, row), known, fed)
-        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, jax.vmap(feedback)(gain_slopes, steps[1]))
+        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, jax.vmap(_Feedback.of)(gain_slopes, steps[1]))
 
         def filtered(known: _Known, scalars: tuple, forcing: Forcing = forcing):
             return advance(known, forcing, scalars, fed, row)

@@ -1,9 +1,8 @@
 """A problem of innovations: the likelihood of a flight with disturbances that the model does not contain.
 
-A real vehicle flies under a controller, which answers gusts and everything else that a model lacks. So the input and
-the disturbance correlate. A likelihood that treats the disturbance as noise of the sensors is then biased, however long
-the flight. Here the disturbance is a part of the model. A Kalman filter estimates it from the past, and only the
-innovations are compared: the part of a measurement that the past cannot predict.
+A controller answers gusts and whatever a model lacks, so input and disturbance correlate, and a likelihood that takes
+the disturbance for noise of the sensors is biased, however long the flight. Here a Kalman filter estimates it from the
+past, and only the innovations are compared: the part of a measurement that the past cannot predict.
 
 References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, System Identification, ch. 7 and 13.
 """
@@ -25,8 +24,7 @@ from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
 from .filters import innovate
-from .gains import INSTANT, LogNoise, Observed, Window
-from .noise_unknowns import NoiseUnknowns, own_names
+from .gains import INSTANT, LogNoise, NoiseUnknowns, Observed, Window, own_names
 from .problem import ShootingProblem
 from .scans import with_tangents
 from .segments import Segments, observe_in_segments
@@ -41,27 +39,22 @@ class InnovationsProblem(AbstractProblem):
 
     Each channel has a disturbance with a strength and a time constant, and white noise of its sensor. The logarithms of
     the three are unknowns like the parameters, and follow them: `log_p_strength`, `log_p_time`, `log_p_sensor`, then
-    those of q, r, and each specific force that the model predicts. The bracket is a Gaussian prior, whose standard
-    deviation is its half-width. With `input_innovations`, each channel has further unknowns, `p_feedthrough_1`
-    and so on: see `jaxos4.shooting.feedthrough`.
-
-    **Arguments:**
+    those of q, r, and each specific force that the model predicts; with `input_innovations` also `p_feedthrough_1` and
+    so on. The bracket is a Gaussian prior, whose standard deviation is its half-width.
 
     - `problem`: model, flight, known or free initial state, and the bracket of the parameters. Its windows and its
       sigma do not matter.
     - `segments`: the number of parts of the flight that are filtered in parallel; by default one for about 384 samples.
-      A short segment loses information if the disturbance is weak, because its filter begins without memory. Padded
-      flights (`ShootingProblem.length`) with equal numbers of segments and equal room share a program, whatever their
-      lengths.
+      Short ones lose information, because a filter begins without memory. Padded flights with equal numbers of segments
+      and equal room share a program.
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
-    - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample; by default
-      nothing: the controller answers no measurement within its sample.
-    - `passed`: feedthroughs that were found before: what they explain counts as noise, which made it. NaN, or by
-      default: not known, so that a search has two stages. The first finds them, the second counts them.
+    - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample, see
+      `jaxos4.shooting.feedthrough`; by default nothing: the controller answers no measurement within its sample.
+    - `passed`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default: not known,
+      so that a search has two stages. The first finds them, the second counts them.
     - `noise_unknowns`: how the noise is looked for.
-    - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
-      of the disturbances.
+    - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants.
     """
 
     problem: ShootingProblem
@@ -204,10 +197,7 @@ class InnovationsProblem(AbstractProblem):
         return lambda unknowns: at(unknowns, passed)
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
-        """The whole problem: filters follow the measurements, so that errors do not grow with time.
-
-        What feedthroughs explain is counted as noise in a second stage, by the feedthroughs that were found before.
-        """
+        """The whole problem; in a second stage, what feedthroughs that were found before explain counts as noise."""
         del shares
         number, at = 2 if self.passed.size else 1, self._local_model()
         is_known = ~jnp.isnan(self.passed).any()

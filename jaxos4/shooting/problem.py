@@ -40,8 +40,6 @@ _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2
 class ShootingProblem(AbstractProblem):
     """A model, a flight and weights: how badly do parameters explain the flight?
 
-    **Arguments:**
-
     - `model`: its parameters are the unknowns.
     - `flight`: the measurements. NaN in `flight.states` means missing.
     - `sigma`: standard deviation of each channel's noise, in the order of `CHANNEL_NAMES`; its reciprocal is the
@@ -204,10 +202,7 @@ class ShootingProblem(AbstractProblem):
         return jnp.concatenate([repeated, self.split(initial_state)[:, : self.free_size]], axis=1)
 
     def first_state(self) -> tuple[InitialStates, InitialStates]:
-        """The initial state at which a search starts, and how far off it may be.
-
-        It is the known state, or the first measurement of each channel in each window, or 0 if there is none.
-        """
+        """The known state, or each window's first measurement of each channel, or 0; and how far off it may be."""
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
@@ -220,8 +215,7 @@ class ShootingProblem(AbstractProblem):
     def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
 
-        Infinite, with an undefined derivative, if the trajectory diverges or reaches theta = +-90 degrees.
-        `initial_state` defaults to `first_state`.
+        Infinite if the trajectory diverges or reaches theta = +-90 degrees. `initial_state`: or `first_state`.
         """
         start = self.first_state()[0] if initial_state is None else initial_state
         cost, feasible = self.shots(parameters, start)
@@ -305,9 +299,9 @@ class ShootingProblem(AbstractProblem):
     def reweighted(self, residuals: Float[ArrayLike, "..."]) -> "ShootingProblem":
         """The problem with each channel's sigma estimated from the weighted `residuals` of a fit, by NumPy.
 
-        Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
-        freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. No sigma falls below the
-        rounding errors that add up over a flight.
+        Alternating this with the fit is maximum likelihood with unknown noise, corrected for degrees of freedom. A
+        channel with fewer than two measurements keeps its sigma. No sigma falls below the rounding errors that add up
+        over a flight.
         """
         columns, before = self.columns, np.asarray(self.sigma)
         measured, squares = self.recorded(), np.square(np.reshape(residuals, (-1, columns.size))).sum(axis=0)

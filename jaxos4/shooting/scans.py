@@ -123,10 +123,7 @@ def shoot_with_derivatives(
     initial_state_is_free: bool,
     length: Length = None,
 ) -> LocalModel:
-    """`shoot` with the gradient and the information in the parameters and, if it is free, the initial state.
-
-    One tangent for each unknown travels with the state. A batch is computed in lanes.
-    """
+    """`shoot` with gradient and information in the parameters and a free initial state. A batch is in lanes."""
 
     def alone(*data: Any) -> LocalModel:
         return _linearised_shot(

@@ -1,9 +1,6 @@
-"""A flight cut into segments, in which Kalman filters run in parallel.
+"""The layout of a flight's samples: segments, in which Kalman filters run in parallel; padding, to share a program."""
 
-A filter that starts in the middle of a flight does not know the disturbance, and the controller does: the first samples
-of a segment settle the filter.
-"""
-
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -20,6 +17,9 @@ from .problem import ShootingProblem
 
 # A gap of this length ends what a filter knows [s].
 _GAP = 0.1
+# A flight is padded to the first of these numbers of samples that is enough. A longer flight is not padded: to compile
+# its program takes less time than to simulate it.
+_CAPACITIES = (4096, 16384, 65536)
 
 
 class Segments(NamedTuple):
@@ -65,9 +65,8 @@ class Segments(NamedTuple):
 def observe_in_segments(problem: ShootingProblem, segments: Segments, settling: int) -> Observed:
     """The measurements in segments, where filters restart, and which innovations count.
 
-    A filter restarts in a gap, and where another stretch begins. Until it has settled its innovations do not count:
-    the controller knew the disturbance then, and the filter does not. At the beginning of a flight in one piece
-    they count: a simulation begins at rest.
+    A filter restarts in a gap, and where a stretch begins. Until it has settled its innovations do not count, except at
+    the beginning of a flight in one piece: a simulation begins at rest.
     """
     flight, index, samples = problem.flight, jnp.asarray(segments.place), problem.flight.time.shape[0]
     exists, place = ((index >= 0) & (index < samples)).T, jnp.minimum(index, samples - 1)
@@ -107,3 +106,50 @@ def _restarts(
     another = jnp.concatenate([jnp.zeros(1, dtype=bool), jnp.diff(stretch) != 0])
     first = jnp.zeros((), dtype=int), jnp.full((), settling if flight.stretch is None else -1, dtype=int)
     return jax.lax.scan(follow, first, (missing, another))[1]
+
+
+def padded(problem: ShootingProblem) -> ShootingProblem:
+    """The problem with a padded flight, unless it is cut into windows. Derivatives are then forward-mode only.
+
+    Padding is not simulated: it costs memory and no time. Results change by rounding errors only.
+    """
+    samples = problem.flight.time.shape[0]
+    capacity = capacity_of(samples)
+    if capacity == samples or problem.windows > 1 or problem.length is not None:
+        return problem
+    return with_room(problem, capacity)
+
+
+def with_room(problem: ShootingProblem, capacity: int) -> ShootingProblem:
+    """The problem in one window, with a flight that is padded to `capacity` samples."""
+    length = jax.device_put(np.asarray(problem.flight.time.shape[0]))
+    return dataclasses.replace(problem, flight=pad_flight(problem.flight, capacity), windows=1, length=length)
+
+
+def capacity_of(samples: int) -> int:
+    """The number of rows of a padded flight; `samples` if it is not padded."""
+    return next((capacity for capacity in _CAPACITIES if capacity >= samples), samples)
+
+
+def pad_flight(flight: Flight, capacity: int) -> Flight:
+    """The flight with more rows, up to `capacity`, in which nothing was measured and the inputs stay as they were."""
+    samples = flight.time.shape[0]
+
+    def pad(values: jax.Array | None, fill: float | None = None) -> jax.Array | None:
+        if values is None:
+            return None
+        rows = np.asarray(values)
+        more = np.repeat(rows[-1:] if fill is None else np.full_like(rows[-1:], fill), capacity - samples, axis=0)
+        return jax.device_put(np.concatenate([rows, more]))
+
+    return dataclasses.replace(
+        flight,
+        time=np.asarray(flight.time)[0] + float(flight.dt) * np.arange(capacity),
+        omega=pad(flight.omega),
+        states=pad(flight.states, np.nan),
+        specific_force=pad(flight.specific_force, np.nan),
+        body_velocity=pad(flight.body_velocity),
+        stretch=pad(flight.stretch),
+        voltage=pad(flight.voltage),
+        within=pad(flight.within),
+    )

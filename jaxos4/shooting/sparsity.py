@@ -20,10 +20,7 @@ Panel = tuple[int, int, tuple[int, ...]]
 
 
 def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results arguments"]:
-    """Which leaves of a function's result depend on which leaves of its arguments, from the operations that it traces.
-
-    All results of an inner function count as dependent on all of its arguments.
-    """
+    """Which leaves of a function's result depend on which of its arguments; inner functions are not looked into."""
     program = jax.make_jaxpr(function)(*arguments).jaxpr
     nothing = np.zeros(len(program.invars), dtype=bool)
     known = dict(zip(program.invars, np.eye(nothing.size, dtype=bool), strict=True))
@@ -41,9 +38,7 @@ def panels_of(
 ) -> tuple[int, list[Panel]]:
     """The number of unknowns up to the last one that acts on rates or attitude; and the panels of all rows.
 
-    **Arguments:**
-
-    - `advance`: from a state, the forcing and the parameters, which are `at`, to the next state and the outputs.
+    - `advance`: from a state, forcing and parameters, which are `at`, to the next state and the outputs.
     - `free`: whether the initial state is unknown too. Its leaves then follow the parameters.
     """
     leaves = dependence(advance, *at)

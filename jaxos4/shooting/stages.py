@@ -1,7 +1,6 @@
 """The plan of a search in stages: the body rates of a short part of the flight first, then more.
 
-Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, so the cost of a long
-flight has other minima, into one of which `CorrectedOS4` falls in a fifth of all cases: the first stages are short.
+Rates do not depend on the others. Errors grow with time, and so does the number of minima of the cost.
 """
 
 from typing import NamedTuple
@@ -46,12 +45,9 @@ class Plan(NamedTuple):
     ) -> "Plan":
         """The plan of a flight, whose last stage is the whole.
 
-        **Arguments:**
-
         - `channels`: that are compared. `shares`: of the flight, to which the body rates are fitted first.
         - `measured`: states in cascade order, then specific force, which all stages compare. `sigma`: of their noise.
-        - `samples`: how many count; the others are padding.
-        - `windows`: of the flight. One of several windows is short enough as a whole.
+        - `samples`: how many count. `windows`: of the flight; one of several is short enough as a whole.
         """
         wanted = (share for share in shares if share == 1 or windows == 1)
         rates = tuple(("rates", share) for share in wanted if (channels, share) != ("rates", 1))

@@ -1,8 +1,7 @@
 """The cells of a study: their flights, and the results of an estimator on them.
 
-Flights are pure functions of the specification and of their numbers; results also of the network. All cores share the
-flights of a cell, see `on_all_cores`. Last digits depend on the length of a batch; with whole cells they are the same
-in any order, in any process, and on any number of cores.
+Flights are pure functions of the specification and of their numbers; results also of the network. With whole cells they
+are the same in any order, in any process, and on any number of cores, see `on_all_cores`.
 """
 
 import functools

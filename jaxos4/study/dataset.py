@@ -113,10 +113,8 @@ class Store:
 def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
     """Opens the folder of a study, new or to be resumed, and locks it until the block ends.
 
-    `device`: the devices that compute, in words; a resumed study keeps those of its first run.
-
-    **Raises:** `InputError` if the folder holds another study (with what differs), other files, or a study that another
-    run is computing; `OSError` if it cannot be written to.
+    `device`: the devices that compute, in words; a resumed study keeps those of its first run. Raises `InputError` if
+    the folder holds another study (with what differs), other files, or one that is being computed; `OSError`.
     """
     check_store(directory, study)
     directory.mkdir(parents=True, exist_ok=True)
@@ -176,12 +174,7 @@ def _short(value: Any) -> str:
 
 
 def assemble(store: Store) -> xr.Dataset:
-    """The Dataset of a study's finished cells; the result of all others is `not_run`.
-
-    Its dimensions are all axes of the grid, `flight`, `parameter` and `level`.
-
-    **Raises:** `InputError` if a cell's file is damaged.
-    """
+    """The Dataset of a study's finished cells; the result of all others is `not_run`. Raises `InputError`."""
     study, coordinates, failures = store.study, _coordinates(store.study), []
     blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {

@@ -1,8 +1,7 @@
 """Metrics of the estimators in a study's Dataset: errors, efficiency, coverage, results, and limits of the noise.
 
-Pure functions from a Dataset, or from a selection of it, to labelled arrays. Missing numbers are NaN and do not count
-in means; a mean over nothing is NaN. Errors are those of *converged* flights, with the result `successful` or
-`unidentifiable`: an unidentifiable flight has an estimate too, although the bracket already held as much information.
+Pure functions from a Dataset, or a selection of it, to labelled arrays. Missing numbers are NaN and do not count.
+Errors are those of *converged* flights, `successful` or `unidentifiable`: the latter have an estimate too.
 """
 
 import math
@@ -56,8 +55,7 @@ def error(dataset: xr.Dataset) -> xr.DataArray:
 def no_percentage(dataset: xr.Dataset, bound: xr.DataArray | None = None) -> xr.DataArray:
     """Why percentages of the truth have no meaning, for each scenario and parameter: an index into `NO_PERCENTAGE`.
 
-    1 if the truth of any flight is 0; else 2 if the truth of any flight is below its noise floor, `NINETY_FIVE` bounds:
-    it cannot be distinguished from 0, so that its relative error is arbitrary. 0 otherwise.
+    1: the truth of a flight is 0. 2: it is below `NINETY_FIVE` bounds, and so cannot be distinguished from 0. Or 0.
     """
     truth, bound = dataset["truth"], dataset["bound"] if bound is None else bound
     below = (abs(truth) < NINETY_FIVE * bound).any("flight")
@@ -87,8 +85,7 @@ def normalised_error(dataset: xr.Dataset) -> xr.DataArray:
 def efficiency(dataset: xr.Dataset) -> xr.Dataset:
     """RMSE / bound of converged flights, each relative to its own bound, with a 95 % Monte-Carlo interval.
 
-    1 is the best value for an unbiased estimator. `low` and `high` are the interval of a Gaussian's standard deviation
-    from `count` draws (chi-squared); NaN for fewer than two flights.
+    `low` and `high`: of a Gaussian's standard deviation from `count` draws (chi-squared); NaN for fewer than two.
     """
     ratio = normalised_error(dataset)
     count = ratio.notnull().sum("flight")
@@ -131,10 +128,7 @@ def accuracy(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def accuracy_interval(dataset: xr.Dataset) -> xr.Dataset:
-    """`accuracy` by scale and estimator, with the Monte-Carlo interval of one parameter: a conservative one.
-
-    The mean of several parameters varies less, by how much their errors correlate.
-    """
+    """`accuracy` by scale and estimator, with the conservative Monte-Carlo interval of one parameter."""
     found, value = efficiency(dataset), accuracy(dataset)
     low, high = (value * (found[end] / found["efficiency"]).mean("parameter").fillna(1) for end in ("low", "high"))
     return xr.Dataset({"accuracy": value, "low": low, "high": high}).transpose("scale", "estimator")

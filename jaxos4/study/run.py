@@ -1,8 +1,4 @@
-"""Runs a study from its specification to its Dataset: in this process, or on a Dask cluster.
-
-The results are the same bit for bit. Workers of a cluster need only this package. If a worker is lost, another worker
-repeats its tasks.
-"""
+"""Runs a study from its specification to its Dataset, here or on a Dask cluster: with the same results, bit for bit."""
 
 import functools
 import io
@@ -34,7 +30,7 @@ FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError
 
 
 def device_name() -> str:
-    """What computes in this process, in words: an accelerator, or the cores of the CPU."""
+    """The device of this process in words: an accelerator, or the cores of the CPU."""
     device = jax.local_devices()[0]
     return f"{cores() if device.platform == 'cpu' else 1} x {device.device_kind}"
 
@@ -49,11 +45,9 @@ def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
 
 
 def run_here(store: Store) -> Iterator[tuple[str, int]]:
-    """Computes the remaining cells one after another, each on all cores.
+    """Computes the remaining cells one after another, each on all cores; one that cannot be computed is kept as failed.
 
     Yields the label of each cell that is finished, and the number of finished cells.
-
-    A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
 
     def submit(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -70,9 +64,8 @@ def run_here(store: Store) -> Iterator[tuple[str, int]]:
 def run_on_cluster(store: Store, client: "Client", *, retries: int = 2) -> Iterator[tuple[str, int]]:
     """Computes the remaining cells on a cluster, in the order in which they finish. Yields as `run_here`.
 
-    `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
-    lock of the cluster. `retries`: how often a task that raises an unexpected exception is repeated; the cluster itself
-    counts lost workers. Raises `InputError` if the cluster has no workers, or loses a task more often than it allows.
+    `client`: made with `set_as_default=False`, or xarray would write under a lock of the cluster. `retries`: of a task
+    that raises an unexpected exception. Raises `InputError` without workers, or if a task is lost too often.
     """
     from distributed import as_completed
 
@@ -132,10 +125,7 @@ def _run(
 
 
 def train(study: Study, job: Scenario) -> bytes | str:
-    """The bytes of a network's file, or a message that says why there is none. It serves all noises and scales.
-
-    The numbers are the same bit for bit only on the same number of cores, which share the products of matrices.
-    """
+    """A network's file, which serves all noises and scales, or why there is none. Its bits depend on the cores."""
     scales = [scale or 1.0 for scale in study.scales]
     try:
         with jax.enable_x64(True):
@@ -177,13 +167,10 @@ def carry_out(
     run: Callable[[Store], Iterator[tuple[str, int]]] = run_here,
     progress: Callable[[str, int], None] = lambda label, done: None,
 ) -> xr.Dataset:
-    """Runs the missing cells of a study and writes its Dataset.
-
-    Raises what `open_store` and `run` raise, and `InputError` if an excitation does not fit into one of the durations.
+    """Runs the missing cells of a study and writes its Dataset. Raises as `open_store`, `run` and `check_excitations`.
 
     - `out`: the study's folder; a new one, or one that the same study wrote.
-    - `device`: what computes, in words, for the provenance.
-    - `run`: `run_here`, or `run_on_cluster` with its client.
+    - `device`: what computes, in words, for the provenance. `run`: `run_here`, or `run_on_cluster` with its client.
     - `progress`: is called after each step, with its label and the number of finished cells.
     """
     study.check_excitations()

@@ -88,16 +88,15 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     - `models`, `excitations`, `channels`, `estimators`: names as on the command line.
     - `airframes`: names of presets, or of tables `[airframe.NAME]` with the keys of an airframe file.
-    - `input`: more excitations: rotor speeds of each sample, by name. In the file: a table of paths of CSV files with
-      `t` and `omega1..4`, as `jaxos4 design` writes them, relative to the folder of the specification.
+    - `input`: more excitations: rotor speeds of each sample, by name. In the file: a table of paths of CSV files of
+      `jaxos4 design`, with `t` and `omega1..4`, relative to the folder of the specification.
     - `durations` [s], at a sample time of `dt` [s].
     - `methods`: the integration method of true flights; estimators simulate by `fit_method`.
-    - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At scale 0 flights are exact, and
-      estimators assume the noise of scale 1.
+    - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At 0, estimators assume the noise of
+      1.
     - `widths`: widths of the brackets, in multiples of the model's default half-width.
-    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's centre is off them by a
-      random offset within 80 % of its half-width; `"drawn"`: each flight has its own parameters, uniform in a bracket
-      around the airframe's.
+    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's centre is off them by up to
+      80 % of its half-width; `"drawn"`: each flight has its own parameters, uniform in a bracket around the airframe's.
     - `initial_state`: `"known"`, or `"free"`: estimated too.
     - `flights`, `seed`: number of flights of a scenario, and the random seed.
     - `batch`: flights of a cell, identified at once by one device. The last digits of results depend on it.
@@ -188,10 +187,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         return as_float(speeds)
 
     def job(self, scenario: Scenario) -> Scenario | None:
-        """The scenario for which to train the network that an estimator needs; `None` if it needs none.
-
-        One network serves all methods, noises and scales. The `channels` are those that it looks at.
-        """
+        """The scenario of the network that an estimator needs, or `None`. It serves all methods, noises and scales."""
         kind = ESTIMATORS[scenario.estimator]
         channels = self.seed_channels(scenario) if kind.shoots else scenario.seen
         shared = {"method": self.fit_method, "noise": self.noises[0], "scale": 1.0, "estimator": "network"}

@@ -40,10 +40,7 @@ _REMEDY = "give a folder that `jaxos4 study` wrote"
 
 
 def read_results(directory: Path) -> xr.Dataset:
-    """Reads the Dataset in a study's folder.
-
-    **Raises:** `InputError` if there is no Dataset, or if the file is not the results of a study.
-    """
+    """Reads the Dataset in a study's folder. Raises `InputError` if there is none, or it is not that of a study."""
     path = directory / RESULTS_FILE
     if not directory.is_dir():
         raise InputError(f"{directory}: no such folder; {_REMEDY}.")
@@ -65,8 +62,7 @@ def read_results(directory: Path) -> xr.Dataset:
 def _probe(path: Path) -> None:
     """Raises `ValueError` if HDF5 cannot read the whole file, or takes longer than a sound one needs.
 
-    A sound file takes less than 4 s, and one more for every 10 MB. A byte of it holds at most 1,030 bytes of arrays,
-    the largest ratio of compression; 1 MB always fits.
+    A sound file takes less than 4 s, and 1 s more for every 10 MB. A byte of it holds at most 1,030 bytes of arrays.
     """
     size = path.stat().st_size
     limits = str(4 + size // 10_000_000), str(1030 * size + (1 << 20))
