@@ -23,11 +23,9 @@ from helpers import refused
 from hypothesis import given, settings, strategies as st
 from recorded_logs import ACCIDENTS, damaged, table_csv
 from strange import in_one_line, nodes
-from synthetic_identification import identified_vehicle
 from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
 
-from jaxos4 import result_file
 from jaxos4._files import read_toml
 from jaxos4.airframe import load_airframe
 from jaxos4.errors import InputError
@@ -39,9 +37,6 @@ from jaxos4.logs.messages import Messages
 from jaxos4.models import MODELS
 from jaxos4.recording import read_recording
 from jaxos4.recording.inspection import airframe_draft, inspect_log
-from jaxos4.report.identification_figures import priors, strongest
-from jaxos4.report.style import style
-from jaxos4.report.timeline import identified_signals
 from jaxos4.study import load_study, read_results
 from jaxos4.study.dataset import read_store
 
@@ -67,15 +62,6 @@ def exported(path):
             parsed(text, target)
 
 
-def drawn(path):
-    """What the page of a result draws, without drawing it."""
-    found, look = result_file.read_result(path), style(0)
-    identified_signals(found, look)
-    if found.covariance:
-        strongest(found)
-    priors(found, look)
-
-
 def bracket(path):
     bracket_of(read_toml(path), MODELS["published"]())
 
@@ -89,7 +75,6 @@ HEADER = {"version": "0", "device": "cpu", "study": {"title": "A study", "scales
 DOORS = {
     "export": (exported, json.dumps(RESULT)),
     "predict": (vehicle_of, json.dumps(RESULT)),
-    "page": (drawn, json.dumps(identified_vehicle().to_dict())),
     "airframe": (load_airframe, MINE),
     "bracket": (bracket, "alpha1 = [-1.0, 1.0]\nalpha3 = [100, 200]\n"),
     "study": (load_study, STUDY),
@@ -229,7 +214,6 @@ HOSTILE = ['"""', "'''", "-->", "--->", "]]>", "<!--", "</mujoco>", "&", "&lt;",
 HOSTILE += ["coding: unicode_escape", "-*- coding: utf-7 -*-", "\nimport os", "\r", "\x0c", "\x85", "\u2028", "\x1b[2J"]
 HOSTILE += ["\udcff", "\ufffe", "{{ 1 }}", "{% raw %}", "é", "\u202e", "mass = 1", "{}", "%s", " ", "'", "b" * 40]
 NAMES = st.lists(st.sampled_from(HOSTILE), min_size=1, max_size=4).map("".join)
-OURS = {"ndarray", "Multirotor", "Vehicle"}
 
 
 def parsed(text, target):

@@ -6,7 +6,6 @@ Flights in closed loop, for which it is made: `test_vehicle.py`.
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,10 +17,8 @@ import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.flight import RATES
 from jaxos4.shooting import InnovationsProblem, pad_flight
-from jaxos4.shooting.filters import BLOCK
 from jaxos4.shooting.gains import LogNoise, Observed, gains_of
 from jaxos4.shooting.innovations import SETTLING
-from jaxos4.shooting.segments import Segments
 
 pytestmark = pytest.mark.slow
 
@@ -71,18 +68,6 @@ def disturbed(seed=0):
 
 
 # The filters.
-
-
-@pytest.mark.parametrize("tau", [0.003, 0.2, 0.34, 30.0])
-def test_the_variance_that_a_disturbance_adds_is_exact(tau):
-    """Also for time constants of thousands of samples, where its formula is a difference of nearly equal numbers."""
-    noise = LogNoise(*(jnp.asarray(np.log([x, 1.0, 1.0])) for x in (3.0, tau, 1e-9)))
-    two = jax.tree.map(lambda leaf: jnp.asarray(np.zeros_like(leaf[:2])), observed_in(disturbed()))
-    gains = filter_gains(two, noise, jnp.asarray(DT))
-    moved, added = transition(3.0, tau, DT)
-    start = np.diag([0.0, 9.0])
-    expected = (moved @ start @ moved.T + added)[0, 0] + 1e-18
-    np.testing.assert_allclose(gains.variance[1, 0, 0], expected, rtol=1e-9)
 
 
 def test_the_likelihood_is_that_of_a_joint_gaussian():
@@ -200,21 +185,6 @@ def test_a_known_start_is_used_in_flights_of_several_segments():
     moved, added = transition(4.0, 0.2, DT)
     expected = (moved @ np.diag([0.0, 16.0]) @ moved.T + added)[0, 0] + 0.02**2
     np.testing.assert_allclose(gains.variance[1, 0, 0], expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize(("samples", "number"), [(2, 1), (50, 1), (501, 1), (501, 4), (1500, 4), (153_601, 400)])
-def test_each_sample_counts_once(samples, number):
-    """Also if the flight is padded: then its length is data."""
-    room = samples + 100
-    padded = jax.jit(lambda edges: Segments.of(number, room, edges, SETTLING))(jnp.array([0, samples]))
-    alone = Segments.of(number, samples, np.array([0, samples]), SETTLING)
-    for index, owned, rows, _ in (alone, map(np.asarray, padded)):
-        assert index.shape == owned.shape
-        assert index.shape[1] % BLOCK == 0
-        assert (index >= 0).all()
-        np.testing.assert_array_equal(np.sort(index[owned]), np.arange(samples))
-        assert not owned[:, rows:].any()
-        assert not owned[1:, :SETTLING].any()
 
 
 # Gaps, recordings, failures.

@@ -1,17 +1,26 @@
-"""Flights to CSV and back; what a log may look like, what it may not, and what is done to an uneven one."""
+"""Flights as CSV: what a file may look like and what not, every bit back, whole files or none."""
 
+import dataclasses
 import inspect
+import os
+import stat
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flight_csvs import HEADER, ROWS, csv, edited, read_flight_and_notes
 from helpers import CRAZYFLIE, same
+from hypothesis import example, given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
 
 import jaxos4.logs.csv as csv_module
 import jaxos4.logs.table as table_module
 from jaxos4.airframe import OS4
 from jaxos4.errors import InputError
-from jaxos4.logs import read_flight
+from jaxos4.flight import STATE_NAMES, Flight
+from jaxos4.logs import read_flight, write_flight
 
 
 def refusal(path, airframe=None):
@@ -173,3 +182,140 @@ def test_an_empty_first_rotor_cell_is_refused_also_beside_an_impossible_one(tmp_
     cells[1] = "-5"
     (tmp_path / "flight.csv").write_text("\n".join([*lines[:4], ",".join(cells), *lines[5:]]) + "\n")
     assert "omega1: is empty, with no earlier value" in refusal(tmp_path / "flight.csv")
+
+
+# Writing
+
+
+FLIGHT = Flight(np.arange(3.0), np.ones((3, 4)), np.zeros((3, 12)))
+LIMITS = {"phi": 1.5, "theta": 1.5, "psi": 1.5, "p": 60, "q": 60, "r": 60, "vx": 1e3, "vy": 1e3, "vz": 1e3}
+
+
+def masked(draw, shape, limits):
+    values = draw(hnp.arrays(float, shape, elements=st.floats(-1, 1, width=64))) * limits
+    return np.where(draw(hnp.arrays(bool, shape)), np.nan, values)
+
+
+@st.composite
+def flights(draw):
+    n = draw(st.integers(2, 12))
+    time = draw(st.floats(-1e4, 1e4)) + draw(st.floats(1e-3, 0.02)) * np.arange(n)
+    omega = draw(hnp.arrays(float, (n, 4), elements=st.floats(0, 1e5)))
+    states = masked(draw, (n, 12), [LIMITS.get(name, 1e6) for name in STATE_NAMES])
+    states[draw(st.integers(0, n - 1)), draw(st.integers(0, 11))] = 0.1
+    force = masked(draw, (n, 3), 1e3) if draw(st.booleans()) else None
+    force = None if force is None or np.isnan(force).all() else jnp.asarray(force)
+    voltage = draw(hnp.arrays(float, n, elements=st.floats(1e-3, 200))) if draw(st.booleans()) else None
+    return Flight(time, omega, states, force, voltage=voltage)
+
+
+# Round trip
+
+
+@given(flight=flights())
+@example(flight=Flight(np.arange(2) / 64, np.zeros((2, 4)), np.full((2, 12), -0.0)))
+@settings(max_examples=150)
+def test_reading_gives_back_every_bit(flight, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "flight.csv"
+    write_flight(flight, path)
+    again, notes = read_flight_and_notes(path)
+    for one, other in zip(jax.tree.leaves(flight), jax.tree.leaves(again), strict=True):
+        assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
+    assert all("in g" in note for note in notes)  # small forces may be in other units
+
+
+def test_only_what_was_measured_gets_a_column(tmp_path):
+    states = np.full((3, 12), np.nan)
+    states[1, STATE_NAMES.index("p")] = 0.25
+    flight = Flight(np.arange(3) * 0.5, np.full((3, 4), 7.0), states, jnp.asarray([[np.nan, 1e-300, np.nan]] * 3))
+    write_flight(flight, tmp_path / "f.csv")
+    rows = [f"{t},7.0,7.0,7.0,7.0,{p},1e-300" for t, p in (("0.0", ""), ("0.5", "0.25"), ("1.0", ""))]
+    text = (tmp_path / "f.csv").read_bytes().decode()
+    assert text == "\n".join(["t,omega1,omega2,omega3,omega4,p,ay", *rows, ""])
+
+
+def test_commands_are_written_as_shares_of_the_largest_speed(tmp_path):
+    flight = Flight(np.arange(3.0), np.full((3, 4), 250.0), np.zeros((3, 12)), commanded=True)
+    airframe = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(500.0))
+    write_flight(flight, tmp_path / "f.csv", airframe)
+    assert (tmp_path / "f.csv").read_text().startswith("t,command1,command2,command3,command4,")
+    again = read_flight(tmp_path / "f.csv", airframe)
+    assert again.commanded
+    assert same(flight, again)
+    # Without the largest speed they cannot be written as commands.
+    for unknown in (None, OS4):
+        write_flight(flight, tmp_path / "g.csv", unknown)
+        assert not read_flight(tmp_path / "g.csv").commanded
+
+
+def test_single_precision_gives_back_its_bits_and_moves_a_late_start(save):
+    with jax.enable_x64(False):
+        flight = Flight(0.1 * np.arange(9), np.full((9, 4), 1 / 3), np.full((9, 12), 0.1))
+        path = save("")
+        write_flight(flight, path)
+        again = read_flight(path)
+        assert again.states.dtype == jnp.float32
+        assert same(dataclasses.replace(flight, held=False), again)  # measured speeds of a file are those at its times
+        late = csv(rows=[f"{1.7e9 + 0.01 * k:.2f},1,1,1,1,0,0,0" for k in range(500)])
+        with pytest.warns(UserWarning, match="starts at 1700000000 s"):
+            moved = read_flight(save(late))
+        assert moved.time[0] == 0
+        assert moved.dt == pytest.approx(0.01, rel=1e-6)
+    assert read_flight(save(late)).time[0] == 1.7e9
+
+
+@pytest.mark.parametrize(
+    ("field", "at", "words"),
+    [
+        ("states", (1, 0), "sample 1, column x: is inf"),
+        ("omega", (1, 0), "sample 1, column omega1: is inf"),
+        ("time", (1,), "sample 1, column t: is inf"),
+        ("batch", (), r"one file holds one flight, got a batch of shape \(2,\)"),
+    ],
+)
+def test_what_a_file_cannot_hold_is_not_written(field, at, words, tmp_path):
+    flight = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), FLIGHT)
+    if at:
+        infinite = jnp.asarray(getattr(FLIGHT, field)).at[at].set(np.inf)
+        flight = dataclasses.replace(FLIGHT, **{field: infinite})
+    with pytest.raises(InputError, match=words):
+        write_flight(flight, tmp_path / "f.csv")
+    assert list(tmp_path.iterdir()) == []
+
+
+# Whole files or none
+
+
+def interrupt(descriptor):
+    raise KeyboardInterrupt
+
+
+def test_a_file_is_replaced_as_a_whole_or_not_at_all_behind_a_link_and_keeps_its_mode(tmp_path, monkeypatch):
+    path, link = tmp_path / "old.csv", tmp_path / "link.csv"
+    path.write_text("old")
+    path.chmod(0o640)
+    link.symlink_to(path)
+    write_flight(FLIGHT, link)
+    assert same(read_flight(path).states, FLIGHT.states)
+    assert link.is_symlink()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_flight(dataclasses.replace(FLIGHT, omega=2 * FLIGHT.omega), path)
+    assert path.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == [link, path]
+    with pytest.raises(FileNotFoundError, match=r"no such folder to write to.*nowhere/f\.csv"):
+        write_flight(FLIGHT, tmp_path / "nowhere" / "f.csv")
+    with pytest.raises(IsADirectoryError, match="is a folder"):
+        write_flight(FLIGHT, tmp_path)
+
+
+def test_a_device_and_a_pipe_are_written_in_place():
+    write_flight(FLIGHT, os.devnull)
+    assert not os.path.isfile(os.devnull)
+    reader, writer = os.pipe()
+    write_flight(FLIGHT, f"/dev/fd/{writer}")
+    os.close(writer)
+    with open(reader) as file:
+        assert file.readline().startswith("t,omega1,")

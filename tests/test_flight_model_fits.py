@@ -151,10 +151,17 @@ def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="
     return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels=channels, windows=windows)
 
 
-@pytest.mark.parametrize("recordings", [(0, 0), (0, 1)])
-def test_gradient_and_information_are_the_residuals_derivatives(recordings):
-    terms = ("offset", "motor", "delay", "accelerometer", "gyro_bias")
-    problem = two_flights(jaxos4.FlightModel(FULL, terms=terms, recordings=recordings), windows=4, noise=0.01)
+MOTORS = ("offset", "motor", "delay", "accelerometer", "gyro_bias")
+
+
+@pytest.mark.parametrize(
+    ("terms", "recordings", "channels"),
+    [(MOTORS, (0, 0), "rates"), (MOTORS, (0, 1), "rates"), (("velocity",), (0,), "all"), (("drag",), (0,), "all")],
+)
+def test_gradient_and_information_are_the_residuals_derivatives(terms, recordings, channels):
+    """Also where the structure of a model says that they are zero. A velocity that makes torque feeds back."""
+    model = jaxos4.FlightModel(FULL, terms=terms, recordings=recordings)
+    problem = two_flights(model, windows=4, noise=0.01, channels=channels)
     count = len(problem.model.parameter_names)
     parameters = truth(problem.model) * 1.03
     unknowns = jnp.concatenate([parameters, first_state(problem)])

@@ -14,7 +14,6 @@ from jaxos4.models.state import CHANNELS
 
 # Each as one program.
 invert = jax.jit(linalg.invert)
-joint_factor = jax.jit(linalg.joint_factor, static_argnums=1)
 
 # Standard flight, known initial state: standard deviations in % of alpha (alpha2, 5 and 7: absolute x 100).
 PRINTED = {
@@ -84,36 +83,6 @@ def test_inverts_whatever_the_units(condition):
     assert np.isfinite(inverse).all()
     assert (np.diagonal(inverse)[[0, 1, 3]] > 1e10).all()
     assert inverse[2, 2] == pytest.approx(1 / 100, rel=0.5)
-
-
-def arrow(blocks, count):
-    """The joint information of all windows: the shared unknowns first, then each window's own."""
-    windows, size, _ = blocks.shape
-    own = size - count
-    joint = np.zeros((count + windows * own,) * 2)
-    for w, block in enumerate(np.asarray(blocks)):
-        places = np.concatenate([np.arange(count), count + w * own + np.arange(own)])
-        joint[np.ix_(places, places)] += block
-    return joint
-
-
-@pytest.mark.parametrize("windows", [1, 2, 7])
-def test_block_elimination_is_the_inverse_of_the_whole(windows):
-    rng = np.random.default_rng(windows)
-    slopes = rng.normal(size=(windows, 40, 11)) * 10.0 ** rng.uniform(-6, 6, 11)
-    blocks = jnp.asarray(np.swapaxes(slopes, 1, 2) @ slopes)
-    joint = arrow(blocks, 8)
-    unit = np.sqrt(np.diagonal(joint))
-    inverse = np.linalg.inv(joint / np.outer(unit, unit)) / np.outer(unit, unit)
-    scale = np.sqrt(np.diagonal(inverse))
-    factor, basis = map(np.asarray, joint_factor(blocks, 8))
-    found = basis @ np.swapaxes(basis, 1, 2)
-    for w in range(windows):
-        places = np.concatenate([np.arange(8), 8 + 3 * w + np.arange(3)])
-        own = np.outer(scale[places], scale[places])
-        np.testing.assert_allclose(found[w] / own, inverse[np.ix_(places, places)] / own, atol=1e-9)
-    identity = np.broadcast_to(np.eye(11), basis.shape)
-    np.testing.assert_allclose(np.swapaxes(basis, 1, 2) @ factor, identity, atol=1e-9)
 
 
 def constants(airframe=jaxos4.OS4):

@@ -13,7 +13,6 @@ from synthetic_results import held, provenance, vehicle_result
 import jaxos4
 from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log, read_recording
-from jaxos4.logs.columns import column_map
 
 SPEEDS = tuple(f"omega{i}" for i in range(1, 5))
 STATES = ("p", "q", "r", "phi", "theta", "psi", "x", "y", "z", "vx", "vy", "vz")
@@ -221,10 +220,3 @@ def test_every_log_of_a_command_is_read_by_the_map(save, run):
 def test_a_format_with_columns_of_its_own_takes_no_map(save):
     with pytest.raises(InputError, match="takes no column map"):
         read_log(save(b"\xbc\x02\0"), columns="mavros")
-
-
-def test_presets_are_column_maps():
-    for name in ("agilicious", "mavros", "neurobem", "px4-ros2"):
-        found = column_map(name)
-        assert found.sources.keys() >= {*SPEEDS, "p", "q", "r", "qw"}
-        assert not found.needed

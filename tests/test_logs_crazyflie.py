@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from crazyflie_logs import GYRO, MOTORS, RPMS, STATE, T, angles, log_2019, ratios, sensors
 from helpers import CRAZYFLIE
-from recorded_logs import (
-    RPM,
-    check,
-    crazyflie,
-    position,
-    speeds,
-)
+from recorded_logs import RPM, check, crazyflie, position, speeds
 
 from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log

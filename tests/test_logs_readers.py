@@ -3,7 +3,6 @@
 A file gives a usable flight or an `InputError` of one line, whatever it contains.
 """
 
-import json
 import math
 import time
 import tracemalloc
@@ -21,10 +20,8 @@ from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
 from recorded_logs import RPM, blackbox_csv, check, outcome, speeds, survives_damage
 
-from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs import FORMATS, LogFormat, Table, log_format, read_log
-from jaxos4.logs.table import opened, refuse
+from jaxos4.logs import FORMATS, log_format, read_log
 
 # Each reader: a good log, the bytes at its beginning that are its header, and bad logs with words of their messages.
 SUBJECTS = {
@@ -198,42 +195,6 @@ def test_a_few_bytes_cost_little_whatever_they_announce(name, save):
     assert time.perf_counter() - begin < 10
 
 
-# A new log format is one file and one line in the registry
-
-
-def read_json_log(path):
-    """The first line names the log; the second holds the columns."""
-    with opened(path) as file:
-        lines = file.readlines()
-    try:
-        columns = {name: np.array(values, dtype=float) for name, values in json.loads(lines[1]).items()}
-    except (ValueError, IndexError):
-        refuse(path, "has no columns; write them as one JSON object", row=2)
-    return Table(path, columns, first_row=None), ("times are those of the logger",)
-
-
-JSON_LOG = LogFormat("JSON", "two-line JSON", lambda begin: begin.startswith(b'{"log"'), read_json_log)
-
-
-@pytest.fixture
-def log(save, monkeypatch):
-    monkeypatch.setattr("jaxos4.logs.FORMATS", (JSON_LOG, *FORMATS))  # the new line
-    t = 0.01 * np.arange(300)
-    columns = {"t": t, **{f"omega{i}": np.full(300, 226.0) for i in range(1, 5)}, "p": np.sin(t)}
-    return save('{"log": 1}\n' + json.dumps({name: column.tolist() for name, column in columns.items()}), "log")
-
-
-def test_a_new_format_is_read_and_inspected(log, save, run):
+def test_each_format_is_a_subject():
     elsewhere = {"ROS"}  # test_logs_ros, because its bags need rosbags
     assert {name.partition(",")[0] for name in SUBJECTS} | elsewhere == {each.name for each in FORMATS}
-    flight, notes = read_log(log)
-    assert notes == ("times are those of the logger",)
-    np.testing.assert_array_equal(np.asarray(flight.states)[:, 7], np.sin(0.01 * np.arange(300)))
-    assert log_format(log) is JSON_LOG
-    code, out, err = run("inspect", "log", "--out", "found.json")
-    assert (code, err) == (0, "")
-    assert out.startswith("log: two-line JSON, 0.00 to 2.99 s, 300 samples")
-    assert json.loads(log.with_name("found.json").read_text())["format"] == "JSON"
-    with pytest.raises(InputError, match=r"bad: row 2: has no columns; write them as one JSON object\.$"):
-        read_log(save('{"log": 1}\n', "bad"))
-    assert log_format(save("t,p\n", "other")).name == "CSV"

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import Inputs
-from jaxos4.models.state import CASCADE_ORDER, CHANNELS, Rates, stack, unstack
+from jaxos4.models.state import CASCADE_ORDER, Rates
 
 every_os4 = pytest.mark.parametrize("model_class", REFERENCES)
 VEHICLE = jaxos4.FlightModel(terms=("offset", "damping", "lag", "delay", "accelerometer", "drag", "gyro_bias"))
@@ -154,23 +154,6 @@ def test_the_corrected_model_is_a_rigid_body(airframe):
 # Laws of every model.
 
 
-def subclasses(kind):
-    return {kind, *(below for child in kind.__subclasses__() for below in subclasses(child))}
-
-
-def test_models_are_abstract_or_final():
-    """No class overrides what another defines, and nothing inherits from a concrete class."""
-    ours = [kind for kind in subclasses(jaxos4.AbstractModel) if kind.__module__.startswith("jaxos4")]
-    assert {type(model) for model in MODELS.values()} < set(ours)
-    for kind in ours:
-        bases = [base for base in kind.__mro__[1:] if issubclass(base, jaxos4.AbstractModel)]
-        assert all(base.__name__.startswith("Abstract") for base in bases)
-        for name, value in vars(kind).items():
-            for base in bases:
-                defined = not name.startswith("__") and callable(getattr(value, "__get__", None)) and name in vars(base)
-                assert not defined or getattr(vars(base)[name], "__isabstractmethod__", False), (kind, name)
-
-
 @every_model
 def test_the_table_of_parameters_is_complete(model):
     size = len(model.parameters)
@@ -195,27 +178,6 @@ def test_the_table_says_what_the_parameters_do(model):
     half_width = np.asarray(model.half_width)
     bend = np.abs(bend * half_width * half_width[:, None]).max(axis=0)
     assert (np.delete(np.diagonal(bend), list(acting)) <= 1e-12).all()
-
-
-@eqx.filter_jit
-def slopes_and_sensors(model, cascade, forcing, parameters):
-    state = unstack(cascade)
-    sensors = model.observe(state, forcing, parameters)
-    return stack(model.cascade(state, forcing, parameters)), jnp.stack(sensors)
-
-
-@every_model
-def test_a_shallower_state_gives_the_same_derivative(model):
-    state = jnp.asarray(random_points(1)[0][0])
-    inputs = Inputs(standard_flight().omega[:2], jnp.asarray(0.01), velocity=jnp.ones((2, 3)))
-    row = jax.tree.map(lambda leaf: np.asarray(leaf)[0], forcing_of(model, inputs, model.alpha))
-    full, seen = slopes_and_sensors(model, state[CASCADE_ORDER], row, model.alpha)
-    assert seen.shape == (12 + len(model.force_axes),)
-    assert model.observes_states == np.array_equal(seen, state[CASCADE_ORDER])
-    for size in CHANNELS.values():
-        slopes, sensors = slopes_and_sensors(model, state[CASCADE_ORDER[:size]], row, model.alpha)
-        np.testing.assert_array_equal(slopes, full[:size])
-        np.testing.assert_array_equal(sensors[:size], seen[:size])
 
 
 @every_os4

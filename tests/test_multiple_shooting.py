@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from helpers import (
     first_samples,
-    inverse_square,
     noisy_states,
-    numpy_jacobian,
     numpy_residuals,
     random_starts,
     standard_flight,
@@ -73,20 +71,6 @@ def test_windows_are_flights_of_their_own(windows, channels):
     # The predictions follow the order of the flight's samples.
     weight = 1 / problem.sigma[order]
     np.testing.assert_allclose(whole, (weight * (states[:, order] - predicted)).ravel(), rtol=1e-12, atol=1e-12)
-
-
-@every_case
-def test_the_bound_counts_all_initial_states_as_unknowns(model_class, channels):
-    problem, whole = (windowed(windows, channels, model_class) for windows in (WINDOWS, 1))
-    alpha, order = np.asarray(problem.model.alpha), CASCADE_ORDER[: problem.size]
-    starts = np.asarray(problem.flight.states)[first_samples(problem)[:-1]][:, order].ravel()
-    inverse = inverse_square(numpy_jacobian(problem, alpha, starts))[:8, :8]
-    bound = jaxos4.cramer_rao_bound(problem, problem.model.alpha, jnp.asarray(starts))
-    std = np.sqrt(np.diagonal(inverse))
-    np.testing.assert_allclose(bound / np.outer(std, std), inverse / np.outer(std, std), atol=1e-8)
-    # Windows are not tied together, which loses information.
-    tied = inverse_square(numpy_jacobian(whole, alpha, starts[: problem.size]))[:8, :8]
-    assert np.all(np.diagonal(bound) > np.diagonal(tied))
 
 
 @every_case

@@ -63,21 +63,6 @@ def test_the_key_decides_the_states_in_a_batch_too_and_what_was_not_measured_sta
     np.testing.assert_array_equal(noisy, np.where(holes, np.nan, first.states))
 
 
-def test_numbers_of_any_kind_share_a_trace_and_can_be_a_batch():
-    @eqx.filter_jit
-    @eqx.debug.assert_max_traces(max_traces=1)
-    def apply(noise, flight, key):
-        return noise(flight, key=key)
-
-    flight, key = make_flight(), jax.random.key(0)
-    for sigma in (0.1, 0.2, 1, SENSOR_SIGMA, np.float32(0.5), jnp.ones(12)):
-        apply(WhiteNoise(sigma), flight, key)
-    scales = jnp.array([0.0, 1.0, 10.0])
-    added = jax.vmap(lambda s: WhiteNoise(s * SENSOR_SIGMA)(flight, key=key).states)(scales) - flight.states
-    np.testing.assert_array_equal(added[0], 0)
-    np.testing.assert_allclose(added[2], 10 * added[1], rtol=1e-9, atol=1e-15)
-
-
 # Statistics.
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import compiled_programs, first_state, local_model, noisy_states, standard_flight, standard_problem
+from helpers import compiled_programs, noisy_states, standard_flight, standard_problem
 
 import jaxos4
 from jaxos4.shooting import for_threads, padded
@@ -44,37 +44,6 @@ def test_an_identification_is_few_programs_and_the_next_one_none():
 @eqx.filter_jit
 def cost_and_residuals(problem, *at):
     return problem.cost(*at), problem.residuals(*at).reshape(-1, problem.size)
-
-
-def test_other_numbers_need_no_other_program():
-    """Of a flight, a vehicle, a bracket and a search; a sample time is a number of any kind."""
-    model, omega = jaxos4.PublishedOS4(), standard_flight().omega
-    other, twice = eqx.tree_at(lambda m: m.airframe.mass, model, np.asarray(0.7)), 2 * model.alpha
-    steps = 0.02, np.float64(0.03), jnp.asarray(0.04, float)
-    problem = standard_problem(states=noisy_states(1)[0], channels="rates", free=True)
-    changed = eqx.tree_at(lambda p: (p.sigma, p.model), problem, (2 * problem.sigma, other))
-    narrow = jaxos4.Bracket.around(np.asarray(model.alpha), 0.5 * jaxos4.DEFAULT_HALF_WIDTH)
-    before = (
-        lambda: jaxos4.simulate(model, model.alpha, omega, dt=0.01),
-        lambda: jaxos4.IBSS()(problem, jaxos4.Bracket.default(model)),
-        lambda: jaxos4.OutputError()(problem, narrow),
-        lambda: jaxos4.EquationError()(problem, narrow),
-    )
-    after = (
-        *(lambda dt=dt: jaxos4.simulate(other, twice, omega, dt=dt) for dt in steps),
-        lambda: jaxos4.IBSS(tolerance=0.02, reach=3.0)(changed, narrow),
-        lambda: jaxos4.OutputError(max_steps=7, tolerance=1e-3)(changed, narrow),
-        lambda: jaxos4.EquationError(bridge=7)(changed, narrow),
-    )
-    for compute in before:
-        compute()
-    with compiled_programs() as programs:
-        for compute in after:
-            compute()
-    assert programs == []
-    with compiled_programs() as programs:  # a sample less is another program
-        jaxos4.simulate(model, model.alpha, omega[1:], dt=0.01)
-    assert programs != []
 
 
 def test_a_batch_is_the_same_on_any_number_of_cores_by_one_program(monkeypatch):
@@ -117,26 +86,6 @@ def test_padding_changes_no_result(channels):
     np.testing.assert_allclose(cost, own_cost, rtol=1e-12)
     np.testing.assert_allclose(residuals[:501], own, rtol=1e-9)
     assert not residuals[501:].any()
-
-
-@pytest.mark.parametrize("windows", [1, 5])
-def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
-    problem = standard_problem(states=noisy_states(1)[0], channels="attitude", free=True)
-    problem = jaxos4.ShootingProblem(
-        problem.model, problem.flight, sigma=problem.sigma, channels="attitude", windows=windows
-    )
-    found, start = jaxos4.evaluate(problem, problem.model.alpha), first_state(problem)
-    expected = local_model(problem, problem.model.alpha, start)
-    assert found.feasible
-    np.testing.assert_allclose(found.cost, expected.cost.sum(), rtol=1e-12)
-    scale = np.sqrt(np.abs(np.asarray(expected.information)).max())
-    np.testing.assert_allclose(found.information / scale**2, expected.information / scale**2, atol=1e-12)
-    bound = np.asarray(jaxos4.cramer_rao_bound(problem, problem.model.alpha))
-    unit = np.sqrt(np.diagonal(bound))
-    np.testing.assert_allclose(found.covariance / np.outer(unit, unit), bound / np.outer(unit, unit), atol=1e-9)
-    diverged = jaxos4.evaluate(problem, jnp.asarray(np.where(np.arange(8) == 2, 1e9, problem.model.alpha)))
-    assert not diverged.feasible
-    assert diverged.cost == float("inf")
 
 
 @pytest.mark.skipif("small_while_loop" not in os.environ["XLA_FLAGS"], reason="XLA_FLAGS are the user's own")

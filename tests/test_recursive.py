@@ -107,34 +107,6 @@ def test_agrees_with_the_textbook_filter(model_class, channels, free):
         assert np.abs(estimate.history / HALF - wrong[0] / HALF).max() > 1e-4
 
 
-class Slopes(jaxos4.PublishedOS4):
-    """Linear in its parameters and without a state of its own: each rate is driven by torques alone."""
-
-    def angular_acceleration(self, rates, forcing, parameters):
-        """Linear in the parameters, without the rates."""
-        a1, a2, a3, a4, a5, a6, a7, a8 = parameters
-        t = (forcing.roll, forcing.pitch, forcing.yaw)
-        p = a3 * t[0] + a1 * t[1] / 100 + a2 * t[2] / 10
-        q = a6 * t[1] + a4 * t[2] / 100 + a5 * t[0] / 10
-        return jaxos4.models.state.Rates(p, q, a8 * t[2] + a7 * t[0] / 100)
-
-
-def test_a_linear_model_with_a_wide_prior_is_least_squares():
-    problem = standard_problem(channels="rates", states=noisy_states(1, seed=5)[0])
-    problem = eqx.tree_at(lambda p: p.model, problem, Slopes(jaxos4.OS4))
-    at_zero, *at_one = (np.asarray(problem.residuals(jnp.asarray(x))) for x in np.vstack([np.zeros(8), np.eye(8)]))
-    slope = np.stack(at_one, axis=1) - at_zero[:, None]
-    best = np.linalg.lstsq(slope, -at_zero, rcond=None)[0]
-    covariance = np.linalg.inv(slope.T @ slope)
-    std = np.sqrt(np.diagonal(covariance))
-    bracket = jaxos4.Bracket.around(best + 100 * std, 1e4 * std)
-    for passes in (1, 10):
-        estimate = JointEKF(passes=passes)(problem, bracket)
-        assert np.abs((estimate.parameters - best) / std).max() < 1e-4
-        np.testing.assert_allclose(estimate.std, std, rtol=1e-4)
-    assert int(estimate.sweeps) == 2  # the second moves nothing
-
-
 def test_agrees_with_shooting():
     """The prior aside, which a wide bracket makes weak, both have the same optimum."""
     problem, states, omega, lower, upper = lanes(noisy_states(LANES, seed=50))

@@ -9,10 +9,8 @@ from helpers import documented_class, noisy_states, same, standard_flight, stand
 from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
-from jaxos4.estimators.ant_colony import Colony
 from jaxos4.estimators.levenberg_marquardt import LevenbergMarquardt
 from jaxos4.estimators.solver import solve
-from jaxos4.shooting import LocalModel, Stage, Unknowns
 
 pytestmark = pytest.mark.slow
 
@@ -30,15 +28,6 @@ def test_where_a_start_is_nan_the_search_begins_at_the_center():
 
 
 SOLVERS = [jaxos4.IBSS(), LevenbergMarquardt(), jaxos4.AntColony()]
-
-
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
-def test_a_search_that_is_skipped_has_no_answer(solver):
-    problem = standard_problem(channels="rates", states=noisy_states(1)[0])
-    found = solve(solver, problem, skip=True)
-    assert names(found) == "nonfinite_trajectory"
-    assert np.isinf(found.cost)
-    np.testing.assert_array_equal(found.parameters, problem.unknowns.center)
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
@@ -172,29 +161,3 @@ def test_each_simulated_point_of_a_colony_is_counted():
     assert shots_of(problem, torques) == shots
     assert int(estimate.rollouts) == shots + 8
     assert (int(estimate.sweeps), str(names(estimate))) == (3, "max_sweeps")
-
-
-def test_new_points_of_a_colony_have_the_distribution_of_the_reference():
-    """Socha and Dorigo 2008, sec. 3: a mixture of Gaussians, here of one unknown, against NumPy."""
-    k, draws, q, xi = 20, 200, 0.2, 0.85
-    points = np.random.default_rng(0).normal(size=(k, 1))
-    colony, one, yes = jaxos4.AntColony(archive=k, ants=k, q=q, xi=xi), np.ones(1), np.ones(1, dtype=bool)
-    unknowns = Unknowns(("x",), ("1",), 1, 1.0, 0 * one, one, yes, 0 * one, -9 * one, 9 * one, 9 * one)
-    flat = LocalModel(jnp.zeros(1), jnp.ones(1, dtype=bool), jnp.zeros((1, 1)), jnp.zeros((1, 1, 1)))
-    stage = Stage(unknowns, jnp.ones((1, 1)), lambda x: flat, jnp.asarray(yes), *map(jnp.asarray, (0.0, 0.0, True)))
-
-    @jax.jit
-    @jax.vmap
-    def drawn_in(sweep):  # all new points are better than the archive, and replace it
-        return colony.step(stage, Colony(jnp.asarray(points), jnp.ones(k), jnp.zeros((1, 1)), sweep)).points
-
-    drawn = np.asarray(drawn_in(np.arange(draws))).ravel()
-    rank = np.arange(1, k + 1)
-    weight = np.exp(-((rank - 1) ** 2) / (2 * q**2 * k**2)) / (q * k * np.sqrt(2 * np.pi))
-    weight /= weight.sum()
-    kernel = xi * np.abs(points - points.T).sum(axis=0) / (k - 1)
-    mean = weight @ points[:, 0]
-    variance = weight @ (kernel**2 + (points[:, 0] - mean) ** 2)
-    squares = (drawn - mean) ** 2
-    assert abs(drawn.mean() - mean) < 4 * np.sqrt(variance / drawn.size)
-    assert abs(squares.mean() - variance) < 4 * squares.std() / np.sqrt(drawn.size)

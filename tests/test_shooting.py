@@ -214,22 +214,6 @@ def test_a_loop_is_a_batch_in_which_a_failed_trajectory_costs_infinity_and_chang
     np.testing.assert_array_equal(costs[[0, 2]], expected[[0, 2]])
 
 
-def test_a_failed_shot_is_compared_up_to_the_failure():
-    """Its cost means nothing, but its derivative is finite."""
-    problem, start, steep = problem_of("attitude"), 1.4 * np.eye(6)[4], np.array(off())
-    steep[5] = 1000.0
-
-    @eqx.filter_jit
-    def shot(problem, parameters, along):
-        return jax.jvp(lambda x: problem.shots(x, jnp.asarray(start)), (parameters,), (along,))
-
-    (cost, feasible), (slope, _) = shot(problem, steep, np.eye(8)[5])
-    assert not bool(feasible)
-    assert np.isfinite(cost)
-    assert np.isfinite(slope)
-    assert float(problem.cost(jnp.asarray(steep), jnp.asarray(start))) == np.inf
-
-
 # Noise levels.
 
 

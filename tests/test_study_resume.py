@@ -16,7 +16,6 @@ from small_study import COMMAND, SPECIFICATION, cells, finish, results, run_stud
 
 from jaxos4.study import load_study
 from jaxos4.study.dataset import open_store, read_store
-from jaxos4.study.run import compute
 
 pytestmark = pytest.mark.slow
 
@@ -83,13 +82,6 @@ def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_re
     assert finished.items() <= cells(whole).items()
     assert read_store(out).device.startswith("2 x")
     assert len(read_store(out).missing()) == 96 - len(finished)
-
-
-def test_cells_are_the_same_in_any_order(whole):
-    study = load_study(whole.parent / "spec.toml")
-    order = random.Random(0).sample(range(study.count), study.count)
-    with jax.default_device(jax.local_devices()[0]):  # as a run does: one program
-        assert {f"{index:08d}.npz": compute(study, study.cell(index), None) for index in order} == cells(whole)
 
 
 @pytest.mark.parametrize(

@@ -89,22 +89,6 @@ def test_information_about_held_unknowns_is_left_out(kind):
     np.testing.assert_array_equal(part.information[np.ix_([0], PLACES, others)], 0)
 
 
-def test_held_values_are_data():
-    """Other values need no other program, and a batch of values is that of each."""
-    problem = noisy_problem()
-
-    @jax.jit
-    @eqx.debug.assert_max_traces(max_traces=1)
-    def fit(value):
-        return jaxos4.OutputError()(problem.hold({"alpha3": value})).parameters
-
-    values = jnp.array([110.0, 130.0, 150.0])
-    each = jnp.stack([fit(value) for value in values])
-    np.testing.assert_array_equal(each[:, 2], values)
-    np.testing.assert_allclose(jax.vmap(fit)(values), each, rtol=1e-9)
-    assert (np.diff(np.asarray(each)[:, 0]) != 0).all()
-
-
 def test_a_bracket_moves_free_unknowns_only():
     problem = noisy_problem().hold(HELD)
     moved = problem.within(jaxos4.Bracket.around(np.full(8, 5.0), np.full(8, 2.0))).unknowns
@@ -125,24 +109,16 @@ def test_the_default_bracket_is_the_models_own_to_each_side():
         np.testing.assert_allclose(bracket.half_width, model.half_width, rtol=1e-13)
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper"),
-    [
-        ([0.0, 1.0], [1.0, 1.0]),
-        ([0.0, 2.0], [1.0, 1.0]),
-        ([0.0, jnp.nan], [1.0, 1.0]),
-        ([0.0, 0.0], [1.0, jnp.nan]),
-        ([0.0, 0.0], [1.0, jnp.inf]),
-        ([-jnp.inf, -jnp.inf], [jnp.inf, jnp.inf]),
-    ],
-)
-def test_says_when_it_is_none(lower, upper):
-    unknowns = jaxos4.Unknowns.of(jaxos4.PublishedOS4())
-    assert bool(unknowns.valid)
-    assert not bool(unknowns.within(jaxos4.Bracket(np.resize(lower, 8), np.resize(upper, 8))).valid)
-
-
 # Results.
+
+
+def test_half_widths_are_gaussian_unless_calibrated():
+    estimate = jaxos4.OutputError()(noisy_problem())
+    np.testing.assert_allclose(estimate.half_width(0.95), 1.959963985 * estimate.std, rtol=1e-8)
+    assert (estimate.half_width(0.95, simultaneous=True) > estimate.half_width(0.95)).all()
+    for level in (0.0, 1.0, -1.0, 95.0):
+        with pytest.raises(ValueError, match="`level` must lie between 0 and 1"):
+            estimate.half_width(level)
 
 
 def test_every_result_has_a_name_and_a_message_in_a_batch_too():

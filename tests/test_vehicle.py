@@ -19,7 +19,6 @@ from jaxos4.identification.sample_time import sample_time_of
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import at_lowest, corrected, upper_end
 from jaxos4.networks import for_flight
-from jaxos4.networks.for_flight import liveliest
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
 
@@ -137,26 +136,6 @@ def test_inertias_lie_in_their_intervals_and_bisection_finds_what_newtons_method
     errors = of_inertias(regressions(*flown())) - 1  # regression sees the same flights, and is wrong
     assert np.square(errors / std).sum() > 200
     assert np.abs(errors.mean()) > 0.1
-
-
-@pytest.mark.usefixtures("optimised")
-def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
-    """The network sees a part of the flight."""
-    flight, airframe = (lane(part, 0) for part in flown())
-    seen = liveliest(shooting_problem(jax.tree.map(lambda x: x[:2480] if x.ndim else x, flight), airframe, windows=40))
-    assert seen.windows == 24
-    assert seen.flight.time.shape == (24 * 62,)
-    unknowns = seen.unknowns
-    bracket = jaxos4.Bracket.around(unknowns.center + unknowns.half_width, 0.5 * unknowns.half_width)
-    settings = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
-    hybrid = jaxos4.Hybrid(settings.fit(seen, bracket, key=jax.random.key(0)), seen=seen)
-    found, newton = hybrid(InnovationsProblem(shooting_problem(flight, airframe))), lane(found_by("filter error"), 0)
-    assert names(found) == "successful"
-    std, best = (np.asarray(each)[: unknowns.count] for each in (newton.std, newton.parameters))
-    assert (np.abs(found.seed.center - best) / std).max() > 10
-    assert (np.abs(found.parameters[: unknowns.count] - best) / std).max() < 0.05
-    # IBSS searches the whole bracket after the search near the seed.
-    assert found.rollouts > 1.5 * lane(found_by("ibss"), 0).rollouts
 
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):

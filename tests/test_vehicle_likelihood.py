@@ -14,11 +14,10 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import sample_time, vehicle
+from jaxos4.identification import vehicle
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
 from jaxos4.identification.sample_time import moved, sample_time_of, search_sample_times, shortest
-from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import Profile, at_lowest, corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
@@ -187,17 +186,6 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
     unclear = answer._replace(fixed=dict.fromkeys(answer.problem.unknowns.names, fixed["thrust_gain"]))
     assert not sample_time_of(unclear).constants
-
-
-def test_a_start_from_longer_samples_that_cannot_be_flown_is_not_the_end(monkeypatch):
-    several = [data_of(flown(), DT * length) for length in (2, 4)]
-    monkeypatch.setattr(sample_time, "start_of", lambda likelihood, found: np.full(found.parameters.size, 1e9))
-    optima = search_sample_times(several, SOLVER)
-    answers = [corrected(x, data.flight, data.clock.log) for x, data in zip(optima, several, strict=True)]
-    rows = [sample_time_of(answer) for answer in answers]
-    assert [set(row.constants) for row in rows] == [{"Ix", "Iy", "Iz"}] * 2
-    assert shortest(rows) == 0
-    assert optima[0].rollouts > search(SOLVER, several[0].likelihood).rollouts  # both searches count
 
 
 # The likelihood.
