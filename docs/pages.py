@@ -1,10 +1,11 @@
-"""Pages of the site that are made: files of the repository, and the commands as their `--help` describes them."""
+"""Pages of the site that are made, and what Markdown has no word for: equations, and blocks that wrap."""
 
 import contextlib
 import io
 import pathlib
 import re
 
+from math_core import LatexToMathML
 from mkdocs.structure.files import File
 
 from jaxos4.cli import app
@@ -17,6 +18,7 @@ PAGES = {
     "security.md": "SECURITY.md",
     "experiments.md": "experiments/README.md",
 }
+EQUATION = LatexToMathML(annotation=True)
 COMMAND = re.compile(r"(jaxos4|python3?|pip|bash|source|export|\.venv/\S+)\b| +\S")
 
 
@@ -40,10 +42,13 @@ def on_pre_page(page, config, files):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Marks the blocks that wrap on a narrow screen: commands, and outputs with lines wider than a terminal."""
+    """Typesets equations, and marks what wraps on a narrow screen: commands, and lines wider than a terminal."""
 
     def marked(block):
         language, lines = block[1], block[2].splitlines()
+        if language == "math":
+            equation = EQUATION.convert_with_local_state(block[2], displaystyle=True)
+            return f'<div class="equation">{equation}</div>'
         if not language and all(COMMAND.match(line) for line in lines):
             language = "sh"
         elif not language and max(map(len, lines), default=0) > 110:
