@@ -9,7 +9,7 @@ cause is right if the faults of the table below are named as they are, wherever 
 
 import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -164,13 +164,13 @@ CASES |= {f"{name} {size:g}": ("gusts", fault, size) for name, fault in FAULTS.i
 
 def good_flights(
     kind: str, count: int, duration: float, seed: int
-) -> tuple[jaxos4.Airframe, Sequence[jaxos4.Flight | None]]:
-    """The vehicle, and its flights with an effect; `None`: one that turned over."""
+) -> tuple[jaxos4.Airframe, Callable[[int], jaxos4.Flight | None]]:
+    """The vehicle, and its flights with an effect by their number; `None`: one that turned over."""
     if kind not in ROTORPY:
-        return VEHICLE, flights_of(kind, count, duration, seed)
+        return VEHICLE, flights_of(kind, count, duration, seed).__getitem__
     from experiments.rotorpy import flights
 
-    return flights.VEHICLE, [flights.fly(ROTORPY[kind], duration, 1000 * seed + i) for i in range(count)]
+    return flights.VEHICLE, lambda i: flights.fly(ROTORPY[kind], duration, 1000 * seed + i)
 
 
 def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> Row:
@@ -300,7 +300,8 @@ def main(
 
     def row_of(case: str, flight: int) -> Row:
         kind, fault, size = CASES[case]
-        vehicle, recorded = flown(kind)[0], flown(kind)[1][flight]
+        vehicle, flights = flown(kind)
+        recorded = flights(flight)
         return {"result": LOST} if recorded is None else judged(vehicle, recorded, flight, fault, size)
 
     fill(out, report, report["rows"], trials, row_of)
