@@ -300,8 +300,8 @@ def main(
 
     def row_of(case: str, flight: int) -> Row:
         kind, fault, size = CASES[case]
-        vehicle, flights = flown(kind)
-        recorded = flights(flight)
+        vehicle, flight_of = flown(kind)
+        recorded = flight_of(flight)
         return {"result": LOST} if recorded is None else judged(vehicle, recorded, flight, fault, size)
 
     fill(out, report, report["rows"], trials, row_of)
