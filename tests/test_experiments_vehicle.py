@@ -71,6 +71,16 @@ def test_verdicts(capsys, tmp_path):
     assert "spoiled flights" in capsys.readouterr().out
 
 
+def test_the_response_at_the_true_parameters(capsys, tmp_path):
+    cases = {"gusts": [2.5], "effects": ["motors"], "sample_times": ["8 ms"]}
+    report = result_of(tmp_path, "verdicts", "response", flights=2, duration=16.0, **cases)
+    for row in report["rows"]:
+        assert [*row["responses"]] == ["4 ms", "8 ms", "16 ms", "32 ms"]
+        for ratio, error in (row["responses"]["8 ms"][axis] for axis in ("roll", "pitch")):
+            assert abs(np.log(ratio)) < 3.5 * error < 0.5
+    assert "motors, 8 ms" in capsys.readouterr().out
+
+
 def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
     random = np.random.default_rng(0)
     states = random.normal(0, 0.2, (500, 12))

@@ -8,6 +8,7 @@ import pytest
 
 import jaxos4
 from experiments.sample_times.run import VEHICLE as CINERAT
+from jaxos4.closed_loop import fly_standard
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.shooting import InnovationsProblem
@@ -143,6 +144,15 @@ def test_a_search_counts_as_noise_what_the_feedthroughs_that_it_found_explain(rn
     np.testing.assert_array_equal(again.parts.passed, passed)
     np.testing.assert_allclose(again.cost, found.cost, atol=3e-3)
     assert search(problem.passing(nothing)).cost < found.cost
+
+
+def test_samples_of_the_log_itself_have_no_feedthrough():
+    """No torque before an instant answers what is measured at it; a mean holds answers to its own noise."""
+    flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0), duration=16.0, seed=0)
+    own, longer = prepare_vehicle(as_recordings(flight), CINERAT, jaxos4.VehicleSettings()).data[:2]
+    assert not np.asarray(own.likelihood.input_innovations).any()
+    assert np.asarray(longer.likelihood.input_innovations).any()
+    assert own.likelihood.input_innovations.shape == longer.likelihood.input_innovations.shape  # they share a program
 
 
 @pytest.mark.slow

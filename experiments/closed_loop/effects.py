@@ -83,13 +83,13 @@ def effect_of(kind: str, random: np.random.Generator) -> Effect:
     return Effect(air, sensors, loop, motor, fastest, max(e.log_every for e in every), every[0].logged)
 
 
-def flights_of(kind: str, flights: int, duration: float, seed: int) -> list[jaxos4.Flight | None]:
+def flights_of(kind: str, flights: int, duration: float, seed: int, gust: float = GUST) -> list[jaxos4.Flight | None]:
     """The flights of a case, in batches of `CHUNK`; `None`: the vehicle is lost."""
     loops, keys = [], []
     for i in range(flights):
         effect = effect_of(kind, np.random.default_rng([seed, i]))
         vehicle = eqx.tree_at(lambda a: a.max_rotor_speed, VEHICLE, VEHICLE.max_rotor_speed * effect.fastest)
-        settings = {"gust": GUST, "rotor_lag": LAG, "rotor_delay": DELAY, **effect.loop}
+        settings = {"gust": gust, "rotor_lag": LAG, "rotor_delay": DELAY, **effect.loop}
         settings |= {name: 1 - below for name, below in effect.motor.items()}
         loop = jaxos4.ClosedLoop(
             vehicle,

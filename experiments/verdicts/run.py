@@ -21,6 +21,7 @@ from experiments.closed_loop.effects import ALL, EFFECTS, flights_of
 from experiments.closed_loop.run import VEHICLE
 from experiments.fits import INERTIAS, given_airframe
 from experiments.monte_carlo import Row, continued, fill, print_table
+from jaxos4 import FrequencyResponse
 from jaxos4.errors import InputError
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification.verdict import IDENTIFIED
@@ -193,10 +194,15 @@ def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault
                 row[name] = {"error": value.estimate / truth - 1, "std": value.std / truth}
                 row[name]["status"] = found.verdicts[name].status
         if found.response is not None:
-            agreements = {axis: one.agreement() for axis, one in found.response._asdict().items()}
-            row["response"] = {axis: [x.ratio, x.error] for axis, x in agreements.items() if np.isfinite(x.ratio)}
+            row["response"] = agreements(found.response)
     named = None if fault is None or not fault.cause else any(fault.cause in cause for cause in causes)
     return row | {"named": named, "causes": causes, "seconds": time.perf_counter() - begin}
+
+
+def agreements(response: FrequencyResponse) -> dict[str, list[float]]:
+    """The mean gain of each axis with a clear response, and the standard deviation of its logarithm."""
+    every = {axis: one.agreement() for axis, one in response._asdict().items()}
+    return {axis: [one.ratio, one.error] for axis, one in every.items() if np.isfinite(one.ratio)}
 
 
 def counts(rows: list[Row]) -> dict[str, int]:
@@ -245,6 +251,21 @@ def errors_of(groups: dict[str, list[Row]]) -> Iterator[tuple[str, ...]]:
         yield name, *cells
 
 
+def print_responses(title: str, groups: dict[str, list[Row]]) -> None:
+    """For each group of flights and axis: the mean logarithm of the gain, and how many intervals hold 1."""
+    lines = []
+    for name, rows in groups.items():
+        for axis in FrequencyResponse._fields:
+            every = [row["response"][axis] for row in rows if axis in row.get("response", {})]
+            logs, errors = np.log([ratio for ratio, _ in every]), np.array([error for _, error in every])
+            if every:
+                held = int((np.abs(logs) < NINETY_FIVE * errors).sum())
+                mean = f"{logs.mean():.3f} +- {logs.std() / np.sqrt(len(every)):.3f}"
+                lines.append((name, axis, str(len(every)), mean, f"{np.median(errors):.2f}", share(held, len(every))))
+    headings = "case", "axis", "flights", "mean log gain", "median error", "interval holds 1 [%]"
+    print_table(title, headings, lines, width=140)
+
+
 def print_tables(rows: list[Row]) -> None:
     """A line for each case, and how often the intervals of the frequency response hold 1 in good flights.
 
@@ -272,15 +293,7 @@ def print_tables(rows: list[Row]) -> None:
         errors_of(unspoiled),
         width=160,
     )
-    lines = []
-    for axis in ("roll", "pitch", "yaw"):
-        every = [r["response"][axis] for r in good if axis in r.get("response", {})]
-        logs, errors = np.log([x for x, _ in every]), np.array([x for _, x in every])
-        if every:
-            held = int((np.abs(logs) < NINETY_FIVE * errors).sum())
-            lines.append((axis, str(len(every)), f"{logs.mean():.3f}", share(held, len(every))))
-    headings = "axis", "flights", "mean log gain", "interval holds 1 [%]"
-    print_table("frequency response of good flights", headings, lines, width=140)
+    print_responses("frequency response of good flights", {"good flights": good})
 
 
 def main(

@@ -22,7 +22,7 @@ from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, def
 from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from ..shooting.feedthrough import input_innovations
+from ..shooting.feedthrough import FEEDTHROUGHS, input_innovations
 from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Clock, Data, HeldOut, Progress
@@ -234,6 +234,8 @@ def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.nda
     flight = shooting.flight
     if flight.within is None:
         return None
+    if float(flight.averaging_time) == 0.0:
+        return np.zeros((capacity, FEEDTHROUGHS, 3))  # no torque before an instant answers it
     samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
     torque = np.square(np.asarray(flight.within)) @ mixer[:3].T
     stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)

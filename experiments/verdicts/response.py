@@ -1,0 +1,75 @@
+"""Does the frequency response of a right model hold 1? Nothing is fitted: the model has the true parameters.
+
+The flights are those of `closed_loop/effects.py`, in gusts of several strengths, and with those effects that the model
+can describe exactly or that are effects of the sensors.
+"""
+
+import functools
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+
+import jaxos4
+from experiments.closed_loop.effects import EFFECTS, GUST, flights_of
+from experiments.closed_loop.run import DELAY, LAG, VEHICLE
+from experiments.monte_carlo import Row, continued, fill
+from experiments.verdicts.run import LOST, agreements, print_responses
+from jaxos4.models.terms import default_terms
+from jaxos4.recording import Recording
+from jaxos4.recording.prepared import prepare
+
+
+def true_parameters(model: jaxos4.FlightModel, kind: str) -> jax.Array:
+    """The parameters of a model of `VEHICLE` that are true in a flight of this kind."""
+    own = {"rotor_lag": LAG, "rotor_delay": DELAY, "thrust_curve": 1.0, "motor_braking": 1.0, "z_drag": 0.0}
+    own |= {name: 1 - below for name, below in EFFECTS[kind].motor.items()}
+    values = zip(model.parameter_names, np.asarray(model.alpha).tolist(), strict=True)
+    return jnp.array([own.get(name, value) for name, value in values])
+
+
+def answered(flight: jaxos4.Flight, kind: str) -> Row:
+    """The mean gain of each axis, and its error, at each sample time."""
+    found = {}
+    for prepared in prepare([Recording.of(flight, kind)], VEHICLE, holdout=0.0):
+        model = jaxos4.FlightModel(VEHICLE, terms=default_terms(prepared.available), recordings=prepared.recordings)
+        problem = jaxos4.ShootingProblem(model, prepared.fitted, sigma=np.ones(12), channels="rates", method="rk4")
+        response = jaxos4.frequency_response(problem, true_parameters(model, kind))
+        found[f"{1e3 * float(prepared.fitted.dt):.3g} ms"] = agreements(response)
+    return {"responses": found}
+
+
+def main(
+    flights: Annotated[int, typer.Option(help="Number of flights of each case.")] = 200,
+    gusts: Annotated[list[float], typer.Option(help="Their strengths, without other effects [rad/s^2].")] = (
+        *(2.5, 5.0, 10.0),
+    ),
+    effects: Annotated[list[str], typer.Option(help="Other effects, in gusts of 5 rad/s^2.")] = (
+        *("own gyro", "fast controller", "filters", "rotor speeds", "dropouts", "bad samples", "motors"),
+    ),
+    sample_times: Annotated[list[str], typer.Option(help="Those of the table.")] = ("4 ms", "8 ms"),
+    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Random seed of references, gusts, noise and effects.")] = 48,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+) -> None:
+    """Count how often the intervals of the frequency response hold 1 at the true parameters."""
+    report = continued(out, {"duration": duration, "seed": seed}, "rows")
+    kinds = [("gusts", gust) for gust in gusts] + [(kind, GUST) for kind in effects]
+    flown = functools.cache(lambda kind, gust: flights_of(kind, flights, duration, seed, gust))
+    trials = ({"kind": kind, "gust": gust, "flight": i} for kind, gust in kinds for i in range(flights))
+
+    def row_of(kind: str, gust: float, flight: int) -> Row:
+        recorded = flown(kind, gust)[flight]
+        return {"result": LOST} if recorded is None else answered(recorded, kind)
+
+    fill(out, report, report["rows"], trials, row_of)
+    groups: dict[str, list[Row]] = {}
+    for row in report["rows"]:
+        name = f"gusts of {row['gust']:g}" if row["kind"] == "gusts" else row["kind"]
+        for step in sample_times:
+            own = row.get("responses", {}).get(step, {})
+            groups.setdefault(f"{name}, {step}", []).append({"response": own})
+    print_responses("frequency response at the true parameters", groups)
