@@ -12,8 +12,7 @@ from typer import Argument, Option
 import jaxos4
 
 from ..errors import InputError, printable
-from ._options import ESTIMATORS
-from ._output import check_outputs, stages
+from ._shared import ESTIMATORS, check_outputs, stages
 
 
 def study(

@@ -113,7 +113,7 @@ class Messages:
     def table(
         self, rates: Series, rotors: Series, others: Mapping[Names, Series | None], **facts: Any
     ) -> tuple[RowPositions, Table]:
-        """The gyro's samples as rows, at 1 kHz at most, with rotors and `others` brought to them, without impossible samples.
+        """Rows at the times of the gyro, at most 1 kHz, with rotors and `others` brought to them, if possible.
 
         Series are in our units and frame. Rotor speeds are measured if `omega1` has a name, and else commands [0..1].
         `others`: by the names of their columns; `None`: not logged. `facts`: more fields of `LogFacts`.
