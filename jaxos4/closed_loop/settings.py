@@ -237,7 +237,13 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Ar
     if sensors is not None:
         omega, step = omega + sensors.speed_noise * jax.random.normal(keys[0], omega.shape), sensors.speed_step
         omega = jnp.where(step > 0, step * jnp.round(omega / jnp.where(step > 0, step, 1.0)), omega)
-        rates, specific = _lossy(sensors, rates, specific, keys[1])
+        bad_key, lost_key = jax.random.split(keys[1])
+        measured = jnp.concatenate([rates, specific], axis=1)
+        draw = jax.random.uniform(bad_key, measured.shape)
+        beyond = jnp.append(jnp.sort(draw.ravel()), 1.0)[sensors.bad_samples.astype(int)]
+        measured = jnp.where(draw < beyond, sensors.impossible, measured)
+        lost = jax.random.uniform(lost_key, (len(measured), 2)) < sensors.dropouts
+        rates, specific = jnp.split(jnp.where(jnp.repeat(lost, 3, axis=1), jnp.nan, measured), 2, axis=1)
     if sensors is not None and motion.velocity is not None:
         velocity = jnp.stack(to_earth(motion.attitude, motion.velocity), axis=1)
         noise = sensors.velocity_noise * jax.random.normal(keys[2], velocity.shape)
@@ -254,15 +260,3 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Ar
         commanded=commands,
         held=commands,
     )
-
-
-def _lossy(sensors: Sensors, rates: Array, specific: Array, key: Key) -> tuple[Array, Array]:
-    """Body rates and specific force with impossible values and gaps."""
-    bad_key, lost_key = jax.random.split(key)
-    measured = jnp.concatenate([rates, specific], axis=1)
-    draw = jax.random.uniform(bad_key, measured.shape)
-    beyond = jnp.append(jnp.sort(draw.ravel()), 1.0)[sensors.bad_samples.astype(int)]
-    measured = jnp.where(draw < beyond, sensors.impossible, measured)
-    lost = jax.random.uniform(lost_key, (len(measured), 2)) < sensors.dropouts
-    measured = jnp.where(jnp.repeat(lost, 3, axis=1), jnp.nan, measured)
-    return measured[:, :3], measured[:, 3:]
