@@ -55,10 +55,7 @@ def option_names(**files: Path | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """Shows a stage and the time, and a bar if there is a `total`. Shows nothing if stderr is no terminal.
-
-    Yields a function that changes the stage, and what is done of the total.
-    """
+    """Shows a stage, the time, and a bar if there is a `total`, on a terminal. Yields a function that changes them."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

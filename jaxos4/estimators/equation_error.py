@@ -254,10 +254,7 @@ class EquationError(AbstractEstimator):
     bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
-
-        **Raises:** `ValueError` for a wrong bracket, or a model that is not linear in its free parameters.
-        """
+        """Identifies one flight. Raises `ValueError` for a wrong bracket, or free parameters that are not linear."""
         mask, parameters = problem.unknowns.free, problem.model.parameters
         free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
         if any(each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):

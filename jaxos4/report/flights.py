@@ -33,10 +33,7 @@ _WORDS = {
 
 
 def print_design(console: Console, found: Design, accuracy: float) -> None:
-    """Print the table, the gain, the share of the limits that is used, and how long to fly.
-
-    `accuracy`: the wanted standard deviation of each target, as a share of its scale.
-    """
+    """Print the table, the gain, the use of limits, and how long to fly for an `accuracy`, as a share of each scale."""
     task, rows = found.task, []
     unexcited, targets, compared, _ = _WORDS[task.kind]
     every = {"designed": found.designed, **found.standard}
