@@ -11,14 +11,13 @@ import os
 def add_flags(*, quick: bool = False) -> None:
     """Adds flags to `XLA_FLAGS`, each unless the user has set its option. No result changes.
 
-    - Loops whose step moves less than a gigabyte become native functions. Larger ones keep XLA's threads.
-    - Loops over 16 lanes stay loops: LLVM turns a loop into vectors, but not the scalar code that it unrolls it to.
-    - Vectors are as wide as the processor's.
-    - `quick`: XLA's older way to write loops, for a command that computes a single flight. Programs compile in two
-      thirds of the time, and that of one flight runs faster, by a tenth; that of a batch takes half as long again.
+    - Loops whose step moves less than a gigabyte become native functions. Loops over 16 lanes stay loops, which LLVM
+      turns into vectors, as wide as the processor's.
+    - `quick`: XLA's older way to write loops, for a command that computes a single flight: it compiles in two thirds of
+      the time, and runs a batch half as long again.
 
-    Nothing is added if `JAXOS4_NO_XLA_OPTIONS` is set, or if `XLA_FLAGS` is the name of a file with flags. Flags have
-    no effect if JAX has computed before.
+    Nothing is added if `JAXOS4_NO_XLA_OPTIONS` is set, or if `XLA_FLAGS` names a file. Flags have no effect if JAX has
+    computed before.
     """
     options = {
         "xla_cpu_small_while_loop_byte_threshold": (

@@ -69,21 +69,24 @@ class Comparison(NamedTuple):
 def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Comparison:
     """Compare results of repeated flights quantity by quantity.
 
-        jaxos4.compare_results(["monday.json", "tuesday.json"]).different
+    jaxos4.compare_results(["monday.json", "tuesday.json"]).different
 
-    The test is that of equality of independent estimates with known standard deviations: chi-squared, with one degree
-    of freedom less than results. Mass and arms are the same in all results, so that agreement says nothing about them.
+    The test is chi-squared, of the equality of independent estimates with known standard deviations. Mass and arms are
+    the same in all results, so that agreement says nothing about them.
 
     - `results`: two or more, of `jaxos4.identify`, or files of `jaxos4 estimate --out`; all of one kind of model.
     - `level`: see `Comparison`.
 
-    **Raises:** `InputError` for fewer than two results, results of several models, or a file that is no result;
-    `OSError` if a file cannot be read.
+    **Raises:** `InputError` for other results; `OSError` if a file cannot be read.
     """
     if len(results) < 2:
         raise InputError(f"a comparison needs two results or more, got {len(results)}.")
     every = [each if isinstance(each, Identification) else read_result(each) for each in results]
-    names = _names(results, every)
+    # Of files, without their folders if these differ; without a file, those of the logs.
+    paths = ["" if isinstance(each, Identification) else os.fspath(each) for each in results]
+    short = [Path(path).name for path in paths]
+    named = zip(short if len({*short}) == len({*paths}) else paths, every, strict=True)
+    names = tuple(printable(name) or ", ".join(each.logs) for name, each in named)
     for name, each in zip(names, every, strict=True):
         if each.model != every[0].model:
             raise InputError(
@@ -112,14 +115,6 @@ def _compared(name: str, answers: list[PhysicalQuantity | None]) -> ComparedQuan
         error = float(std.min() / np.sqrt(weight.sum()) * np.sqrt(max(chi2 / max(free, 1), 1.0)))
     tests = (chi2, float(chdtrc(free, chi2))) if free else (np.nan, np.nan)
     return ComparedQuantity(name, unit, tuple(answers), used, mean, error, *tests)
-
-
-def _names(results: Sequence[Source], every: Sequence[Identification]) -> tuple[str, ...]:
-    """The names of files, without their folders if these differ; without a file, those of the logs."""
-    paths = ["" if isinstance(each, Identification) else os.fspath(each) for each in results]
-    short = [Path(path).name for path in paths]
-    chosen = short if len({*short}) == len({*paths}) else paths
-    return tuple(printable(name) or ", ".join(each.logs) for name, each in zip(chosen, every, strict=True))
 
 
 def _notes(names: Sequence[str], every: Sequence[Identification], *, same: float = 1e-3) -> list[str]:

@@ -228,10 +228,7 @@ class AbstractRecursion(AbstractEstimator):
         """Identifies one flight, or a block of flights, in the problem's own bracket."""
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
-
-        **Raises:** `ValueError` for a wrong bracket, windows, or a model with rotor or sensor terms.
-        """
+        """Identifies one flight. Raises `ValueError` for a wrong bracket, windows, or rotor or sensor terms."""
         if problem.windows > 1:
             remedy = f"got {problem.windows}: use an estimator that shoots"
             raise ValueError(f"`problem.windows` must be 1 for this estimator, {remedy}.")

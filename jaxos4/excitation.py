@@ -191,15 +191,11 @@ def random_references(
 ) -> References:
     """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
 
-    Each steps every half second, one after another. Accelerations come in pairs of opposite sign. So the vehicle gains
-    little vertical velocity, as in a real flight.
+    Each steps every half second, one after another. Accelerations come in pairs of opposite sign, for little vertical
+    velocity. The first and the last second are level.
 
-    **Arguments:**
-
-    - `duration`, `dt`: length and sample time [s].
+    - `duration`, `dt`: length and sample time [s]; there are round(duration / dt) + 1 rows.
     - `amplitude`: levels are uniform between -amplitude and amplitude: roll, pitch, yaw [rad], acceleration [m/s^2].
-
-    **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
 
     **Raises:** `ValueError` that names the argument.
     """

@@ -59,7 +59,9 @@ class ConstantBias(AbstractNoise):
 
 
 class GaussMarkov(AbstractNoise):
-    """Coloured errors: a stationary first-order process with autocorrelation sigma^2 exp(-|tau| / T), exact at samples.
+    """Coloured errors: a stationary first-order process with autocorrelation sigma^2 exp(-|tau| / T).
+
+    The samples are exact: e_{k+1} = a e_k + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T) and w_k standard normal.
 
     - `sigma`: standard deviation for each state, in `STATE_UNITS`.
     - `correlation_time`: T [s] for each state, positive. Infinite: a constant bias.

@@ -67,11 +67,9 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
             "airframe": airframe_from_table(fields["airframe"]),
             "rigid_body": RigidBody(constants, tests.pop("consistency_p", None), tests.pop("rigid_body", None)),
             "is_vehicle": fields["model"] == "flight",
-            "predictions": _predictions(fields["predictions"]),
-            "response": _response(fields["response"]),
-            "traces": _traces(fields["traces"]),
-            "correlations": _correlations(fields["correlations"]),
         }
+        checked = {"predictions": _predictions, "response": _response, "traces": _traces, "correlations": _correlations}
+        fields |= {name: check(fields[name]) for name, check in checked.items() if fields[name] is not None}
         found = Identification(**fields)
         if problem := next(_problems(found, tests), None):
             raise InputError(f"{problem}; {_AGAIN}")
@@ -147,9 +145,7 @@ def _arrays(kind: type, table: dict[str, Any], place: str) -> dict[str, Any]:
     return arrays
 
 
-def _traces(table: dict[str, Any] | None) -> Traces | None:
-    if table is None:
-        return None
+def _traces(table: dict[str, Any]) -> Traces:
     arrays = _arrays(Traces, table, "traces")
     channels, simulated = arrays["measured"].shape[1], arrays["predicted"].shape[1]
     spatial = {arrays[name].shape[1] for name in ("position", "disturbance")}
@@ -164,18 +160,14 @@ def _traces(table: dict[str, Any] | None) -> Traces | None:
     return Traces(**arrays)
 
 
-def _correlations(table: dict[str, Any] | None) -> Correlations | None:
-    if table is None:
-        return None
+def _correlations(table: dict[str, Any]) -> Correlations:
     arrays = _arrays(Correlations, table, "correlations")
     if arrays["own"].shape[0] not in CHANNELS.values() or arrays["with_torque"].shape[2] % 2 == 0:
         raise InputError(f"`correlations`: has channels that no model has; {_AGAIN}")
     return Correlations(**arrays)
 
 
-def _predictions(table: dict[str, Any] | None) -> Predictions | None:
-    if table is None:
-        return None
+def _predictions(table: dict[str, Any]) -> Predictions:
     arrays = _arrays(Predictions, table, "predictions")
     start, horizons = arrays["start"], arrays["horizons"]
     usable = start.size and (start >= 0).all() and (start < 1 << 40).all() and (np.diff(start) >= 1).all()
@@ -184,9 +176,7 @@ def _predictions(table: dict[str, Any] | None) -> Predictions | None:
     return Predictions(**arrays | {"start": start.astype(int)})
 
 
-def _response(table: dict[str, dict[str, Any]] | None) -> FrequencyResponse | None:
-    if table is None:
-        return None
+def _response(table: dict[str, dict[str, Any]]) -> FrequencyResponse:
     axes = {}
     for name in FrequencyResponse._fields:
         arrays = axes[name] = _arrays(AxisResponse, table.get(name, {}), f"response.{name}")

@@ -12,7 +12,7 @@ from helpers import refused
 from px4_logs import everything
 
 import jaxos4
-from jaxos4.cli._output import in_options
+from jaxos4.cli._shared import in_options
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording

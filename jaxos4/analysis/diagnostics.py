@@ -32,20 +32,16 @@ class Diagnostics(eqx.Module):
     It is 1 for a channel with fewer than three measurements, or with rounding errors as its only residuals.
 
     - `feasible`: whether the trajectory did not fail before its end. If not, the other fields mean nothing.
-    - `count`: number of measured samples.
-    - `rms`: of the residuals, in the channel's unit.
-    - `percent`: 100 (1 - |y - x| / |y - mean y|). 100 is a perfect prediction, 0 is as good as the mean, or the channel
-      does not move.
-    - `level`: mean square of the weighted residuals (the *normalised innovation level*). 1: as large as the problem's
-      sigma.
-    - `level_p`: p-value of a level of 1, two-sided (chi-squared).
-    - `autocorrelation`: of residuals 1, 2, ... samples apart.
-    - `colour`: the autocorrelation at the first lag that has pairs of measured samples.
-    - `white_p`: p-value of white residuals (Ljung and Box 1978; each lag counts its pairs of measured samples, Stoffer
-      and Toloi 1992). 1 for several windows, whose fitted initial states correlate the residuals.
+    - `count`: number of measured samples. `rms`: of the residuals, in the channel's unit.
+    - `percent`: 100 (1 - |y - x| / |y - mean y|). 100 is a perfect prediction, 0 is as good as the mean, or no motion.
+    - `level`: mean square of the weighted residuals (the *normalised innovation level*). `level_p`: p-value of a level
+      of 1, two-sided (chi-squared).
+    - `autocorrelation`: of residuals 1, 2, ... samples apart. `colour`: that of the first lag with measured pairs.
+    - `white_p`: p-value of white residuals (Ljung and Box 1978; by measured pairs, Stoffer and Toloi 1992). 1 for
+      several windows, whose fitted initial states correlate the residuals.
     - `input_correlation`: with the roll, pitch and yaw torques, each at the lag with the largest correlation.
-    - `input_p`: p-value of residuals that depend on no torque at any lag. It allows for coloured residuals (Ljung,
-      System Identification, chapter 16) and is conservative (Bonferroni).
+    - `input_p`: p-value of residuals that depend on no torque at any lag, coloured or not (Ljung, System
+      Identification, chapter 16); conservative (Bonferroni).
     """
 
     feasible: bool

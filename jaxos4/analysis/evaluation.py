@@ -180,10 +180,7 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
 
 
 def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
-    """The covariance for stationary noise: R(t, s) depends on t - s only. The first axis of all arrays is time.
-
-    Lags reach to a tenth of the flight, with Bartlett's weights. Sums over lags are products of spectra.
-    """
+    """The covariance for stationary noise, with Bartlett's weights for lags up to a tenth of the flight; time first."""
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
     def products(x: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, "lags columns columns"]:

@@ -65,10 +65,7 @@ def filtered(
     stretch: Int[Numeric, " samples"],
     dt: Scalar,
 ) -> Filtered:
-    """The rates and disturbances at each sample. Filters begin anew in each stretch.
-
-    `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model.
-    """
+    """Rates and disturbances at each sample, anew in each stretch. `modelled`: p', q', r'; 0 for a specific force."""
     begins = jnp.diff(stretch, prepend=-1) != 0
     is_known, memory = ~jnp.isnan(measured), is_rate(measured.shape[1])
     gains = gains_of(Observed(measured[:, :, None], begins[:, None], begins[:, None]), noise, dt)

@@ -67,13 +67,10 @@ def predictions(
     disturbance: Float[np.ndarray, "samples 3"] | None = None,
     noise: LogNoise | None = None,
 ) -> Predictions:
-    """Predict the body rates from many starts, with the recorded rotor speeds.
+    """Predict the body rates from many `starts`, with the recorded rotor speeds. The velocity keeps its value there.
 
-    The velocity keeps its value at the start. See `starts` for the starts.
-
-    **Arguments:** `problem` gives model, flight and method; its windows and channels have no effect. `horizons` [s] are
-    positive. `disturbance` [rad/s^2]: fades from its value at the start, as the past lets expect, by the time constants
-    of `noise`; by default there is none.
+    `problem` gives model, flight and method; `horizons` [s] are positive. `disturbance` [rad/s^2]: fades from its value
+    at the start by the time constants of `noise`; by default there is none.
 
     **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """

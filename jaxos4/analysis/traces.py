@@ -33,10 +33,7 @@ class Traces(NamedTuple):
     start_log: Int[np.ndarray, " starts"]
 
     def thinned(self, most: int = 1200, *, digits: int = 5) -> "Traces":
-        """Every so many samples, `most` at most. Channels and rotors have so many significant `digits`.
-
-        Each sample has the first finite value of its block, because some channels are logged more rarely than others.
-        """
+        """At most `most` samples, each the first finite value of its block, with so many significant `digits`."""
         every = -(-self.time.size // most)
         blocks = np.arange(self.time.size) // every
         apart = self.log != self.log[::every][blocks]  # a block has the values of one log

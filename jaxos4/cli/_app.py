@@ -7,7 +7,6 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -39,8 +38,15 @@ def prepare(*, batch: bool) -> None:
         jax.config.update("jax_enable_compilation_cache", False)
         return
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        folder = _usable_folder()
-        if folder is None:
+        import platformdirs
+
+        # JAX removes the oldest programs only from a folder that has had a limit since its first one.
+        folder = platformdirs.user_cache_path("jaxos4", appauthor=False) / "compiled"
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError:
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", 1 << 30)  # 1 GB
@@ -48,21 +54,6 @@ def prepare(*, batch: bool) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
     # Another process may be writing the same program, or remove it: it is then compiled again.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
-
-
-def _usable_folder() -> Path | None:
-    """The folder of compiled programs; `None` if it cannot be written."""
-    import platformdirs
-
-    # JAX removes the oldest programs only from a folder that has had a limit since its first one.
-    folder = platformdirs.user_cache_path("jaxos4", appauthor=False) / "compiled"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-        return folder
-    except OSError:
-        return None
 
 
 _EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1: nothing is kept."

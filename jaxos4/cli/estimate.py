@@ -11,8 +11,8 @@ from typer import Argument, Option
 import jaxos4
 
 from ..errors import InputError, named, printable
-from . import _options as options
-from ._output import check_outputs, command, end, in_options, option_names, stages, write_json
+from . import _shared as options
+from ._shared import check_outputs, command, end, in_options, option_names, stages, write_json
 
 _OS4, _PUBLISHED = "os4", "published"
 # The defaults of `NetworkEstimator`, written out because its import takes seconds; a test compares them.

@@ -10,8 +10,8 @@ import jaxos4
 
 from .._files import check_writable, write_file
 from ..errors import InputError
-from . import _options as options
-from ._output import check_outputs, end, in_options, option_names, stages, write_folder, write_json
+from . import _shared as options
+from ._shared import check_outputs, end, in_options, option_names, stages, write_folder, write_json
 
 
 def export(

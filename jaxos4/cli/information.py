@@ -9,8 +9,8 @@ import jaxos4
 
 from .._files import write_file
 from ..errors import InputError
-from . import _options as options
-from ._output import check_outputs, command, in_options, option_names, stages, write_json
+from . import _shared as options
+from ._shared import check_outputs, command, in_options, option_names, stages, write_json
 
 
 def inspect(

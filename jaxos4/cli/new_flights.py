@@ -11,8 +11,8 @@ from typer import Option
 import jaxos4
 
 from ..errors import InputError, named
-from . import _options as options
-from ._output import check_outputs, end, option_names, stages
+from . import _shared as options
+from ._shared import check_outputs, end, option_names, stages
 
 OpenLoopModelOption = Annotated[options.Model | None, Option(help="Equations of motion. Default: published.")]
 DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
@@ -170,7 +170,7 @@ def design(
         found.task.write(found.designed, out)
     from rich.console import Console
 
-    from ..report.design_page import print_design, write_design
+    from ..report.flights import print_design, write_design
 
     if figure is not None:
         with stages("drawing"):

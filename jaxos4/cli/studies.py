@@ -12,8 +12,7 @@ from typer import Argument, Option
 import jaxos4
 
 from ..errors import InputError, printable
-from ._options import ESTIMATORS
-from ._output import check_outputs, stages
+from ._shared import ESTIMATORS, check_outputs, stages
 
 
 def study(
@@ -164,10 +163,7 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
 
 
 def comparison(*, quick: bool) -> "jaxos4.study.Study":
-    """The study that compares the estimators: the whole one, or a short one.
-
-    Training is short. The network loses accuracy; the hybrid does not, as its search only starts from a network.
-    """
+    """The study that compares the estimators, or a short one. A hybrid's search needs only a short training."""
     if quick:
         return jaxos4.study.Study(
             title="IBSS, network, hybrid and a Kalman filter under sensor noise, body rates alone, in short",

@@ -188,10 +188,7 @@ class Fleet(eqx.Module):
         return np.asarray(flights.omega), states, self.dt
 
     def envelope(self, references: Series, limits: Mapping[str, float]) -> Envelope:
-        """The limits that these references need, with some replaced. Limits of rotors are those of the airframe.
-
-        Raises `InputError` for a limit that is not positive, or if a vehicle turns over or cannot hover.
-        """
+        """The limits that these references need, with rotors by the airframe and some replaced. Raises `InputError`."""
         airframe, hover = self.loop.airframe, float(self.loop.airframe.hover_speed)
         slowest = self.slowest * hover
         fastest = float(airframe.max_rotor_speed) if airframe.has_full_scale else self.fastest * hover

@@ -122,6 +122,8 @@ class ReferenceTask(task.AbstractTask):
     signals: dict[str, Float[Numeric, "axes points coefficients"]]
     largest: Float[Numeric, "4"]
     basis: Float[Array, "points coefficients"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
     tones: Tones = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
@@ -132,16 +134,6 @@ class ReferenceTask(task.AbstractTask):
     def size(self) -> int:
         """A cosine and a sine for each tone of each reference."""
         return 8 * self.tones.number
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Ix, Iy and Iz, then the model's other parameters."""
-        return self.fleet.inertias_first(INERTIAS, self.fleet.model.parameter_names)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """The unit of each of `names`."""
-        return self.fleet.inertias_first(("kg m^2",) * 3, self.fleet.model.parameter_units)
 
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
@@ -235,6 +227,8 @@ def design_references(
     progress("flying tones")
     references = ReferenceTask(
         envelope=envelope,
+        names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
+        units=fleet.inertias_first(("kg m^2",) * 3, fleet.model.parameter_units),
         scale=np.asarray(loop.airframe.inertia),
         unexcited=ReferenceTask.little * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,

@@ -85,6 +85,8 @@ class RotorSpeedTask(task.AbstractTask):
     draws: Float[Array, "draws parameters"]
     weights: Float[Array, " sensors"]
     dt: Scalar
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
     start_is_known: bool = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
@@ -94,16 +96,6 @@ class RotorSpeedTask(task.AbstractTask):
     def size(self) -> int:
         """A coefficient for each tone of each acceleration."""
         return self.amplitudes.size
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The model's parameters."""
-        return self.model.parameter_names
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """The unit of each of `names`."""
-        return self.model.parameter_units
 
     def _omega(self, coefficients: Coefficients) -> RotorSpeeds:
         """The rotor speeds [rad/s]."""
@@ -257,6 +249,8 @@ def _of_bracket(model: AbstractModel, bracket: Bracket, key: Key) -> dict[str, A
     others = drawn(bracket, jax.random.fold_in(key, 1), RotorSpeedTask.averaged - 1)
     return {
         "model": model,
+        "names": model.parameter_names,
+        "units": model.parameter_units,
         "scale": np.asarray(bracket.half_width),
         "unexcited": np.asarray(model.half_width),
         "draws": jnp.concatenate([np.asarray(bracket.center)[None], others]),

@@ -99,6 +99,7 @@ class AbstractTask(eqx.Module):
     """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
+    - `names`, `units`: of each parameter, the targets first.
     - `scale`: for each target, a size of which accuracies are shares. `unexcited`: a parameter whose bound is not below
       this counts as not excited.
     """
@@ -106,6 +107,8 @@ class AbstractTask(eqx.Module):
     kind: ClassVar[str]
     vehicles: ClassVar[int]
     envelope: eqx.AbstractVar[Envelope]
+    names: eqx.AbstractVar[tuple[str, ...]]
+    units: eqx.AbstractVar[tuple[str, ...]]
     scale: eqx.AbstractVar[Float[Numeric, " targets"]]
     unexcited: eqx.AbstractVar[Float[Numeric, " parameters"]]
 
@@ -113,16 +116,6 @@ class AbstractTask(eqx.Module):
     @abc.abstractmethod
     def size(self) -> int:
         """The number of coefficients."""
-
-    @property
-    @abc.abstractmethod
-    def names(self) -> tuple[str, ...]:
-        """The name of each parameter, the targets first."""
-
-    @property
-    @abc.abstractmethod
-    def units(self) -> tuple[str, ...]:
-        """The unit of each of `names`."""
 
     @abc.abstractmethod
     def objective(self, coefficients: Coefficients) -> Scalar:

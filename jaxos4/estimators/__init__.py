@@ -1,7 +1,4 @@
-"""Estimators: from a `ShootingProblem` and a `Bracket` to an `Estimate`. Each algorithm has its own file.
-
-The names are in `__init__.pyi`. Each is imported when it is first used: an estimate needs one estimator, not all.
-"""
+"""Estimators: from a `ShootingProblem` and a `Bracket` to an `Estimate`. `__init__.pyi` names them."""
 
 import lazy_loader
 

@@ -44,23 +44,19 @@ class AntColony(AbstractSolver[Colony]):
     It finds the optimum of the other methods that shoot, with many times their rollouts, and so shows what derivatives
     are worth. Use another method if the initial state is free: it adds 3 to 12 unknowns for each window.
 
-    - `archive`: number of points in the archive. The first is the bracket's center, the others are uniform in the
-      bracket.
+    - `archive`: number of points. The first is the bracket's center, the others are uniform in the bracket.
     - `ants`: number of new points in each sweep. They are simulated in parallel.
-    - `q`: how many of the points are chosen, as a share of the archive. The weight of a choice is a Gaussian of the
-      point's rank, with this standard deviation and a mean at the best point.
-    - `xi`: standard deviation of an ant's step, in mean distances of the archive from its point. Smaller values
-      contract the archive faster.
+    - `q`: the weight of a choice is a Gaussian of the point's rank, with this standard deviation, as a share of the
+      archive.
+    - `xi`: standard deviation of an ant's step, in mean distances of the archive from its point.
     - `tolerance`: the search ends once the worst point of the archive costs at most this much more than the best one.
-      The cost is the negative logarithm of a likelihood: an error of one standard deviation costs 0.5.
+      An error of one standard deviation costs 0.5.
     - `max_sweeps`: the search ends after this many sweeps at the latest.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     - `shares`: see `AbstractProblem.stages`; by default the likelihood is searched as a whole.
 
-    The estimate's `rollouts` count each point that was simulated, and the Fisher information at the answer. The
-    covariance is the inverse of this information, the only use of derivatives.
-
-    All flights have the same random numbers.
+    `rollouts` count each point, and the Fisher information at the answer, whose inverse is the covariance. All flights
+    have the same random numbers.
     """
 
     shoots: ClassVar[bool] = True
@@ -87,8 +83,16 @@ class AntColony(AbstractSolver[Colony]):
 
     def step(self, stage: Stage, state: Colony) -> Colony:
         """One sweep: the ants' points replace the worst of the archive."""
-        new = self._sample(state.points, jax.random.fold_in(self._keys[0], state.sweeps))
-        points = jnp.concatenate([state.points, new])
+        points = state.points
+        basis_key, choice_key, step_key = jax.random.split(jax.random.fold_in(self._keys[0], state.sweeps), 3)
+        log_weights = -0.5 * jnp.square(jnp.arange(self.archive) / (self.q * self.archive))
+        chosen = jax.random.categorical(choice_key, log_weights, shape=(self.ants,))
+        basis = _directions(points - points[chosen[0]], basis_key)
+        along = (points[:, None, :] * basis).sum(axis=-1)
+        distances = jnp.abs(along - along[chosen][:, None]).sum(axis=1) / (self.archive - 1)
+        steps = self.xi * distances * jax.random.normal(step_key, distances.shape, dtype=float)
+        new = jnp.clip(points[chosen] + (steps[:, :, None] * basis).sum(axis=1), -REACH, REACH)
+        points = jnp.concatenate([points, new])
         costs = jnp.concatenate([state.costs, self._shoot(stage, state.start, new)])
         return Colony(*self._best(points, costs), state.start, state.sweeps + 1)
 
@@ -129,17 +133,6 @@ class AntColony(AbstractSolver[Colony]):
         """Whether the costs of the archive agree, within their rounding errors, or none is finite."""
         tolerance = self.tolerance + ROUNDING * jnp.finfo(costs.dtype).eps * costs[0]
         return ~(costs[-1] - costs[0] > tolerance)
-
-    def _sample(self, points: Points, key: Key) -> Float[Array, "ants unknowns"]:
-        """A new point of each ant."""
-        basis_key, choice_key, step_key = jax.random.split(key, 3)
-        log_weights = -0.5 * jnp.square(jnp.arange(self.archive) / (self.q * self.archive))
-        chosen = jax.random.categorical(choice_key, log_weights, shape=(self.ants,))
-        basis = _directions(points - points[chosen[0]], basis_key)
-        along = (points[:, None, :] * basis).sum(axis=-1)
-        distances = jnp.abs(along - along[chosen][:, None]).sum(axis=1) / (self.archive - 1)
-        steps = self.xi * distances * jax.random.normal(step_key, distances.shape, dtype=float)
-        return jnp.clip(points[chosen] + (steps[:, :, None] * basis).sum(axis=1), -REACH, REACH)
 
 
 def _directions(differences: Points, key: Key) -> Float[Array, "unknowns unknowns"]:

@@ -228,22 +228,20 @@ def _prior(count: int) -> Matrix:
 class EquationError(AbstractEstimator):
     """Least squares of differentiated body rates on the regressors of the rate equations, in one step.
 
-    The rate equations must be linear in the parameters. Their derivatives with respect to the parameters, at the
-    measured rates, are the regressors. Only the body rates are used, but the estimate's cost counts all of the
-    problem's channels. A free initial state is fitted to the parameters afterwards.
+    The rate equations must be linear in the parameters: their derivatives at the measured rates are the regressors.
+    Only the body rates are used; the cost counts all channels. A free initial state is fitted to the parameters
+    afterwards.
 
-    - `memory`: how the rates are differentiated, from 0 to 1. The mean of the earlier samples is subtracted, in which
-      each sample weighs `memory` times its successor. 0 gives plain forward differences (ordinary least squares); 1
-      gives the integrated regression, generalised least squares for white noise of the rates. 1 has the smallest
-      errors on the standard flight.
+    - `memory`: how the rates are differentiated, from 0 to 1: the mean of the earlier samples is subtracted, in which
+      each weighs `memory` times its successor. 0: forward differences (ordinary least squares); 1: the integrated
+      regression, generalised least squares for white noise of the rates.
     - `bridge`: a gap of up to this many samples in a rate is bridged by a straight line in the regressors. A longer gap
       splits the integration in two.
 
     A known initial state is exact for a `memory` of 1, and one more sample for a smaller one. Without noise the answer
-    is exact for forward Euler; for another `method` the trapezoidal rule leaves a small error.
-
-    The covariance contains the white noise of the problem's `sigma` in regressors and outputs, to first order, but
-    neither the bias nor forces that the model lacks. Without measurements of a rate the result is `unidentifiable`.
+    is exact for forward Euler; for another `method` the trapezoidal rule leaves a small error. The covariance has the
+    white noise of `sigma` in regressors and outputs, to first order, but neither the bias nor forces that the model
+    lacks.
 
     References: Klein and Morelli, Aircraft System Identification, ch. 5; Jategaonkar, Flight Vehicle System
     Identification, ch. 6; Ljung, System Identification, section 7.3.
@@ -256,10 +254,7 @@ class EquationError(AbstractEstimator):
     bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
-
-        **Raises:** `ValueError` for a wrong bracket, or a model that is not linear in its free parameters.
-        """
+        """Identifies one flight. Raises `ValueError` for a wrong bracket, or free parameters that are not linear."""
         mask, parameters = problem.unknowns.free, problem.model.parameters
         free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
         if any(each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):
@@ -286,18 +281,16 @@ class EquationError(AbstractEstimator):
 class RecursiveLeastSquares(AbstractRecursion):
     """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
 
-    The recursion carries the normal matrix and its right-hand side, which stay symmetric and positive in single
-    precision. A parameter stays at the bracket's center until it is excited.
+    The recursion carries the normal matrix and its right-hand side. A parameter stays at the bracket's center until it
+    is excited.
 
-    - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1. The estimate describes the
-      last 1 / (1 - forgetting) samples or so, and follows parameters that change within this time. With the default of
-      1 nothing is forgotten, and the last estimate is that of `EquationError` with the same settings.
-    - `memory`, `bridge`: as in `EquationError`. A `forgetting` below 1 also forgets the means, and a known initial
-      state then counts like one sample.
+    - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1: the estimate describes the
+      last 1 / (1 - forgetting) samples or so. With 1 the last estimate is that of `EquationError`.
+    - `memory`, `bridge`: as in `EquationError`. With a `forgetting` below 1 a known initial state counts like one
+      sample.
 
-    The estimate's `history` holds the parameters after each sample; its last row is `parameters`. Rows inside a bridged
-    gap are known only after the gap. The covariance is that of the last estimate, without its lag behind parameters
-    that change.
+    `history` holds the parameters after each sample; rows inside a bridged gap are known only after the gap. The
+    covariance is that of the last estimate, without its lag behind parameters that change.
 
     Reference: Ljung, System Identification, section 11.2, with exponential forgetting.
     """

@@ -28,18 +28,17 @@ _UNEXPLAINED = 5.0
 class Hybrid(AbstractEstimator):
     """IBSS near the answer of a network.
 
-    The network's answer, the *seed*, and its covariance open the first brackets, against all of the problem's channels
-    at once. The search for a free initial state begins at the network's estimate of it; what the network does not
-    look at begins at the first measurements. If the search shows that the seed was wrong, or if the network had no
-    answer, IBSS searches the whole bracket, as without a network. The better answer is returned.
+    The network's answer, the *seed*, and its covariance open the first brackets, against all of the problem's channels;
+    what the network does not look at begins at the first measurements. If the search shows that the seed was wrong, or
+    if the network had no answer, IBSS searches the whole bracket too. The better answer is returned.
 
     The estimate's `seed` is the bracket of the network's 99.9 % intervals for all parameters at once. `rollouts` are
     those of network and search together.
 
     - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
     - `ibss`: how to search.
-    - `seen`: the part of the flight that the network looks at; by default the shooting problem that is searched, or
-      that of the innovations. It may differ from the training problem only in the measured values.
+    - `seen`: the part of the flight that the network looks at, by default the shooting problem. It may differ from the
+      training problem only in the measured values.
     """
 
     shoots: ClassVar[bool] = True

@@ -156,10 +156,7 @@ class IBSS(AbstractSolver[State]):
         return Found(state.unknowns, state.model, spread, state.sweeps, state.rollouts, state.done)
 
     def _look_around(self, stage: Stage, unknowns: WindowUnknowns, model: LocalModel) -> Directions:
-        """The directions in which the cost is nearly separable, and the steps that the local model predicts.
-
-        The information of the bracket is added for an unknown without a prior. The cost does not contain it.
-        """
+        """The directions in which the cost is nearly separable, and predicted steps; the bracket is information."""
         of_bracket, (windows, _) = 1 / jnp.square(stage.off / 2), unknowns.shape
         shared = of_bracket[:, : stage.unknowns.count] / windows
         has_prior, of_stride = stage.unknowns.precision > 0, self.damping / jnp.square(stage.unknowns.stride)

@@ -63,12 +63,10 @@ class SVSF(AbstractRecursion):
       with less influence than the greatest. With 1, the gyroscopic terms hardly move.
     - `passes`: number of passes over the flight. Each begins with the parameters of the pass before (iterative SVSF).
 
-    The answer is the mean of the parameters over the second half of the last pass; `history` holds the parameters of
-    that pass. Only the body rates are used. A free initial state is fitted to the parameters at the end.
-
-    The method gives no covariance. Ours follows the errors through the slope of each correction, from the bracket's
-    half-widths on (in the manner of Gadsden and Habibi 2010). It ignores that all passes see the same noise: only its
-    size is right. A pass counts as one rollout for each rate and parameter, and one for the state.
+    The answer is the mean of the parameters over the second half of the last pass, whose parameters are the `history`.
+    A free initial state is fitted to them at the end. The method gives no covariance: ours follows the errors through
+    the slope of each correction (in the manner of Gadsden and Habibi 2010), and only its size is right, as all passes
+    see the same noise.
 
     Reference: Habibi 2007, Proc. IEEE 95(5), 1026-1059; Al-Shabi and Habibi 2011, ISRN Signal Processing 725108, for
     the idea of iterating it.
@@ -191,22 +189,20 @@ _product = functools.partial(jnp.matmul, precision="highest")
 class JointEKF(AbstractRecursion):
     """Joint extended Kalman filter: states and constant parameters from one recursion over the flight.
 
-    - `passes`: the most passes over the flight. The first pass linearises the model around its own running estimate:
-      the textbook filter. Each later pass starts from the same prior and linearises around the trajectory of the
-      previous answer: a Gauss-Newton step on prior and flight together. The passes end once a pass changes no
-      parameter by more than a tenth of its standard deviation; otherwise the result is `max_sweeps`. In single
-      precision, rounding errors can be as large if the noise is a tenth of the standard sensors' (6 of 256 flights).
-      With `passes=1` the first answer is accepted as it is. On more channels than the rates its covariance can then be
-      far too small.
+    - `passes`: the most passes over the flight. The first linearises the model around its own running estimate: the
+      textbook filter. Each later one starts from the same prior and linearises around the trajectory of the answer
+      before: a Gauss-Newton step. They end once one changes no parameter by more than a tenth of its standard
+      deviation; else the result is `max_sweeps`. With 1 the first answer is accepted, whose covariance can be far too
+      small.
 
-    The bracket is a Gaussian prior: its center is the mean, its half-width the standard deviation. If the center is off
-    by half of the half-width, the answer is off by half of std^2 / half_width. A free initial state has the first
-    measurements as its prior, and is a constant part of the joint state. There is no process noise. `history` is that
-    of the last pass. A pass counts as one rollout for each unknown and one for the state; `sweeps` are the passes.
+    The bracket is a Gaussian prior: its center is the mean, its half-width the standard deviation. A free initial state
+    has the first measurements as its prior, and is a constant part of the joint state. There is no process noise.
+    `history` is that of the last pass; `rollouts` count each unknown and the state in each pass, and `sweeps` the
+    passes.
 
     Reference: Ljung 1979, IEEE Trans. Autom. Control 24(1), on the filter; Bierman 1977, Factorization Methods for
     Discrete Sequential Estimation, on Potter's update; Bell and Cathey 1993, IEEE Trans. Autom. Control 38(2), on
-    iterated updates as Gauss-Newton steps.
+    iterated updates.
     """
 
     prior: ClassVar[float] = GAUSSIAN_PRIOR

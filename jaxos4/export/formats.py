@@ -142,13 +142,12 @@ def _drone_models(vehicle: RigidVehicle) -> dict[str, Any]:
 def _templates(suffix: str) -> Any:
     made = templates("jaxos4.export", printable if suffix in (".py", ".toml") else in_xml)
     made.filters["short"] = lambda values: ", ".join(f"{value:.3g}" for value in np.atleast_1d(values))
-    made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}
+
+    def numbers(*values: float) -> str:
+        return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)  # 0 has no sign
+
+    made.globals |= {"number": lambda value: repr(float(value)), "numbers": numbers, "zip": zip}
     return made
-
-
-def _numbers(*values: float) -> str:
-    """Numbers with all their digits; 0 has no sign."""
-    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
 
 
 TARGETS: dict[str, Target] = {

@@ -118,10 +118,7 @@ class RigidVehicle(NamedTuple):
 
 @np.errstate(all="ignore")  # `impossible` says what is not finite
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
-    """The vehicle with the parameters of a `FlightModel`, by name, and the airframe's constants for missing ones.
-
-    Offsets of several recordings are averaged.
-    """
+    """The vehicle with parameters of a `FlightModel`, by name, and else the airframe's. Offsets are averaged."""
     mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)
     for axis, inverse in enumerate(INERTIAS.values()):

@@ -150,7 +150,11 @@ def predict(
     **Raises:** `InputError`, one line, for a result without a vehicle, a flight that cannot be predicted, or unusable
     arguments; `OSError` if `found` cannot be read.
     """
-    _check_options(horizon, spacing, seed)
+    for name, value, least in (("horizon", horizon, "positive"), ("spacing", spacing, "at least 0")):
+        if not math.isfinite(value) or value < 0 or (value == 0 and name == "horizon"):
+            raise InputError(f"`{name}`: must be a number of seconds, {least}, got {value:g}.")
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
     vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
     recording = as_recording(flight, airframe=vehicle.model.airframe)
     prepared = _prepare(vehicle, recording, sample_time)
@@ -196,14 +200,6 @@ def _predicted(
         seed=seed,
         notes=(*vehicle.notes, *prepared.notes),
     )
-
-
-def _check_options(horizon: float, spacing: float, seed: int) -> None:
-    for name, value, least in (("horizon", horizon, "positive"), ("spacing", spacing, "at least 0")):
-        if not math.isfinite(value) or value < 0 or (value == 0 and name == "horizon"):
-            raise InputError(f"`{name}`: must be a number of seconds, {least}, got {value:g}.")
-    if not isinstance(seed, int) or seed < 0:
-        raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
 
 
 def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) -> Prepared:

@@ -138,7 +138,7 @@ def _instances(fields: Fields) -> dict[int, Fields]:
 
 
 def _layout(body: bytes) -> tuple[int, int, str, np.dtype | None, dict[str, float]]:
-    """What a message FMT describes: number, length, name, layout (`None`: unknown), units of last digits by field."""
+    """The number, length, name and layout (`None`: unknown) of a message by its FMT, and units of last digits."""
     name, letters, fields = (body[a:b].rstrip(b"\0").decode(errors="replace") for a, b in ((2, 6), (6, 22), (22, 86)))
     labels, unknown = fields.split(","), (body[0], body[1], name, None, {})
     if not len(labels) == len(letters) == len({*labels}) or "" in labels or not {*letters} <= _TYPES.keys():

@@ -165,10 +165,7 @@ def mapped_rows(table: Table, columns: ColumnMap) -> Table:
 
 
 def array_table(data: Any, columns: ColumnMap) -> Table:
-    """The table of a mapping of arrays, a DataFrame or a Dataset, with one row for each time, which may be a date.
-
-    Column i of an array `name` with two dimensions is named `name[i]`. Raises `InputError`.
-    """
+    """The table of a mapping of arrays, DataFrame or Dataset; matrices have columns `name[i]`. Raises `InputError`."""
     names = getattr(data, "columns", None)
     if names is None and not hasattr(data, "keys"):
         refuse("data", f"is of type {type(data).__name__}; give the path of a log, or a mapping of arrays")

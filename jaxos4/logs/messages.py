@@ -86,10 +86,7 @@ class Messages:
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
 
     def fastest(self, columns: Sequence[str], sources: Iterable[Source], *, faster: float = 1.1) -> Series | None:
-        """The source that was logged most often, in our units and frame; `None` if none was.
-
-        One is preferred to those before it if it is so many times `faster`.
-        """
+        """The source that was logged most often in our units and frame; a later one must be so many times `faster`."""
         best, found = 0.0, None
         for kind, fields, factor in sources:
             for instance in self.fields.get(kind, ()):
@@ -113,10 +110,11 @@ class Messages:
     def table(
         self, rates: Series, rotors: Series, others: Mapping[Names, Series | None], **facts: Any
     ) -> tuple[RowPositions, Table]:
-        """The gyro's samples as rows, at 1 kHz at most, with rotors and `others` at the same times.
+        """Rows at the times of the gyro, at most 1 kHz, with rotors and `others` brought to them.
 
-        Series are in our units and frame. Rotor speeds are measured if `omega1` has a name, and else commands [0..1].
-        `others`: by the names of their columns; `None`: not logged. `facts`: more fields of `LogFacts`.
+        Series are in our units and frame. Impossible samples are taken out before. Rotor speeds are measured if
+        `omega1` has a name, else commands [0..1]. `others`: by the names of their columns; `None`: not logged. `facts`:
+        more of `LogFacts`.
 
         **Returns:** the times of the rows [s], and the table; `t` is 0 in the first row.
 

@@ -1,7 +1,4 @@
-"""ULog: the logs of PX4, decoded by pyulog. Topics, frames and commands: docs/logs.md.
-
-Reference: `FunctionMotors::updateValues`, `MixingOutput` and `logged_topics.cpp` of PX4.
-"""
+"""ULog: the logs of PX4, decoded by pyulog. Reference: `FunctionMotors::updateValues`, `MixingOutput` of PX4."""
 
 import contextlib
 import functools

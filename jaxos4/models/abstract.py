@@ -66,10 +66,7 @@ class ByRecording(NamedTuple):
 
 
 class AbstractModel(eqx.Module):
-    """A quadrotor: a table of unknown parameters, a forcing, equations of motion and sensors.
-
-    `parameters` below means the values of the unknowns, as an array or as a tuple of its scalars.
-    """
+    """A quadrotor: a table of unknown parameters, whose values are `parameters`, a forcing, equations, and sensors."""
 
     airframe: eqx.AbstractVar[Airframe]
 

@@ -30,37 +30,31 @@ Row = tuple[Term, str, Parameter]
 class FlightModel(AbstractModel):
     """`CorrectedOS4` and the effects that real vehicles show. Each term is optional.
 
-        p' = alpha1 q r - alpha2 Omega_r q + alpha3 d_roll + roll_offset + roll_thrust (U_c / m - 9.81)
-             - roll_damping p + roll_velocity v_y
-        q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset + pitch_thrust (U_c / m - 9.81)
-             - pitch_damping q + pitch_velocity v_x
-        r' = alpha7 p q + alpha8 d_yaw + yaw_offset - yaw_damping r - rotor_reaction Omega_r'
-        rotor_lag w_i' = g(u_i(t - rotor_delay) - thrust_curve w_i) - (1 - thrust_curve) w_i^2
-        u_i = command_i (V / V_0)^voltage_exponent (1 - battery_fade t)
-        a_z = thrust_gain U_c / m + az_bias,    a_x = ax_bias - x_drag v_x,    a_y = ay_bias - y_drag v_y
+    p' = alpha1 q r - alpha2 Omega_r q + alpha3 d_roll + roll_offset + roll_thrust (U_c / m - 9.81)
+    - roll_damping p + roll_velocity v_y q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset +
+      pitch_thrust (U_c / m - 9.81)
+    - pitch_damping q + pitch_velocity v_x r' = alpha7 p q + alpha8 d_yaw + yaw_offset - yaw_damping r - rotor_reaction
+      Omega_r' rotor_lag w_i' = g(u_i(t - rotor_delay) - thrust_curve w_i) - (1 - thrust_curve) w_i^2 u_i = command_i (V
+      / V_0)^voltage_exponent (1 - battery_fade t) a_z = thrust_gain U_c / m + az_bias,    a_x = ax_bias - x_drag v_x,
+      a_y = ay_bias - y_drag v_y
 
     The last line is the specific force, as an accelerometer at the centre of mass measures it. `jaxos4.models.rotors`
     explains the motors, whose speeds w_i = omega_i / `max_rotor_speed`.
 
-    A centre of mass at (x_c, y_c) in the frame of the rotor positions gives the thrust U_c the torque
-    (-x_c, -y_c, 0) x (0, 0, U_c) = (-y_c U_c, x_c U_c, 0). So roll_thrust = -alpha3 m y_c and pitch_thrust =
-    alpha6 m x_c (`jaxos4.center_of_mass`). Only thrust above hover counts, so that an estimate can distinguish it from
-    a constant torque. Rotors of unequal thrust cause the same torque.
+    A centre of mass at (x_c, y_c) in the frame of the rotor positions gives the thrust U_c the torque (-y_c U_c, x_c
+    U_c, 0): roll_thrust = -alpha3 m y_c and pitch_thrust = alpha6 m x_c (`jaxos4.center_of_mass`). Only thrust above
+    hover counts, to distinguish it from a constant torque. Rotors of unequal thrust cause the same torque.
 
-    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity`, `inflow` and `drag`
-      need `Flight.body_velocity`, or states with a velocity. `gyro_bias` and `offset` can be distinguished only if the
-      attitude is compared too.
-      Leave out `motor`, `lag` and `delay` if rotor speeds were measured.
+    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity`, `inflow` and `drag` need
+      `Flight.body_velocity`, or states with a velocity; `gyro_bias` beside `offset` needs the attitude. Leave out
+      `motor`, `lag` and `delay` if rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0; the last number holds
-      for all stretches that follow. Each recording has its own offsets and gyro biases. All other parameters are the
-      vehicle's.
+      for all stretches that follow. Each recording has its own offsets and gyro biases.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
+    - `batch`: so many samples of a padded flight are computed together.
 
-    `batch`: so many samples of a padded flight are computed together.
-
-    **Raises:** `ValueError` for a term that does not exist or is given twice, terms that exclude each other, recordings
-    that are not counted from 0, or a term that needs `airframe.max_rotor_speed` or `battery_voltage` if that is not
-    known.
+    **Raises:** `ValueError` for terms that do not exist, are given twice or exclude each other, recordings that are not
+    counted from 0, or a term that needs an unknown `airframe.max_rotor_speed` or `battery_voltage`.
     """
 
     batch: ClassVar[int] = 512

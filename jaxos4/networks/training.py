@@ -60,10 +60,7 @@ def untrained(
     *,
     per_feature: int = 4,
 ) -> tuple[Scaling, Regressor]:
-    """Scaling and regressor before training, with a linear map that is fitted to simulated flights.
-
-    `per_feature`: of these flights, for each feature; `noise`: their lowest and highest noise scale.
-    """
+    """Scaling and a linear map fitted to `per_feature` simulated flights for each feature, in a range of `noise`."""
     scales = np.asarray(noise, float)
     count, purpose = max(CHUNK, per_feature * features.size), Purpose.LINEAR_MAP
     chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)

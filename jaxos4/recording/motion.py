@@ -23,11 +23,7 @@ Ups = tuple[Float[np.ndarray, "_samples 3"], Float[np.ndarray, "_samples 3"]]
 
 
 class Excited(NamedTuple):
-    """When an axis counts as excited: standard deviations of its body rate.
-
-    - `weak`, `good`: [rad/s]; less than `weak` is not excited.
-    - `over_noise`: so many times the gyro's noise.
-    """
+    """When an axis counts as excited, by the deviation of its rate [rad/s], and in multiples of the gyro's noise."""
 
     weak: float = 0.1
     good: float = 0.3

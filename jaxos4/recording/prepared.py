@@ -123,7 +123,12 @@ def prepare(
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
-    _check_options(begin, end, sample_time, holdout)
+    if sample_time is not None and not 0 < sample_time < math.inf:
+        raise InputError(f"`sample_time`: must be a positive number of seconds, got {sample_time:g}.")
+    if not 0 <= holdout <= 0.5:
+        raise InputError(f"`holdout`: must be a share from 0 to 0.5, got {holdout:g}.")
+    if begin is not None and end is not None and not begin < end:
+        raise InputError(f"`begin` {begin:g} `end` {end:g}: must be in this order.")
     for number, recording in enumerate(recordings):
         if any(recording.same_data(earlier) for earlier in recordings[:number]):
             raise InputError(f"{recording.name}: given twice; give each log once.")
@@ -324,12 +329,3 @@ def _level(
 
 def _seconds(recording: Recording) -> float:
     return float(np.count_nonzero(~np.isnan(recording.states[:, CASCADE_ORDER[0]])) * recording.dt)
-
-
-def _check_options(begin: float | None, end: float | None, sample_time: float | None, holdout: float) -> None:
-    if sample_time is not None and not 0 < sample_time < math.inf:
-        raise InputError(f"`sample_time`: must be a positive number of seconds, got {sample_time:g}.")
-    if not 0 <= holdout <= 0.5:
-        raise InputError(f"`holdout`: must be a share from 0 to 0.5, got {holdout:g}.")
-    if begin is not None and end is not None and not begin < end:
-        raise InputError(f"`begin` {begin:g} `end` {end:g}: must be in this order.")

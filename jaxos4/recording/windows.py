@@ -13,10 +13,7 @@ _SAME = 1e-6  # sample times that differ by less than this share are equal
 
 
 def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
-    """A flight averaged to samples of each length [s], see `averages`, with the rotor speeds `within` each.
-
-    Measurements stay as they are where its own samples are not shorter.
-    """
+    """A flight averaged to samples of each length [s], if longer than its own, with the rotor speeds `within` each."""
     within = speeds_within(flight.time, flight.omega, held=flight.held)
     columns = [flight.channels] if flight.voltage is None else [flight.channels, flight.voltage[:, None]]
     average = averages(flight.time, flight.omega, np.hstack(columns), held=flight.held)

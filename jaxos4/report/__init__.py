@@ -1,7 +1,4 @@
-"""Reports: figures, tables and an HTML page of a study; a page and a text of an identification.
-
-The names are in `__init__.pyi`. Each is imported when it is first used: text needs no Matplotlib.
-"""
+"""Reports as figures, tables, texts and HTML pages. `__init__.pyi` names them; each is imported when it is used."""
 
 import lazy_loader
 

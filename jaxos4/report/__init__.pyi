@@ -1,5 +1,5 @@
 from .comparison import print_comparison as print_comparison, write_comparison as write_comparison
-from .flight_prediction import print_prediction as print_prediction, write_prediction_figure as write_prediction_figure
+from .flights import print_prediction as print_prediction, write_prediction_figure as write_prediction_figure
 from .identification_figures import Plots as Plots
 from .identification_page import (
     identification_html as identification_html,

@@ -80,10 +80,7 @@ def residual_figure(found: Correlations) -> Figure:
 
 
 def path_in_space(traces: Traces, look: Style, *, turn: float = -60.0, height: float = 28.0) -> Figure:
-    """The measured path in its box, with its shadow on the floor; of an OS4, the predicted one too.
-
-    `turn`, `height`: from where the box is seen [degrees].
-    """
+    """The measured path in its box, with its shadow; an OS4's prediction. `turn`, `height`: of the view [degrees]."""
     turned, up = np.radians([turn, height])
     right = np.array([-np.sin(turned), np.cos(turned), 0.0])
     above = np.array([-np.cos(turned) * np.sin(up), -np.sin(turned) * np.sin(up), np.cos(up)])

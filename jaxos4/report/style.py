@@ -128,9 +128,9 @@ def label(figure: Figure, *, x: str, y: str = "") -> None:
 
 def log_axis(axes: Axes, which: str) -> None:
     """A logarithmic axis with plain numbers."""
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    low, high = sorted(axes.get_xlim() if which == "x" else axes.get_ylim())
+    getattr(axes, f"set_{which}scale")("log")
+    axis: Axis = getattr(axes, f"{which}axis")
+    low, high = sorted(getattr(axes, f"get_{which}lim")())
     if low > 0 and high / low < 5:
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))  # 1 is a tick if it is in the range
     elif low > 0 and high / low < 30:

@@ -29,10 +29,7 @@ Section = Iterator[str | Listing]
 
 
 def print_identification(console: Console, found: Identification, *, verbose: bool = False) -> None:
-    """Prints verdicts, physical quantities, reservations and notes; or why there is no answer.
-
-    `verbose`: also of a vehicle all parameters, the noise, and the quality of predictions. An OS4's are printed always.
-    """
+    """Prints verdicts, quantities, reservations and notes, `verbose` all parameters too; or why there is no answer."""
     sections = [_verdicts, _quantities, _reasons, _notes]
     if not found.is_vehicle:
         sections = [_verdicts, _reasons, _notes, _parameters, _fit, _inertias, _validation]

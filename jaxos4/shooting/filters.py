@@ -46,11 +46,7 @@ BLOCK = 32
 
 
 class _Row(NamedTuple):
-    """One sample of all segments.
-
-    - `measured`: 0 if `is_measured` is false.
-    - `restarts`, `restarts_next`: whether a segment forgets what it knew before this sample, or before the next.
-    """
+    """One sample of all segments, which may forget before it or the next; `measured` is 0 if it was not."""
 
     measured: Channels
     is_measured: Bool[Array, "channels segments"]

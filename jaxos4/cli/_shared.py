@@ -1,4 +1,4 @@
-"""Output of the commands: progress, the library's messages with names of options, and files, whole or not at all."""
+"""Shared by the commands: values of options, checks of them, progress, messages in the words of options, and files."""
 
 import contextlib
 import json
@@ -9,12 +9,14 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
-from .._files import check_writable, write_file
+from .._files import check_writable, read_toml, write_file
 from ..errors import InputError, printable
+from ..estimators import ESTIMATORS
 
 _ARGUMENTS = ("angle", "bandwidth", "bracket", "channels", "criterion", "distance", "dt", "duration", "estimator")
 _ARGUMENTS += ("fastest", "gust", "holdout", "horizon", "inertia_z", "initial_state", "network", "rate", "sample_time")
@@ -53,10 +55,7 @@ def option_names(**files: Path | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """Shows a stage and the time, and a bar if there is a `total`. Shows nothing if stderr is no terminal.
-
-    Yields a function that changes the stage, and what is done of the total.
-    """
+    """Shows a stage, the time, and a bar if there is a `total`, on a terminal. Yields a function that changes them."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -120,3 +119,72 @@ def write_json(report: dict[str, Any], out: Path) -> None:
     # No string has a line break, because JSON escapes it.
     text = re.sub(r"\[(\n\s+[^][{}\"]*)\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
     write_file(out, text + "\n")
+
+
+# The names in the library's tables, written out because an import of these tables takes seconds; a test compares them.
+Model = Literal["published", "corrected"]
+VehicleModel = Literal["published", "corrected", "flight"]
+Excitation = Literal["multisine", "doublet", "3211", "chirp"]
+Method = Literal["euler", "rk4", "diffrax"]
+Sensors = Literal["commands", "speeds"]
+Channels = Literal["rates", "attitude", "all"]
+InitialState = Literal["free", "known"]
+Simulator = Literal["mujoco", "rotorpy", "sdf", "drone-models", "urdf"]
+Features = Literal["score", "raw"]
+Architecture = Literal["mlp", "cmac"]
+Criterion = Literal["D", "A", "worst"]
+
+
+def check_seed(seed: int) -> int:
+    """Refuses a random seed that JAX cannot use."""
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
+    return seed
+
+
+def check_estimator(name: str | None) -> str | None:
+    """Refuses an estimator that neither this package nor another one has."""
+    if name is not None and name not in ESTIMATORS:
+        raise InputError(f"--estimator: must be one of {', '.join(ESTIMATORS)}, got {name!r}.")
+    return name
+
+
+EstimatorOption = Annotated[
+    str | None,
+    Option(
+        metavar=f"[{'|'.join(ESTIMATORS.data)}]",  # to list those of other packages takes a tenth of a second
+        help="The algorithm; default: ibss, or filter-error for a vehicle.",
+        callback=check_estimator,
+        autocompletion=lambda: list(ESTIMATORS),
+    ),
+]
+FlightFile = Annotated[Path, Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
+ModelOption = Annotated[Model, Option(help="Equations of motion: as published, or corrected.")]
+AirframeOption = Annotated[
+    str, Option(help="A preset (os4, os4-simulator, voos, crazyflie, x500, ...), or a TOML file.")
+]
+BracketOption = Annotated[Path | None, Option(help="TOML file: alpha1 = [lower, upper], ...")]
+ChannelsOption = Annotated[Channels | None, Option(help="Channels to fit. Default: all that were measured.")]
+InitialStateOption = Annotated[InitialState, Option(help="free: estimated too; known: equal to the first sample.")]
+WindowOption = Annotated[
+    float | None, Option(help="Multiple shooting: windows of this length [s], each with its own initial state.")
+]
+SeedOption = Annotated[int, Option(help="Random seed.", callback=check_seed)]
+ColumnsOption = Annotated[
+    str | None,
+    Option(
+        metavar="MAP.toml",
+        help="Which columns or topics of the logs hold what: a column map (docs/logs.md), or mavros, px4-ros2, ...",
+    ),
+]
+OutOption = Annotated[Path | None, Option(help="JSON file to write.")]
+
+
+def given(**settings: Any) -> dict[str, Any]:
+    """The settings that have a value."""
+    return {name: value for name, value in settings.items() if value is not None}
+
+
+def read_bracket(path: Path | None) -> dict[str, Any] | None:
+    """The table in the file of `--bracket`. Raises `InputError` if it is no TOML file."""
+    return None if path is None else read_toml(path)
