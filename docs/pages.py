@@ -7,6 +7,7 @@ import re
 
 from math_core import LatexToMathML
 from mkdocs.structure.files import File
+from mkdocs.utils import get_relative_url
 
 from jaxos4.cli import app
 
@@ -18,7 +19,9 @@ PAGES = {
     "security.md": "SECURITY.md",
     "experiments.md": "experiments/README.md",
 }
+PLACES = {}
 EQUATION = LatexToMathML(annotation=True)
+OBJECT = re.compile(r"^::: jaxos4\.((?:\w+\.)*)(\w+)$", flags=re.MULTILINE)
 COMMAND = re.compile(r"(jaxos4|python3?|pip|bash|source|export|\.venv/\S+)\b| +\S")
 
 
@@ -56,6 +59,26 @@ def on_page_markdown(markdown, page, config, files):
         return f"```{language}\n{block[2]}```"
 
     return re.sub(r"^```(.*)\n((?:(?!```).*\n)*)```$", marked, markdown, flags=re.MULTILINE)
+
+
+def on_env(env, config, files):
+    """Remembers where the API reference has each name: a function with its modules, a class also without."""
+    for page in (file for file in files.documentation_pages() if file.src_uri.startswith("api/")):
+        for modules, name in OBJECT.findall(page.content_string):
+            place = f"{page.url}#jaxos4.{modules}{name}"
+            short = name[0].isupper() or modules.endswith(f"{name}.")  # the file of this function has its name
+            PLACES.update({name if short else modules + name: place})
+    return env
+
+
+def on_post_page(output, page, config):
+    """Links each name of the package in a text to the API reference; a function only if `jaxos4.` is before it."""
+
+    def linked(code):
+        place = PLACES.get(code[2]) if code[1] or code[2][0].isupper() else None
+        return f'<a href="{get_relative_url(place, page.url)}">{code[0]}</a>' if place else code[0]
+
+    return re.sub(r'(?<!">)<code>(jaxos4\.)?([\w.]+)(?:\(\))?</code>', linked, output)
 
 
 def commands() -> str:

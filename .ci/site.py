@@ -1,0 +1,62 @@
+"""Checks a built site as a reader opens it from a folder: links and their anchors, and the search in a browser.
+
+python .ci/site.py SITE
+"""
+
+import shutil
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urldefrag
+
+
+class Page(HTMLParser):
+    """The addresses that a page refers to, and the anchors that it has."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.links, self.anchors = set(), set()
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        """Called for each tag."""
+        given = dict(attrs)
+        self.links |= {given[name] for name in ("href", "src") if given.get(name)}
+        self.anchors |= {given[name] for name in ("id", "name") if given.get(name)}
+
+
+def broken(site: Path) -> list[str]:
+    """The links of all pages that lead nowhere in the site. A server's 404 page has links from its root."""
+    pages = {path: Page(path) for path in site.rglob("*.html") if path.name != "404.html"}
+    found = []
+    for path, page in pages.items():
+        for link in page.links:
+            address, anchor = map(unquote, urldefrag(link))
+            target = (path.parent / address).resolve() if address else path
+            if ":" in address.split("/")[0]:
+                continue
+            if not target.exists() or (anchor and target in pages and anchor not in pages[target].anchors):
+                found.append(f"{path.relative_to(site)}: {link}")
+    return sorted(found)
+
+
+def search(site: Path, browser: str) -> list[str]:
+    """What is wrong with the search, and what the page wants from the network."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        page = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"]).new_page()
+        wrong = []
+        page.on("request", lambda request: request.url.startswith("http") and wrong.append(request.url))
+        page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
+        page.goto((site / "method" / "index.html").as_uri())
+        page.fill("input.md-search__input", "feedthrough")
+        page.wait_for_selector(".md-search-result__item")
+        return wrong
+
+
+if __name__ == "__main__":
+    site = Path(sys.argv[1]).resolve()
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if wrong := broken(site) + (search(site, browser) if browser else []):
+        sys.exit("\n".join(["the site is wrong:", *wrong]))
