@@ -63,6 +63,33 @@ def test_intervals_hold_the_truth_although_a_controller_answers_gusts(gain):
     assert abs(np.log(ratio / gain).mean()) > 2 * np.median(errors)
 
 
+def test_intervals_hold_one_for_the_right_vehicle():
+    """Whole flights in closed loop: rotors, all axes, and a gyro that the controller answers."""
+    trials, vehicle = 24, jaxos4.load_airframe("crazyflie")
+    loop = jaxos4.ClosedLoop(vehicle, gust=5.0)
+
+    def fly_one(key):
+        first, second = jax.random.split(key)
+        references = jaxos4.random_references(duration=20.0, dt=DT, key=first)
+        return jaxos4.fly_closed_loop(loop, references, dt=DT, key=second)
+
+    flights = eqx.filter_vmap(fly_one)(jax.random.split(jax.random.key(48), trials))
+    model = jaxos4.FlightModel(vehicle, terms=("lag", "delay", "reaction"))
+    known = dict(zip(model.parameter_names, model.alpha, strict=True)) | {"rotor_lag": 0.05, "rotor_delay": 0.01}
+    values, found = jnp.array([known[name] for name in model.parameter_names]), []
+    for i in range(trials):
+        flight = jax.tree.map(lambda leaf, i=i: leaf[i], flights)
+        problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates", method="rk4")
+        found.append([axis.agreement() for axis in jaxos4.frequency_response(problem, values)])
+    logs = np.array([[math.log(each.ratio) for each in row] for row in found])
+    errors = np.array([[each.error for each in row] for row in found])
+    held = np.mean(np.abs(logs) < 1.96 * errors)
+    assert held == pytest.approx(0.95, abs=3 * np.sqrt(0.05 * 0.95 / logs.size))
+    # No bias: the mean deviation of each axis, in standard deviations.
+    assert np.all(np.abs((logs / errors).mean(axis=0)) < 3 / np.sqrt(trials))
+    assert np.all(np.median(errors, axis=0) < 0.3)
+
+
 def fly(*, gyro, excited=(True, True, True)):
     """30 s of noise on the torques of some axes, with the rates that the model says and gyro noise [rad/s]."""
     rng, mixer = np.random.default_rng(0), np.asarray(MODEL.airframe.mixer)

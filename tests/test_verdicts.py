@@ -14,7 +14,7 @@ from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification.answers import Solution, vehicle_constants
 from jaxos4.identification.checks import consequences
-from jaxos4.identification.doubts import doubts_of, doubts_of_log, few_parts
+from jaxos4.identification.doubts import doubts_of, doubts_of_log, few_parts, stronger_or_weaker
 from jaxos4.identification.identify import describe
 from jaxos4.identification.results import Constant, ParameterEstimate
 from jaxos4.identification.search import search
@@ -101,6 +101,26 @@ def test_a_flight_with_too_few_parts_identifies_no_inertia():
         found = verdict_of("Ix", Quantity(), [*few_parts(seconds)])
         assert found.status == status
         assert all(f"only {seconds:.1f} s" in reason for reason in found.reasons)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "error", "move"), [(1.3, 0.05, 0.231), (0.7, 0.1, 0.429), (1.04, 0.005, None), (1.3, 0.2, None)]
+)
+def test_an_axis_that_answers_otherwise_than_the_model_has_a_reservation(ratio, error, move):
+    """Beyond chance, and by more than a tolerated share; an axis whose inertia is not known has nothing to reserve."""
+    frequency = np.arange(1.0, 31.0)
+    other = jaxos4.AxisResponse(
+        frequency, np.full(30, ratio), 0 * frequency, 0 * frequency, np.full((30, 30), error**2), 20.0
+    )
+    response = jaxos4.FrequencyResponse(other._replace(gain=np.ones(30)), other, other)
+    constants = {name: Constant(2.0, 0.1, "kg m^2") for name in ("Ix", "Iy")}
+    doubts = [*stronger_or_weaker(response, constants)]
+    statuses = {name: verdict_of(name, Quantity(), doubts).status for name in ("Ix", "Iy", "Iz")}
+    assert statuses == {"Ix": IDENTIFIED, "Iy": IDENTIFIED if move is None else RESERVED, "Iz": IDENTIFIED}
+    if move is not None:
+        assert doubts[0].moves["Iy"].share == pytest.approx(move, abs=1e-3)
+        assert doubts[0].moves["Iy"].deviations == pytest.approx(20 * move, rel=0.01)
+        assert f"from 4 to 20 Hz, pitch answers the rotors {ratio:.2f}" in str(doubts[0])
 
 
 def test_the_result_is_that_of_what_was_asked():

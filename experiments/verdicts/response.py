@@ -1,10 +1,12 @@
 """Does the frequency response of a right model hold 1? Nothing is fitted: the model has the true parameters.
 
 The flights are those of `closed_loop/effects.py`, in gusts of several strengths, and with those effects that the model
-can describe exactly or that are effects of the sensors.
+can describe exactly or that are effects of the sensors. A second table says how often an axis would have a reservation,
+for the right model and for wrong ones.
 """
 
 import functools
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -16,11 +18,17 @@ import typer
 import jaxos4
 from experiments.closed_loop.effects import EFFECTS, GUST, flights_of
 from experiments.closed_loop.run import DELAY, LAG, VEHICLE
-from experiments.monte_carlo import Row, continued, fill
-from experiments.verdicts.run import LOST, agreements, print_responses
+from experiments.monte_carlo import Row, continued, fill, print_table
+from experiments.verdicts.run import LOST, agreements, print_responses, share
+from jaxos4 import FrequencyResponse
+from jaxos4.analysis.frequency_response import Agreement
+from jaxos4.identification.verdict import TOLERANCE
 from jaxos4.models.terms import default_terms
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
+
+# Factors by which the torque of a wrong model is too weak: the gain is larger by as much.
+TOO_WEAK = (1.0, 1.12, 1.25, 1.5, 2.0)
 
 
 def true_parameters(model: jaxos4.FlightModel, kind: str) -> jax.Array:
@@ -73,3 +81,21 @@ def main(
             own = row.get("responses", {}).get(step, {})
             groups.setdefault(f"{name}, {step}", []).append({"response": own})
     print_responses("frequency response at the true parameters", groups)
+    print_reservations(groups)
+
+
+def print_reservations(groups: dict[str, list[Row]]) -> None:
+    """For each group and axis: how often it has a reservation, if the model's torque is too weak by each factor."""
+    lines = []
+    for name, rows in groups.items():
+        for axis in FrequencyResponse._fields:
+            every = [row["response"][axis] for row in rows if axis in row["response"]]
+            shares = []
+            for factor in TOO_WEAK:
+                agreements = (Agreement(factor * ratio, error, math.nan, math.nan) for ratio, error in every)
+                reserved = [each.excludes_one(TOLERANCE.share) for each in agreements]
+                shares.append(share(sum(reserved), len(reserved)))
+            lines.append((name, axis, *shares))
+    print_table(
+        "reservations [%]", ("case", "axis", *(f"torque too weak by {x:g}" for x in TOO_WEAK)), lines, width=170
+    )

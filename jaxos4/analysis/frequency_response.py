@@ -52,6 +52,11 @@ class Agreement(NamedTuple):
         factor = math.exp(min(NINETY_FIVE * self.error, _BOUNDLESS))
         return self.ratio / factor, self.ratio * factor
 
+    def excludes_one(self, share: float) -> bool:
+        """Whether the interval is beyond 1 by more than this share."""
+        low, high = self.interval
+        return low > 1 + share or high < 1 - share
+
 
 class AxisResponse(NamedTuple):
     """The frequency response of one axis. A model that is right has gain 1 and phase 0.

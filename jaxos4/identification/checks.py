@@ -28,6 +28,7 @@ from .doubts import (
     moved_by_sample_time,
     moves_between,
     neighbours,
+    stronger_or_weaker,
     vibration,
 )
 from .held_out import predict_held_out, validate_on, vehicle_traces
@@ -139,19 +140,21 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
         said = "not identified: the disturbance is larger"
         table |= {name: msgspec.structs.replace(table[name], note=said) for name in _OF_YAW if name in table}
         still = (*still, *({"yaw"} - {*still}))
+    values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
+    response = frequency_response(with_room(answer.problem, data.room), values)
     doubts = [
         *doubts_of_log(data.findings),
         *few_parts(data.seconds),
         *_doubts_of_weak_axes(weak),
         *_doubts_of_answer(data, answer, optimum, trusted, body.constants, skill, still),
         *_doubts_of_sample_time(answer, sample_times, body.constants),
+        *stronger_or_weaker(response, body.constants),
     ]
     quantities = vehicle_quantities(answer, table, body.constants, skill, still)
     if not optimum.is_lowest:
         doubts.insert(0, msgspec.structs.replace(_NOT_LOWEST, moves=dict.fromkeys(quantities)))
     doubts += _doubts_of_search(search, quantities)
     verdicts = verdicts_of(quantities, doubts)
-    values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
     predicted = None if predicted is None else predicted.thinned(_MOST_STARTS)
     traces, correlations = vehicle_traces(data, answer, optimum, predicted)
     return Checked(
@@ -165,7 +168,7 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
         predictions=predicted,
         traces=traces,
         correlations=correlations,
-        response=frequency_response(with_room(answer.problem, data.room), values),
+        response=response,
     )
 
 

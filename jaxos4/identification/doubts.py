@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..airframe import Airframe
+from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import decisive_horizon
 from ..models.abstract import AbstractModel, Parameter
@@ -68,6 +69,26 @@ def few_parts(seconds: float, tolerance: Tolerance = TOLERANCE) -> Iterator[Doub
             f"fly for {2 * tolerance.seconds:g} s or longer",
             _ALL,
         )
+
+
+def stronger_or_weaker(
+    response: FrequencyResponse, constants: Mapping[str, Constant], tolerance: Tolerance = TOLERANCE
+) -> Iterator[Doubt]:
+    """An axis that answers the rotors clearly more or less than the model says, by a regression that knows no model.
+
+    A reservation, and no refusal: the regression has two to three times the error of the fit.
+    """
+    for (axis, found), name in zip(response._asdict().items(), INVERSE, strict=True):
+        agreement, row = found.agreement(), constants.get(name)
+        if row is not None and agreement.excludes_one(tolerance.share):
+            share, (low, high) = abs(1 / agreement.ratio - 1), agreement.interval
+            yield Doubt(
+                "successful",
+                f"from {agreement.low:g} to {agreement.high:g} Hz, {axis} answers the rotors {agreement.ratio:.2f} "
+                f"({low:.2f} to {high:.2f}) times as strongly as the model",
+                f"fly more {axis}, or look at its frequency response for what the model lacks",
+                {name: Move(share, share * row.estimate / row.std)},
+            )
 
 
 def doubts_of(
