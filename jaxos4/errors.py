@@ -28,6 +28,11 @@ def shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
+def in_words(error: Exception, most: int = 120) -> str:
+    """The message of an error on one line, at most so many characters; the name of its type if it has none."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
 @contextlib.contextmanager
 def named(place: object) -> Iterator[None]:
     """Raises a `ValueError` of the block again, as an `InputError` that begins with its place."""

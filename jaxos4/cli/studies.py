@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 import jaxos4
 
-from ..errors import InputError, printable
+from ..errors import InputError, in_words, printable
 from ._shared import ESTIMATORS, check_outputs, stages
 
 
@@ -69,8 +69,8 @@ def _connected(address: str):
     try:
         return Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:
-        what = " ".join(str(error).split())[:120]
-        raise InputError(f"--scheduler {address}: no Dask scheduler answers ({what}); give another address.") from None
+        why = f"no Dask scheduler answers ({in_words(error)}); give another address"
+        raise InputError(f"--scheduler {address}: {why}.") from None
 
 
 def report(

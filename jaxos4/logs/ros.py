@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, in_words
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
 from .compression import check_parts, check_sizes
 from .messages import ANGLES, RATES, Fields, Messages, Names
@@ -24,7 +24,6 @@ from .table import (
     LogFormat,
     Path,
     Table,
-    in_words,
     listed,
     needed,
     opened,

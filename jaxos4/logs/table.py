@@ -268,11 +268,6 @@ def quoted(text: str) -> str:
     return repr(shortened(text, 40))
 
 
-def in_words(error: Exception) -> str:
-    """The message of a decoder's error, on one line."""
-    return " ".join(str(error).split())[:120] or type(error).__name__
-
-
 def listed(names: Iterable[str], most: int = 20) -> str:
     """The first names in quotes."""
     every = [*names]

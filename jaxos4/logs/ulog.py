@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import BROKEN
+from ..errors import in_words
 from .messages import ANGLES, FORCES, RATES, Fields, Messages, Names, motor_order
 from .sampling import HALF_TURN, Series, euler_angles, logged_rate
-from .table import LogFormat, Path, Table, fast_enough, in_words, needed, order_note, read_bytes, refuse
+from .table import LogFormat, Path, Table, fast_enough, needed, order_note, read_bytes, refuse
 
 _MAGIC = b"ULog"
 _MOVING = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}

@@ -18,7 +18,7 @@ from .._files import BROKEN, check_plain, write_file
 from .._version import __version__
 from ..airframe import Airframe, airframe_from_table
 from ..bracket import Bracket
-from ..errors import InputError, named
+from ..errors import InputError, in_words, named
 from ..flight import Flight
 from ..models import MODELS
 from ..shooting import ShootingProblem
@@ -78,7 +78,7 @@ def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
     except InputError:
         raise
     except (*BROKEN, OSError) as error:
-        what = " ".join(str(error).split())[:120]
+        what = in_words(error)
         raise InputError(f"{place}: not a whole network file ({what}); train it again with `jaxos4 train`.") from None
 
 

@@ -22,7 +22,7 @@ import xarray as xr
 
 from .._files import BROKEN, read_json, write_file
 from .._version import __version__
-from ..errors import InputError, shortened
+from ..errors import InputError, in_words, shortened
 from ..models import MODELS
 from ..networks import TrainedNetwork, load_network
 from .cell import LEVELS, OUTCOMES, fly, setup_of
@@ -94,8 +94,8 @@ class Store:
         except FileNotFoundError:
             return None
         except BROKEN as error:
-            what = " ".join(str(error).split())[:120]
-            raise InputError(f"{path}: not a whole cell ({what}); delete it, and run the study again.") from None
+            what = f"not a whole cell ({in_words(error)}); delete it, and run the study again"
+            raise InputError(f"{path}: {what}.") from None
 
     def read_network(self, number: int) -> TrainedNetwork | None:
         """A network, or `None` if it is not trained. Raises `InputError` if its file is damaged."""
@@ -147,8 +147,8 @@ def read_store(directory: Path) -> Store:
     except InputError:
         raise
     except (*BROKEN, msgspec.MsgspecError) as error:
-        what = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: not the specification of a study ({what}); give another folder.") from None
+        what = f"not the specification of a study ({in_words(error, 200)}); give another folder"
+        raise InputError(f"{path}: {what}.") from None
     raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {__version__}; give another folder.")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from .._files import write_file, write_netcdf
-from ..errors import InputError, TrainingError
+from ..errors import InputError, TrainingError, in_words
 from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_network
 from ..shooting import cores
 from .cell import blank_problem, key_of, run_cell, setup_of
@@ -79,7 +79,7 @@ def run_on_cluster(store: Store, client: "Client", *, retries: int = 2) -> Itera
             try:
                 result = future.result()
             except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
-                what = " ".join(str(error).split())[:300] or type(error).__name__
+                what = in_words(error, 300)
                 raise InputError(f"lost by the cluster ({what}); run the study again to resume.") from None
             yield future, result
 
@@ -147,7 +147,7 @@ def compute(study: Study, cell: Cell, network: Trained) -> bytes:
         if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
             remedy = "free some and run the study again, or start another study with a smaller `batch`"
             raise InputError(f"out of memory: {remedy}.") from None
-        results = {"failed": np.asarray(" ".join(str(error).split())[:500])}
+        results = {"failed": np.asarray(in_words(error, 500))}
     file = io.BytesIO()
     np.savez(file, **results)  # pyright: ignore[reportArgumentType]
     return file.getvalue()

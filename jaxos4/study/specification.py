@@ -16,7 +16,7 @@ import numpy as np
 from .._custom_types import RotorSpeeds, as_float
 from .._files import read_toml
 from ..airframe import PRESETS, Airframe, airframe_from_table
-from ..errors import InputError, named
+from ..errors import InputError, in_words, named
 from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
 from ..models import MODELS
@@ -234,8 +234,8 @@ def load_study(path: Path) -> Study:
         study.check_excitations()
     except (InputError, msgspec.ValidationError, RecursionError) as error:
         in_our_words = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
-        what = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: {what}" if in_our_words else f"{path}: {_in_words(what)}; correct it.") from None
+        what = in_words(error, 300)
+        raise InputError(f"{path}: {what}" if in_our_words else f"{path}: {_translated(what)}; correct it.") from None
     return study
 
 
@@ -253,7 +253,7 @@ def _inputs(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     return {"input": files | read}
 
 
-def _in_words(message: str) -> str:
+def _translated(message: str) -> str:
     """A message of msgspec with the key first, types in the words of TOML, and the choices last."""
     complaint, _, place = message.partition(" - at `$")
     key = place.strip(".`")
