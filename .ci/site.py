@@ -1,6 +1,6 @@
-"""Checks a built site as a reader opens it from a folder: links and their anchors, and the search in a browser: `python .ci/site.py SITE`.
+"""Checks a built site as a reader opens it from a folder: `python .ci/site.py SITE`.
 
-Without a browser, only the links are checked.
+It follows links and anchors, and searches in a browser; without a browser, only the links are checked.
 """
 
 import shutil
