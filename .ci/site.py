@@ -1,6 +1,6 @@
-"""Checks a built site as a reader opens it from a folder: links and their anchors, and the search in a browser.
+"""Checks a built site as a reader opens it from a folder: `python .ci/site.py SITE`.
 
-python .ci/site.py SITE
+It follows links and anchors, and searches in a browser; without a browser, only the links are checked.
 """
 
 import shutil
@@ -50,7 +50,7 @@ def search(site: Path, browser: str) -> list[str]:
         page.on("request", lambda request: request.url.startswith("http") and wrong.append(request.url))
         page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
         page.goto((site / "method" / "index.html").as_uri())
-        page.fill("input.md-search__input", "feedthrough")
+        page.locator("input.md-search__input").press_sequentially("feedthrough")
         page.wait_for_selector(".md-search-result__item")
         return wrong
 

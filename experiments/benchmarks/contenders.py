@@ -42,9 +42,11 @@ def _shots(**options: Any) -> Contender:
     return Contender("jaxos4_shots:shots", options=options)
 
 
+COMPILED_FIT = Contender("casadi_fit:single", "casadi", alone=True, options={"compiled": True})
 OURS = ("kalman", "output-error", "ibss", "hybrid")
 FITS = {
     REFERENCE_FIT: Contender("casadi_fit:single", "casadi", alone=True),
+    "CasADi, single shooting, compiled": COMPILED_FIT,
     "CasADi, multiple shooting": Contender("casadi_fit:multiple", "casadi", alone=True),
     "SciPy least_squares": Contender("scipy_fit:levenberg_marquardt", "scipy", alone=True),
     "pyPESTO, 4 starts": Contender("pypesto_fit:multi_start", "pypesto", alone=True),

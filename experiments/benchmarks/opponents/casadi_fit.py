@@ -11,11 +11,12 @@ import numpy as np
 
 from experiments.benchmarks.case import Case, step
 
+COMPILED = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O3", "-march=native"]}}
 OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
 
 
-def single(case: Case) -> Callable[[], dict]:
-    """The unknowns are the parameters, and the initial state if it is free."""
+def single(case: Case, compiled: bool = False) -> Callable[[], dict]:
+    """The unknowns are the parameters, and the initial state if it is free. `compiled`: by the C compiler."""
     steps = len(case.forcing)
     start, measured = casadi.MX.sym("start", 8), casadi.MX.sym("measured", 12, steps + 1)
     scaled, offset = casadi.MX.sym("scaled", 8), casadi.MX.sym("offset", 0 if case.known else 12)
@@ -23,7 +24,8 @@ def single(case: Case) -> Callable[[], dict]:
     first = casadi.DM.zeros(12) if case.known else measured[:, 0] + offset * case.sigma
     following = _one_step(case).mapaccum("trajectory", steps)(first, case.forcing.T, casadi.repmat(alpha, 1, steps))
     errors = casadi.vec((casadi.horzcat(first, following) - measured)[:, case.begin :] / _tiled(case, steps + 1))
-    solver = _gauss_newton(errors, casadi.vertcat(scaled, offset), casadi.vertcat(start, casadi.vec(measured)))
+    unknowns, data = casadi.vertcat(scaled, offset), casadi.vertcat(start, casadi.vec(measured))
+    solver = _gauss_newton(errors, unknowns, data, compiled)
     zero = np.zeros(8 + offset.numel())
     begin = case.first_states()
 
@@ -51,7 +53,7 @@ def multiple(case: Case) -> Callable[[], dict]:
     following = _one_step(case).map(steps)(states[:, :-1], case.forcing.T, casadi.repmat(alpha, 1, steps))
     gaps = casadi.vec((following - states[:, 1:]) / casadi.repmat(casadi.DM(case.sigma), 1, steps))
     unknowns, data = casadi.veccat(scaled, offsets), casadi.vertcat(start, casadi.vec(measured))
-    solver = _gauss_newton(casadi.vec(offsets), unknowns, data, gaps)
+    solver = _gauss_newton(casadi.vec(offsets), unknowns, data, gaps=gaps)
     zero = np.zeros(unknowns.numel())
 
     def run() -> dict:
@@ -77,7 +79,9 @@ def _tiled(case: Case, samples: int) -> casadi.DM:
     return casadi.repmat(casadi.DM(case.sigma), 1, samples - case.begin)
 
 
-def _gauss_newton(errors: casadi.MX, unknowns: casadi.MX, data: casadi.MX, gaps: casadi.MX | None = None):
+def _gauss_newton(
+    errors: casadi.MX, unknowns: casadi.MX, data: casadi.MX, compiled: bool = False, gaps: casadi.MX | None = None
+):
     """IPOPT with the Hessian J^T J of the residuals."""
     slope = casadi.jacobian(errors, unknowns)
     factor, multipliers = casadi.MX.sym("factor"), casadi.MX.sym("multipliers", 0 if gaps is None else gaps.numel())
@@ -92,8 +96,9 @@ def _gauss_newton(errors: casadi.MX, unknowns: casadi.MX, data: casadi.MX, gaps:
         },
         ["x", "p", "lam_f", "lam_g"],
         ["triu_hess_gamma_x_x"],
+        COMPILED if compiled else {},
     )
     problem = {"x": unknowns, "p": data, "f": casadi.dot(errors, errors) / 2}
     if gaps is not None:
         problem["g"] = gaps
-    return casadi.nlpsol("solver", "ipopt", problem, {**OPTIONS, "hess_lag": hessian})
+    return casadi.nlpsol("solver", "ipopt", problem, {**OPTIONS, **(COMPILED if compiled else {}), "hess_lag": hessian})
