@@ -39,7 +39,7 @@ def _constructor(found: griffe.Class, real: type) -> griffe.Function:
     parameters = [own]
     for name, each in inspect.signature(real).parameters.items():
         default = None if each.default is each.empty else repr(each.default)
-        if default is not None and default.startswith("<"):  # a factory, or a function
+        if default is not None and (default.startswith("<") or len(default) > 40):  # a factory, or a whole object
             default = "..."
         kind = kinds.get(each.kind, griffe.ParameterKind.positional_or_keyword)
         annotation = fields[name].annotation if name in fields else None

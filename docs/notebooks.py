@@ -71,7 +71,7 @@ def page(name: str, ran: list[Cell]) -> str:
         parts.append(cell.source if cell.is_text else f"```python\n{cell.source}\n```")
         parts += [f"``` {{ .text .wide }}\n{cell.said}\n```"] if cell.said else []
         for _ in cell.pictures:
-            parts.append(f"![A figure of the code above.]({name}-{drawn}.svg)")
+            parts.append(f"![A figure of the code above.]({name}-{drawn}.svg){{ .panel }}")
             drawn += 1
     return "\n\n".join(parts) + "\n"
 

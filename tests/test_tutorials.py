@@ -91,7 +91,7 @@ def test_cells_show_what_they_print_and_draw():
     assert ran[0] == Cell("# Title\n\nIntroduction.", is_text=True)
     assert (ran[1].said, ran[1].pictures) == ("printed\n3", ())
     assert (ran[3].said, len(ran[3].pictures)) == ("", 1)
-    assert page("it", ran).count("(it-0.svg)") == 1
+    assert page("it", ran).count("(it-0.svg){ .panel }") == 1
     kinds = [(cell["cell_type"], len(cell.get("outputs", ()))) for cell in json.loads(notebook(ran))["cells"]]
     assert kinds == [("markdown", 0), ("code", 1), ("markdown", 0), ("code", 1)]
 
