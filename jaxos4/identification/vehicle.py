@@ -43,6 +43,7 @@ class Likelihoods(NamedTuple):
     - `segments`: the parts of a flight, which are filtered in parallel. Their disagreement shows errors of the model.
       There are more from twice `recordings` recordings on. None is shorter than `seconds` [s].
     - `tolerance`: of `FilterError`: it stops within 0.05 standard deviations of the minimum.
+    - `controller`: a log whose rows are at most this far apart holds every run of the controller [s].
     - `sigma`: the scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
     """
 
@@ -50,6 +51,7 @@ class Likelihoods(NamedTuple):
     recordings: int = 4
     seconds: float = 1.25
     tolerance: float = 1e-3
+    controller: float = 0.005
     sigma: float = 0.5
 
 
@@ -234,7 +236,7 @@ def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.nda
     flight = shooting.flight
     if flight.within is None:
         return None
-    if float(flight.averaging_time) == 0.0:
+    if float(flight.averaging_time) == 0.0 and float(flight.dt) <= LIKELIHOODS.controller:
         return np.zeros((capacity, FEEDTHROUGHS, 3))  # no torque before an instant answers it
     samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
     torque = np.square(np.asarray(flight.within)) @ mixer[:3].T
