@@ -146,12 +146,16 @@ def test_a_search_counts_as_noise_what_the_feedthroughs_that_it_found_explain(rn
     assert search(problem.passing(nothing)).cost < found.cost
 
 
-def test_samples_of_the_log_itself_have_no_feedthrough():
-    """No torque before an instant answers what is measured at it; a mean holds answers to its own noise."""
+def test_a_log_that_holds_every_run_of_the_controller_has_no_feedthrough():
+    """No torque before an instant answers what is measured at it. Means, and slower logs, hold such answers."""
     flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0), duration=16.0, seed=0)
-    own, longer = prepare_vehicle(as_recordings(flight), CINERAT, jaxos4.VehicleSettings()).data[:2]
+    (every,), slow = as_recordings(flight), as_recordings(flight)[0].rows(slice(None, None, 2))
+    own, longer = prepare_vehicle([every], CINERAT, jaxos4.VehicleSettings()).data[:2]
+    slower = prepare_vehicle([slow], CINERAT, jaxos4.VehicleSettings()).data[0]
     assert not np.asarray(own.likelihood.input_innovations).any()
     assert np.asarray(longer.likelihood.input_innovations).any()
+    assert np.asarray(slower.likelihood.input_innovations).any()
+    assert float(slower.flight.flight.averaging_time) == 0.0
     assert own.likelihood.input_innovations.shape == longer.likelihood.input_innovations.shape  # they share a program
 
 
