@@ -4,12 +4,14 @@ import functools
 import io
 import json
 import os
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
@@ -17,21 +19,28 @@ from jaxtyping import Array, Float, Key as Keys
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.monte_carlo import count_results
 from jaxos4._custom_types import Key, States
 from jaxos4._files import write_atomically, write_netcdf
+from jaxos4.analysis.evaluation import cramer_rao_bound
 from jaxos4.bracket import Bracket
 from jaxos4.cli.studies import run_with_bar
 from jaxos4.estimate import AbstractEstimator, Estimate
+from jaxos4.excitation import multisine
 from jaxos4.flight import Flight
 from jaxos4.models.abstract import AbstractModel
-from jaxos4.noise import AbstractNoise
+from jaxos4.noise import SENSOR_SIGMA, AbstractNoise, WhiteNoise
 from jaxos4.report.style import Style, drawing, svg
+from jaxos4.results import result_names
 from jaxos4.shooting import ShootingProblem
+from jaxos4.simulation import simulate
 from jaxos4.study import Study, device_name, metrics, read_results
 from jaxos4.study.dataset import RESULTS_FILE, provenance
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""
+DT = 0.01  # of a standard flight [s]
+CHUNK = 250  # flights in one call, limited by the memory for the derivatives of the residuals
 
 
 def flight_files(folder: Path | None, names: Iterable[str]) -> list[Path]:
@@ -83,9 +92,13 @@ def identify(
     return jax.vmap(one)(brackets, states)
 
 
-def noise_and_bracket_keys(seed: int, flights: int) -> Keys[Array, "2 flights"]:
-    """For each flight a key of its noise and one of its bracket."""
-    return jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+def standard_problem(
+    model: AbstractModel, channels: str = "all", *, scale: float = 1.0, known: bool = True, windows: int = 1, omega=None
+) -> ShootingProblem:
+    """The standard flight of a model, or that of other rotor speeds, without noise; for sensors of this `scale`."""
+    exact = simulate(model, model.alpha, multisine(model.airframe) if omega is None else omega, dt=DT)
+    settings = {"channels": channels, "windows": windows, "initial_state": exact.states[0] if known else None}
+    return ShootingProblem(model, exact, sigma=scale * SENSOR_SIGMA, **settings)
 
 
 def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: float = 0.8) -> Bracket:
@@ -96,6 +109,52 @@ def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: 
         return Bracket.around(model.alpha + offset * model.half_width, model.half_width)
 
     return jax.vmap(one)(keys)
+
+
+def many_times(bracket: Bracket, flights: int) -> Bracket:
+    """The same bracket for each flight."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), bracket)
+
+
+def fit_noisy(
+    estimator: AbstractEstimator, problem: ShootingProblem, flights: int, seed: int, noise: AbstractNoise | None = None
+) -> tuple[Estimate, float]:
+    """Estimates of noisy copies of a problem's flight, each in a bracket of its own; and the seconds for each.
+
+    `problem`: by `standard_problem`. `noise`: by default white, as large as the problem says. A second call takes the
+    time without that of compiling.
+    """
+    keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+    brackets = brackets_around(problem.model, keys[1])
+
+    def part(some: slice) -> Estimate:
+        states = measure(noise or WhiteNoise(problem.sigma), problem.flight, keys[0][some])
+        return jax.block_until_ready(identify(estimator, problem, jax.tree.map(lambda x: x[some], brackets), states))
+
+    parts, begin = [slice(first, first + CHUNK) for first in range(0, flights, CHUNK)], time.perf_counter()
+    found = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(part, parts))
+    return found, (time.perf_counter() - begin) / flights
+
+
+def scores(problem: ShootingProblem, found: Estimate) -> dict[str, Any]:
+    """A row of a table: errors, in bounds of the problem's flight, and coverage of those that have an answer."""
+    results = result_names(found.result)
+    answered = np.isin(results, metrics.CONVERGED)
+    bound = np.sqrt(np.diagonal(cramer_rao_bound(problem, problem.model.alpha)))
+    error, half_width = np.asarray(found.parameters - problem.model.alpha), np.asarray(found.half_width(0.95))
+    own, some = error[answered] / bound, answered.any()
+    return {
+        "flights": len(error),
+        "answers": int(answered.sum()),
+        "results": count_results(results),
+        "efficiency": np.sqrt(np.mean(own**2, axis=0)).tolist() if some else None,
+        "bias": np.mean(own, axis=0).tolist() if some else None,
+        "monte_carlo_error": float(1 / np.sqrt(2 * max(answered.sum(), 1))),
+        # A flight without an answer has an infinite interval, and counts as not covered.
+        "covered": (np.isfinite(half_width) & (np.abs(error) < half_width)).mean(axis=0).tolist(),
+        "std": np.median(found.std / bound, axis=0).tolist(),
+        "rollouts": float(np.mean(found.rollouts)),
+    }
 
 
 def pdf(figure: Figure) -> bytes:

@@ -60,12 +60,15 @@ def programs_end_with_their_file() -> Iterator[None]:
     jax.clear_caches()
 
 
-@pytest.fixture
-def optimised() -> Iterator[None]:
-    """For a test that computes for longer than it compiles. A program keeps the level of its first use."""
+def computing() -> Iterator[None]:
+    """For tests that compute for longer than they compile. A program keeps the level of its first use."""
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", True)
+
+
+optimised = pytest.fixture(computing)
+all_optimised = pytest.fixture(computing, scope="module")  # also the fixtures of a file
 
 
 @pytest.fixture(scope="session")

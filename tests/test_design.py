@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from jaxos4.design.task import CRITERIA, criterion_of
 from jaxos4.study import load_study
 from jaxos4.study.cell import setup_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("all_optimised")]
 
 MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
@@ -30,14 +31,6 @@ CLOSED = ("--closed-loop", "--airframe", "mine.toml")
 
 OPEN_SETTINGS = {"duration": SECONDS, "dt": 0.01, "channels": "all", "criterion": "D", "start_is_known": True}
 LOOP_SETTINGS = {"duration": LOOP_SECONDS, "dt": LOOP_DT, "criterion": "D"}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def all_optimised():
-    """Designs compute for longer than they compile, also those of the fixtures."""
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +142,12 @@ def test_designed_references_tell_twice_as_much_as_3211(references):
         assert one.inputs.shape == (1001, 4)
     period = round(found.designed.period / LOOP_DT)
     np.testing.assert_allclose(found.designed.inputs[period:], found.designed.inputs[:-period], atol=1e-9)
+
+
+def test_how_the_sensors_are_mounted_changes_no_references(references):
+    mounted = eqx.tree_at(lambda loop: loop.airframe.sensor_rotation, LOOP, np.array([10.0, -5.0, 45.0]))
+    found = design.design_references(mounted, bracket=LOOP_BRACKET, **LOOP_SETTINGS, key=0)
+    np.testing.assert_array_equal(found.designed.inputs, references.designed.inputs)
 
 
 def test_other_vehicles_in_other_gusts_keep_the_limits(references):

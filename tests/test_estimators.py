@@ -1,17 +1,12 @@
 """Laws that hold for every estimator of the registry that needs no network: one batch of noisy flights, one program."""
 
-import json
-import os
-import subprocess
-import sys
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
-from helpers import doublet_problem, how_we_compile, noisy_states, standard_flight, standard_problem
+from helpers import doublet_problem, noisy_states, standard_flight, standard_problem
 from lanes import HALF, assert_chi_square, assert_nothing_invented, bound, count_of, identify, lanes, lost, names, noisy
 
 import jaxos4
@@ -110,54 +105,6 @@ def test_no_estimator_invents_numbers_for_doublets(name, free):
     """Doublets do not identify all parameters. For a hover: above."""
     for only_roll in (True, False):
         assert_nothing_invented(make_estimator(name), *doublet_problem(only_roll=only_roll, free=free))
-
-
-SINGLE = """
-import json, sys
-import numpy as np
-import jaxos4
-from jaxos4.estimators import make_estimator
-
-time, omega, exact, noisy, of_all, *ends = np.load(sys.argv[1]).values()
-
-def found(estimator, states, bracket, channels):
-    flight = jaxos4.Flight(time, omega, states)
-    settings = {"sigma": jaxos4.SENSOR_SIGMA, "channels": channels, "initial_state": np.zeros(12)}
-    estimate = estimator(jaxos4.ShootingProblem(jaxos4.PublishedOS4(), flight, **settings), jaxos4.Bracket(*bracket))
-    assert estimate.parameters.dtype == estimate.std.dtype == "float32"
-    return str(jaxos4.result_names(estimate.result)), estimate.parameters.tolist(), estimate.std.tolist()
-
-answers = {name: found(make_estimator(name), noisy, ends[:2], "rates") for name in ("filter-error", "kalman")}
-answers |= {f"ibss {i}": found(jaxos4.IBSS(), states, ends[2:], "all") for i, states in enumerate(of_all)}
-answers |= {name: found(make_estimator(name), exact, ends[2:], "all") for name in ("equation-error", "rls")}
-answers["rls that forgets"] = found(jaxos4.RecursiveLeastSquares(forgetting=0.99), exact, ends[2:], "all")
-json.dump(answers, sys.stdout)
-"""
-
-
-def test_single_precision_is_enough(tmp_path):
-    """In a process of its own, with JAX as it comes."""
-    _, states, _, lower, upper = lanes(noisy_states(1, seed=50))
-    exact, off = standard_flight(), MODEL.alpha + 0.5 * HALF
-    data = exact.time, exact.omega, exact.states, states[0], noisy_states(2), lower[0], upper[0], off - HALF, off + HALF
-    np.savez(tmp_path / "flights.npz", *data)
-    environment = os.environ | how_we_compile() | {"JAX_ENABLE_X64": "0"}
-    script = [sys.executable, "-c", SINGLE, tmp_path / "flights.npz"]
-    done = subprocess.run(script, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    for name, (result, parameters, std) in json.loads(done.stdout).items():
-        assert result == "successful", name
-        parameters, std = np.array(parameters), np.array(std)
-        if name in ("filter-error", "kalman"):  # the answer of double precision
-            (most, wider), double = {"filter-error": (0.1, 0.05), "kalman": (0.05, 0.02)}[name], found_by(name)
-            assert (np.abs(parameters - double.parameters[0]) < most * double.std[0]).all(), name
-            np.testing.assert_allclose(std, double.std[0], rtol=wider)
-        elif name.startswith("ibss"):  # noisy flights, all channels: errors are those of the noise
-            assert (np.abs(parameters - MODEL.alpha) < 4 * bound(channels="all")).all()
-            np.testing.assert_allclose(std / bound(channels="all"), 1, atol=0.1)
-        else:  # an exact flight, to a hundredth of what noise would do
-            assert (np.abs(parameters - MODEL.alpha) < 0.01 * bound()).all()
-            assert (std > 0.99 * bound()).all()
 
 
 def test_output_error_is_the_minimum_that_another_minimiser_finds():

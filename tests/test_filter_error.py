@@ -17,7 +17,7 @@ import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.flight import RATES
 from jaxos4.shooting import InnovationsProblem, pad_flight
-from jaxos4.shooting.gains import LogNoise, Observed, gains_of
+from jaxos4.shooting.gains import LogNoise, Observed
 from jaxos4.shooting.innovations import SETTLING
 
 pytestmark = pytest.mark.slow
@@ -26,10 +26,6 @@ MODEL = jaxos4.PublishedOS4()
 # Without gyroscopic torques a disturbed rate changes no other channel.
 UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 NOISE = LogNoise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 1.0], [0.02, 0.01, 0.03])))
-
-
-# Each as one program.
-filter_gains = eqx.filter_jit(gains_of)
 
 
 @eqx.filter_jit
@@ -168,23 +164,6 @@ def test_it_finds_the_truth_at_nearly_the_bound():
     assert (ratio > 0.95).all(), ratio
     assert (ratio < np.array([1.2, 1.4, 1.1, 1.2, 1.4, 1.1, 1.2, 1.1])).all(), ratio
     assert_chi_square(errors(found), np.linalg.inv(found.covariance))
-
-
-def test_a_known_start_is_used_in_flights_of_several_segments():
-    """A filter that knows the first rates begins with the rates themselves, and without uncertainty."""
-    long = standard_problem(channels="rates")
-    start = np.array(long.flight.states[0])
-    start[RATES] = 0.3, -0.2, 0.1
-    problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
-    observed = observed_in(problem, 4)
-    assert observed.restart[0].tolist() == [False, True, True, True]
-    assert observed.known is not None
-    np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
-    gains = filter_gains(observed, NOISE, jnp.asarray(DT))
-    # After one sample only the disturbance is unknown.
-    moved, added = transition(4.0, 0.2, DT)
-    expected = (moved @ np.diag([0.0, 16.0]) @ moved.T + added)[0, 0] + 0.02**2
-    np.testing.assert_allclose(gains.variance[1, 0, 0], expected, rtol=1e-9)
 
 
 # Gaps, recordings, failures.

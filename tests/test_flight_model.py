@@ -6,12 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flight_model_reference import FULL, NAMES, NAMES_XY, VALUES, VOLTS, battery, commands, reference, truth
-from helpers import standard_flight
 
 import jaxos4
-from jaxos4.models import Parameter, Term, default_terms
+from jaxos4.models import default_terms
 from jaxos4.models.flight_model import DEFAULT_TERMS
-from jaxos4.models.state import Rates
 from jaxos4.models.terms import (
     COMMANDS,
     FULL_SCALE,
@@ -118,34 +116,6 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     assert jaxos4.FlightModel(recordings=(0, 0, 0)).recordings == (0,)
     assert jaxos4.FlightModel(recordings=(0, 0, 1, 1)).recordings == (0, 0, 1)
     assert two == tuple(f"{name}_{i}" for i in (1, 2) for name in NAMES["offset"])
-
-
-def brake(total, values, rates, forcing):
-    """Damping that grows with the square of the rate."""
-    coefficients = (values[f"{axis}_brake"] for axis in ("roll", "pitch", "yaw"))
-    return Rates(*(x - c * jnp.abs(rate) * rate for x, c, rate in zip(total, coefficients, rates, strict=True)))
-
-
-def test_a_new_term_is_one_object(monkeypatch):
-    """One `Term` in the registry is all that a vehicle needs to be simulated and estimated with it."""
-    parameters = tuple(Parameter(f"{axis}_brake", "1/rad", 2.0) for axis in ("roll", "pitch", "yaw"))
-    term = Term("a moment against the square of each body rate", parameters, angular_acceleration=brake)
-    monkeypatch.setitem(jaxos4.TERMS, "brake", term)
-    model = jaxos4.FlightModel(terms=("brake", "offset"))
-    assert model.parameter_names[8:] == (*NAMES["offset"], "roll_brake", "pitch_brake", "yaw_brake")
-    values = model.alpha.at[-3:].set(jnp.array([0.5, 0.3, 0.8]))
-    flight = jaxos4.simulate(model, values, standard_flight().omega[:201], dt=0.01)
-    problem = jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
-    problem = problem.hold(dict(zip(model.parameter_names[:8], values, strict=False)))
-    found = jaxos4.OutputError()(problem)
-    np.testing.assert_allclose(found.parameters[-3:], [0.5, 0.3, 0.8], atol=1e-4)
-    with pytest.raises(ValueError, match="acts on the forcing"):
-        Term("", (Parameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda omega, *other: omega)
-    servo = Term("", (Parameter("own_lag", "s", 0.1),), speed=lambda omega, *other: omega)
-    monkeypatch.setitem(jaxos4.TERMS, "servo", servo)
-    assert jaxos4.FlightModel(terms=("servo",)).parameter_names[8:] == ("own_lag",)
-    with pytest.raises(ValueError, match="lag says how the rotors follow their commands; leave out servo"):
-        jaxos4.FlightModel(terms=("servo", "lag"))
 
 
 def test_an_estimate_uses_the_terms_that_the_logs_allow():

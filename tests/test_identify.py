@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import CRAZYFLIE, refused
 from px4_logs import everything
+from sign_flights import flown, turned
 
 import jaxos4
 from jaxos4.cli._shared import in_options
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
-from jaxos4.recording.prepared import prepare
 
 pytestmark = pytest.mark.slow
 
@@ -87,6 +87,7 @@ REFUSED = {
     f"flight1.csv {VEHICLE} --model flight": "given twice",
     f"{VEHICLE} --model flight --validate flight1.csv": "is fitted",
     f"speeds2.csv {VEHICLE} --model flight": "some of these logs hold commands",
+    f"{VEHICLE} --model flight --validate flight2.csv --holdout 0.2": "--holdout: --validate is predicted instead",
     f"{VEHICLE} --model flight --validate rare2.csv": "nothing is long enough to be predicted 0.5 s ahead",
     "flight1.csv": "flight1.csv has commands, not rotor speeds: a real vehicle needs --airframe; `jaxos4 inspect",
     "speeds1.csv --model flight": "--model flight: a real vehicle needs --airframe; `jaxos4 inspect",
@@ -112,31 +113,6 @@ def test_a_log_shows_whether_its_vehicle_is_real(vehicle, tmp_path):
     facts = read_recording(tmp_path / "log", full_scale=1.0).facts
     assert speeds._replace(facts=facts).vehicle_evidence == "is a log of a vehicle (PX4 ULog)"
     assert jaxos4.Recording.of(speeds.flight).vehicle_evidence == ""
-
-
-def test_each_measurement_is_either_fitted_or_held_out(vehicle):
-    airframe = jaxos4.load_airframe(str(vehicle / "airframe.toml"))
-    prepared, *_ = prepare([read_recording(vehicle / f"flight{i}.csv", airframe) for i in (1, 2)], airframe)
-    assert prepared.tested is not None
-    fitted, held_out = (~np.isnan(np.asarray(f.states)[:, 7]) for f in (prepared.fitted, prepared.tested))
-    assert (fitted ^ held_out).all()
-    assert 0.15 < held_out.mean() < 0.35
-    assert prepared.recordings == (0, 1)
-    assert prepared.available == {"commands", "full scale"}
-
-
-@pytest.mark.parametrize("steps", [(1 / 249, 1 / 251), (0.01, 0.00998), (0.0040001, 0.003)])
-def test_no_window_reaches_from_one_stretch_into_the_next(vehicle, steps):
-    airframe = jaxos4.load_airframe(str(vehicle / "airframe.toml"))
-    recording = read_recording(vehicle / "flight1.csv", airframe)
-    sampled = [recording._replace(time=dt * np.arange(recording.time.size)) for dt in steps]
-    prepared, *_ = prepare(sampled, airframe, holdout=0.0)
-    flight, windows = prepared.fitted, prepared.windows
-    assert flight.time.shape[0] == windows * prepared.length
-    assert (np.ptp(np.asarray(flight.stretch).reshape(windows, -1), axis=1) == 0).all()
-    model = jaxos4.FlightModel(airframe, recordings=prepared.recordings)
-    problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates", windows=windows)
-    assert (np.diff(np.nonzero(problem.cut()[1])[0].reshape(windows, -1)) == 0).all()
 
 
 COMMON = (
@@ -226,6 +202,14 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     assert found.predictions.horizons.tolist() == found.skill.horizons
 
 
+def test_a_search_that_fails_keeps_what_the_log_shows():
+    diverging, settings = {"roll_damping": [-1e6, -9e5]}, jaxos4.VehicleSettings(sample_time=0.016, holdout=0.0)
+    recording, airframe = flown(CRAZYFLIE, 0, seconds=6.0), turned(CRAZYFLIE, "rotor_spins")
+    found = jaxos4.identify(recording, airframe, bracket=diverging, settings=settings)
+    assert found.result == "nonfinite_trajectory"
+    assert any("yaw answers the rotors with the opposite sign" in doubt.cause for doubt in found.doubts)
+
+
 MODEL, OS4 = jaxos4.PublishedOS4(), jaxos4.OS4
 TURNED = eqx.tree_at(lambda a: a.sensor_rotation, OS4, np.array([0.0, 0.0, 45.0]))
 OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
@@ -244,13 +228,11 @@ OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
         (MODEL, {"settings": OF_VEHICLE()}, "`settings`: must be FlightSettings for a model"),
         (jaxos4.FlightModel(), {}, "`subject`: must be a model in alpha_1..8"),
         (OS4, {"settings": OF_FLIGHT()}, "`settings`: must be VehicleSettings for an airframe"),
-        (OS4, {"estimator": jaxos4.JointEKF()}, "`estimator` kalman: is biased by a controller"),
         (OS4, {"network": "none.net"}, "`network`: a vehicle's network is trained for its own flights"),
         (OS4, {"settings": OF_VEHICLE(holdout=0.9)}, "`holdout`: must be a share from 0 to 0.5"),
         (OS4, {"settings": OF_VEHICLE(terms=("drag",))}, "`terms`: drag needs lateral specific force"),
         (jaxos4.PublishedOS4(TURNED), {}, "`sensor_rotation`: the rates of an OS4 flight are along the body's axes"),
         (MODEL, {"flights": 2}, "flight 2: `subject` published explains one flight"),
-        (OS4, {"flights": 2}, "flight 2: given twice"),
         (OS4, {"flights": 0}, "holds no flight"),
     ],
 )

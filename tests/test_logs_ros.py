@@ -6,6 +6,7 @@ import sqlite3
 import struct
 import tracemalloc
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +31,14 @@ from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log, read_recording
-from jaxos4.logs.compression import Limits, _decompressor, check_parts, check_sizes
+from jaxos4.logs.compression import Limits, check_parts, check_sizes
 
 pytest.importorskip("rosbags", reason="reading a ROS bag needs rosbags")
 import lz4.frame  # noqa: E402
 import recorded_bags as bags  # noqa: E402
 from recorded_bags import KINDS, T, bag  # noqa: E402
 
-zstd = import_module(_decompressor("zstd").__module__.removeprefix("_"))
+zstd = import_module("compression.zstd" if find_spec("compression") else "backports.zstd")
 
 ATTITUDE = ("p", "q", "r", "phi", "theta", "psi")
 MAP = {

@@ -11,6 +11,7 @@ import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.excitation import EXCITATIONS, chirp, doublet, multisine, step3211
+from jaxos4.models import Parameter, Term
 from jaxos4.noise import SENSOR_SIGMA, ConstantBias, Dropouts, GaussMarkov, Quantisation, WhiteNoise
 
 MODEL = jaxos4.PublishedOS4()
@@ -128,6 +129,10 @@ MISUSE = [
     ("`terms` must be some of", lambda: vehicle(terms=("lag", "Lag"))),
     *(("`recordings` must count from 0", lambda r=r: vehicle(recordings=r)) for r in ((), (1,), (0, 2), (-1, 0))),
     ("velocity, inflow, drag need `Flight.body_vel", lambda: vehicle(terms=("velocity",))),
+    (
+        "acts on the forcing",
+        lambda: Term("", (Parameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda omega, *other: omega),
+    ),
     ("voltage need `Flight.voltage`", lambda: vehicle(terms=("voltage",), battery_voltage=11.1)),
     # Brackets, results and estimators.
     *(

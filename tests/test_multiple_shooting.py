@@ -7,13 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import (
-    first_samples,
-    noisy_states,
-    numpy_residuals,
-    random_starts,
-    standard_flight,
-)
+from helpers import first_samples, noisy_states, numpy_residuals, random_starts, standard_flight
 from lanes import LANES, identify
 
 import jaxos4

@@ -1,4 +1,4 @@
-"""Networks: their features, their training, the coverage of their intervals, and the problems that they refuse."""
+"""Networks: their training, the coverage of their intervals, and the problems that they refuse."""
 
 import equinox as eqx
 import jax
@@ -11,7 +11,6 @@ from small_network import (
     BRACKET,
     CMAC,
     CORRECTED,
-    DURATION,
     LEVELS,
     MANY,
     OMEGA,
@@ -29,55 +28,8 @@ from small_network import (
 )
 
 import jaxos4
-from jaxos4.networks.features import FEATURES, Coordinates, Features
 
 pytestmark = pytest.mark.slow
-
-# Features.
-
-
-@eqx.filter_jit
-def features_of(kind, free=False):
-    problem = problem_of(free=free)
-    return Features.of(kind, problem, Coordinates.of(problem, BRACKET, jnp.asarray(1.0)))
-
-
-@pytest.mark.parametrize(("kind", "free"), [("raw", False), ("score", False), ("score", True)])
-def test_simulated_features_are_those_of_the_simulated_flight(kind, free):
-    features = features_of(kind, free)
-
-    @eqx.filter_jit
-    def both(features, u):
-        parameters, start = features.coordinates.split(u, 8)
-        initial_state = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(start)
-        flight = jaxos4.simulate(PUBLISHED(), parameters, OMEGA, dt=DT, initial_state=initial_state)
-        return features.simulated(u), features(problem_of(flight.states, free=free))
-
-    u = np.random.default_rng(1).uniform(-1, 1, features.coordinates.center.shape)
-    simulated, (measured, inflation) = both(features, jnp.asarray(u))
-    np.testing.assert_allclose(simulated, measured, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(inflation, 1.0, rtol=1e-12)
-
-
-@pytest.mark.parametrize("kind", FEATURES)
-def test_simulated_noise_is_that_of_noisy_flights(kind):
-    """The score's noise is drawn in its own space: the same distribution as that of noisy flights."""
-    features, scale, count = features_of(kind), 3.0, 4000
-    noise = jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
-    keys = jax.random.split(jax.random.key(3), count)
-    exact = standard_flight(duration=DURATION)
-    measure = eqx.filter_jit(lambda features, k: features(problem_of(noise(exact, key=k).states))[0])
-    draw = eqx.filter_jit(
-        lambda features, k: features.simulated(u) + features.noise(scale * jax.random.normal(k, (features.size,)))
-    )
-    u = jnp.zeros(features.coordinates.center.shape)
-    measured, drawn = (jax.lax.map(lambda k, one=one: one(features, k), keys) for one in (measure, draw))
-    measured, drawn = (np.asarray(x)[:, slice(None) if kind == "score" else slice(300, 308)] for x in (measured, drawn))
-    unit = np.sqrt(np.diagonal(np.cov(drawn.T)))
-    difference = np.cov((measured / unit).T) - np.cov((drawn / unit).T)
-    assert np.abs(difference).max() < 5 * np.sqrt(4 / count)
-    assert np.abs((measured.mean(axis=0) - drawn.mean(axis=0)) / unit).max() < 5 * np.sqrt(2 / count)
-
 
 # Training.
 

@@ -4,11 +4,10 @@ import dataclasses
 import functools
 import json
 
-import jax
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CRAZYFLIE, compiled_programs, refused
+from helpers import CRAZYFLIE, refused
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from synthetic_results import provenance, row, vehicle_result
@@ -18,12 +17,11 @@ from jaxos4.airframe import airframe_table
 from jaxos4.closed_loop import Air, ClosedLoop, Sensors
 from jaxos4.closed_loop.flight import fly_standard
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("all_optimised")]
 
 TERMS = ("offset", "damping", "lag", "delay", "reaction", "accelerometer", "inflow", "drag")
 DRAG, DAMPING, LAG, DELAY = (0.3, 0.4, 0.5), 0.5, 0.04, 0.01
 GUST, THRUST_GUST, GUST_TIME, GYRO, FORCE, DT = 3.0, 0.5, 0.25, 0.02, 0.3, 0.01
-SERIES = ("time", "omega", "states", "specific_force")
 POSITION = 0.003  # noise of the position [m]
 
 
@@ -89,19 +87,6 @@ def uncertain(seed):
 def write(save):
     """Writes a result file."""
     return lambda content, name="found.json": save(json.dumps(content), name)
-
-
-# The first test compiles the programs of most others, optimised: the others compute for longer than they compile.
-def test_another_flight_needs_no_other_program(write, optimised):
-    path, flight = write(result()), flown(2)
-    shorter = dataclasses.replace(flight, **{name: getattr(flight, name)[:-160] for name in SERIES})
-    jax.clear_caches()
-    with compiled_programs() as first:
-        jaxos4.predict(path, flight)
-    assert len(first) <= 20, first
-    with compiled_programs() as second:
-        jaxos4.predict(path, shorter)
-    assert set(second) <= {"jit(stage)"}, second  # copies an array to the device
 
 
 def reference(begin, squares, steps):

@@ -23,6 +23,7 @@ from synthetic_identification import (
     identified_flight,
     identified_vehicle,
     synthetic_predictions,
+    synthetic_traces,
     vehicle_traces,
 )
 
@@ -114,21 +115,12 @@ def test_predictions_in_a_file_are_few(tmp_path):
 
 def test_channels_that_are_logged_rarely_stay_in_thinned_traces():
     """Attitude in every tenth sample from sample 3 on, position from sample 5 on; the second log begins in a block."""
-    traces = vehicle_traces(np.arange(100))
-    count, rows = 4010, np.arange(4010)
-    rare = np.where(rows % 10 == 3, rows + 1.0, np.nan)
-    traces = traces._replace(
-        time=0.002 * rows,
-        log=(rows >= 2001).astype(int),
-        rotors=np.tile(rows[:, None] + 1.0, 4),
-        measured=np.tile(rare[:, None], 6),
-        predicted=np.zeros((count, 0)),
-        disturbance=np.full((count, 3), np.nan),
-        position=np.tile(np.where(rows % 10 == 5, rows + 1.0, np.nan)[:, None], 3),
-    )
+    rows = np.arange(4010)
+    rare, places = (np.where(rows % 10 == first, rows + 1.0, np.nan)[:, None] for first in (3, 5))
+    traces = synthetic_traces(0.002 * rows, (rows >= 2001).astype(int), np.tile(rare, 6))
+    traces = traces._replace(disturbance=np.full((4010, 3), np.nan), position=np.tile(places, 3))
     fewer = traces.thinned(401)
     np.testing.assert_allclose(fewer.time, traces.time[::10])
-    np.testing.assert_allclose(fewer.rotors[:, 0], rows[::10] + 1)
     expected = rows[3::10] + 1.0
     expected[200] = np.nan  # only sample 2000 of this block is of the first log
     np.testing.assert_allclose(fewer.measured[:, 5], expected)

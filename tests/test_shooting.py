@@ -72,27 +72,6 @@ def test_cost_and_residuals_are_the_weighted_mismatch(model_class, channels, fre
     assert cost > 1
 
 
-def test_a_free_initial_state_starts_at_the_first_measurements():
-    states = measured()
-    order = np.asarray(CASCADE_ORDER)
-    value, spread = problem_of(free=True, states=states).first_state()
-    np.testing.assert_array_equal(value, states[0, order])
-    np.testing.assert_allclose(spread, 3 * SIGMA[order])
-    # p is measured from the third sample on, x never.
-    p, x = (jaxos4.STATE_NAMES.index(name) for name in ("p", "x"))
-    states = states.at[:2, p].set(jnp.nan).at[:, x].set(jnp.nan)
-    value, spread = problem_of(free=True, states=states).first_state()
-    assert float(value[0]) == float(states[2, p])
-    assert float(value[6]) == 0
-    assert spread[0] > 1
-    assert spread[6] > 2
-    np.testing.assert_array_equal(spread[1:6], 3 * SIGMA[order[1:6]])
-    # A known initial state is itself.
-    value, spread = problem_of().first_state()
-    np.testing.assert_array_equal(value, 0)
-    np.testing.assert_array_equal(spread, 0)
-
-
 @known_or_free
 def test_missing_measurements_contribute_nothing(free):
     states, lost = measured(), np.random.default_rng(0).random((101, 12)) < 0.3

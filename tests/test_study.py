@@ -1,4 +1,4 @@
-"""Studies: their plan, grid and draws, and their Dataset against the library called directly."""
+"""Studies: their plan and grid, their Dataset against the library called directly, and `jaxos4 compare`."""
 
 import itertools
 import json
@@ -6,15 +6,18 @@ import os
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import refused
+from helpers import compiled_programs, refused
 from hypothesis import given, settings, strategies as st
 from small_study import AIRFRAME, run_study, specification
 
 import jaxos4
-from jaxos4.study import OUTCOMES, Study, cell as cell_module, load_study, run as run_module
+from jaxos4.cli import studies
+from jaxos4.report import write_report
+from jaxos4.study import OUTCOMES, Study, Training, load_study, run as run_module
 from jaxos4.study.cell import run_cell
 from jaxos4.study.dataset import open_store, read_store
 from jaxos4.study.specification import AXES
@@ -91,36 +94,6 @@ def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
         assert tuple(axis[i] for axis, i in zip(axes, cell.place, strict=True)) == tuple(cell.scenario)
 
 
-def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
-    sizes = {"durations": (1.0,), "widths": (1.0, 0.5), "flights": 8, "batch": 4, "truth": "drawn", "seed": 7}
-    study = Study(scales=(0.0, 1.0, 10.0), channels=("rates", "all"), estimators=("ibss", "kalman"), **sizes)
-    truths, noises, draws = {}, {}, {}
-    for cell in map(study.cell, range(study.count)):
-        setup = cell_module.setup_of(study, cell.scenario)
-        truth, true, measured = (np.asarray(x) for x in cell_module.fly(study, setup, cell))
-        width, scale, first = cell.scenario.width, cell.scenario.scale, cell.first
-        np.testing.assert_array_equal(truths.setdefault((width, first), truth), truth)
-        np.testing.assert_array_equal(noises.setdefault((width, scale, first), measured), measured)
-        # The same uniform numbers for every width, and the same normal ones for every scale.
-        u = (truth - setup.bracket.center) / setup.bracket.half_width
-        np.testing.assert_allclose(draws.setdefault(first, u), u, rtol=1e-9, atol=1e-9)
-        if scale:
-            normal = (measured - true) / (scale * jaxos4.SENSOR_SIGMA)
-            np.testing.assert_allclose(draws.setdefault(("noise", first), normal), normal, rtol=0, atol=1e-8)
-        else:
-            np.testing.assert_array_equal(measured, true)
-    assert (len(truths), len(noises)) == (4, 12)
-    assert not np.allclose(draws[0], draws[4], atol=0.1)
-    assert np.std(draws["noise", 0]) == pytest.approx(1, abs=4 / np.sqrt(2 * 4 * 101 * 12))
-    # Around one truth, all brackets are off the airframe by one draw.
-    study, model = Study(widths=(1.0, 3.0), seed=7), jaxos4.PublishedOS4()
-    off = jax.random.uniform(jax.random.fold_in(jax.random.key(7), 0), (8,), minval=-0.8, maxval=0.8)
-    for width in study.widths:
-        bracket = cell_module.setup_of(study, study.cell(0).scenario._replace(width=width)).bracket
-        same(bracket.center, model.alpha + off * width * model.half_width, model.half_width)
-        same(bracket.half_width, width * model.half_width)
-
-
 # The Dataset.
 
 
@@ -156,6 +129,7 @@ def test_the_dataset_is_what_the_library_computes(dataset, number, scale):
         assert OUTCOMES[int(of["result"])] == jaxos4.result_names(found.result)
         assert int(of["hit"]) == -1
     same(dataset["center"].squeeze(), bracket.center, bracket.half_width)
+    assert (dataset["truth"] == dataset["truth"].isel(scale=0)).all()  # the same draws in all scenarios
     same(dataset["bracket_half_width"].squeeze(), bracket.half_width)
 
 
@@ -270,3 +244,49 @@ def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path,
     assert (code, "failed" in out) == (0, False)
     with xr.open_dataset("out/results.nc") as found:
         assert found.drop_attrs(deep=False).identical(dataset.drop_attrs(deep=False))
+
+
+# `jaxos4 compare`
+
+SMALL = {"durations": (0.5,), "flights": 16, "batch": 16, "channels": ("rates",)}
+SMALL |= {"estimators": ("ibss", "network", "hybrid"), "network": Training(steps=20, held_out=1000)}
+
+
+def draw_few(dataset, directory, **options):
+    """The report with one of the parameters: each has a panel, and panels take time."""
+    return write_report(dataset.isel(parameter=[6]), directory, **options)
+
+
+@pytest.fixture
+def cut(monkeypatch):
+    monkeypatch.setattr("jaxos4.report.write_report", draw_few)
+    whole = studies.comparison
+    monkeypatch.setattr(studies, "comparison", lambda *, quick: msgspec.structs.replace(whole(quick=quick), **SMALL))
+
+
+@pytest.mark.usefixtures("cut")
+def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monkeypatch):
+    with compiled_programs() as programs:
+        code, out, err = run("compare", "--quick", "--out", "here")
+    assert (code, err) == (0, "")
+    # Flights, their bounds, the network, and one search for IBSS and the hybrid.
+    assert programs.count("jit(chunk)") == 4
+    rows = ("noise x 0.1", "noise x 10", "bound, rates", "ibss", "network", "hybrid", "bracket centre")
+    assert all(words in out for words in (*rows, "144 estimates"))
+    figures = {path.name for path in (tmp_path / "here/figures").iterdir()}
+    assert figures >= {"error.svg", "efficiency.svg"}
+    page = (tmp_path / "here/report.html").read_text(encoding="utf-8")
+    assert all(f'<figure id="figure-{name.removesuffix(".svg")}">' in page for name in figures)
+    with xr.open_dataset(tmp_path / "here/results.nc") as results:
+        assert (results["result"] != OUTCOMES.index("not_run")).all()
+        assert dict(results.sizes)["scale"] == 3
+
+    written = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("here/cells/*")}
+    # Nothing remains to be computed. The figures would be the same again (test_report.py).
+    monkeypatch.setattr("jaxos4.report.write_report", lambda dataset, directory, **_: [directory / "report.html"])
+    code, again, _ = run("compare", "--quick", "--out", "here")
+    assert code == 0
+    assert written == {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("here/cells/*")} != {}
+    assert again.splitlines()[:-2] == out.splitlines()[:-2]
+
+    refused(run("compare", "--out", "here"), "here", "another study", "`title`")

@@ -6,62 +6,22 @@ that the cost of coloured and biased noise is visible. Without noise, errors are
 """
 
 import itertools
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
-from experiments.shared import PARAMETERS, brackets_around, identify, measure, noise_and_bracket_keys
+from experiments.monte_carlo import Row, continued, fill, in_words, print_table
+from experiments.shared import PARAMETERS, fit_noisy, scores, standard_problem
 from jaxos4.estimators import ESTIMATORS as ALL
 from jaxos4.noise import NOISES
 
 ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {
     name: kind for name, kind in ALL.items() if not kind.needs_network
 }
-
-
-def row_of(
-    estimator: jaxos4.AbstractEstimator,
-    noise: jaxos4.AbstractNoise,
-    scale: float,
-    channels: str,
-    flights: int,
-    seed: int,
-) -> Row:
-    """The results of one estimator with one noise: a row of the table."""
-    model = jaxos4.PublishedOS4(jaxos4.OS4)
-    exact = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
-    problem = jaxos4.ShootingProblem(
-        model, exact, sigma=(scale or 1.0) * jaxos4.SENSOR_SIGMA, initial_state=exact.states[0], channels=channels
-    )
-    noise_keys, start_keys = noise_and_bracket_keys(seed, flights)
-    states, brackets = measure(noise, exact, noise_keys), brackets_around(model, start_keys)
-    jax.block_until_ready(identify(estimator, problem, brackets, states))
-    begin = time.perf_counter()
-    found = jax.block_until_ready(identify(estimator, problem, brackets, states))
-    seconds = (time.perf_counter() - begin) / flights
-    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
-    results = jaxos4.result_names(found.result)
-    answered = np.isin(results, ["successful", "unidentifiable"])
-    errors = np.asarray(found.parameters - model.alpha)[answered] / bound
-    inside = np.abs(np.asarray(found.parameters - model.alpha)) < np.asarray(found.half_width(0.95))
-    return {
-        "flights": flights,
-        "answers": int(answered.sum()),
-        "results": count_results(results),
-        "efficiency": np.sqrt(np.mean(errors**2, axis=0)).tolist() if answered.any() else None,
-        "bias": np.mean(errors, axis=0).tolist() if answered.any() else None,
-        "monte_carlo_error": float(1 / np.sqrt(2 * max(answered.sum(), 1))),
-        "covered": inside[answered].mean(axis=0).tolist() if answered.any() else None,
-        "rollouts": float(np.mean(found.rollouts)),
-        "seconds": seconds,
-    }
 
 
 def main(
@@ -77,7 +37,9 @@ def main(
 
     def row(noise: str, scale: float, estimator: str) -> Row:
         kind = NOISES[noise if scale else "white"](scale * jaxos4.SENSOR_SIGMA)
-        return row_of(ESTIMATORS[estimator](), kind, scale, channels, flights, seed)
+        problem = standard_problem(jaxos4.PublishedOS4(jaxos4.OS4), channels, scale=scale or 1.0)
+        _, (found, seconds) = (fit_noisy(ESTIMATORS[estimator](), problem, flights, seed, kind) for _ in range(2))
+        return scores(problem, found) | {"seconds": seconds}
 
     report = continued(out, {"seed": seed, "channels": channels, "flights": flights}, "rows")
     trials = (
@@ -91,7 +53,7 @@ def main(
             *(row["noise"] if row["scale"] else "none", f"{row['scale']:g}", row["estimator"]),
             *((f"{x:.2g}" for x in row["efficiency"]) if row["efficiency"] else [""] * len(PARAMETERS)),
             f"{np.abs(row['bias']).max():.2g}" if row["bias"] else "",
-            f"{100 * np.mean(row['covered']):.0f}" if row["covered"] else "",
+            f"{100 * np.mean(row['covered']):.0f}",
             *(f"{row['rollouts']:.0f}", f"{1000 * row['seconds']:.3g}", in_words(row["results"])),
         )
         for row in report["rows"]

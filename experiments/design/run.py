@@ -15,13 +15,12 @@ import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
-from experiments.shared import brackets_around, identify, measure
+from experiments.monte_carlo import Row, continued, fill, in_words, print_table
+from experiments.shared import DT, fit_noisy, scores, standard_problem
 from jaxos4.design import Design
 from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.models import MODELS
 
-DT = 0.01
 # Widths of the bracket, in multiples of the default: that of all vehicles, and almost none.
 WIDTHS = {"default": 1.0, "airframe": 1e-3}
 # In the default bracket of this model some vehicles turn over in the standard multisine.
@@ -50,19 +49,11 @@ def excess(model: jaxos4.AbstractModel, found: Design, width: float, seed: int) 
     return max(found.task.envelope.shares(found.designed.inputs, states, DT).values())
 
 
-def efficiency(model: jaxos4.AbstractModel, found: Design, channels: str, flights: int, seed: int) -> dict:
+def efficiency(model: jaxos4.AbstractModel, found: Design, channels: str, flights: int, seed: int) -> Row:
     """RMSE / bound of each parameter over simulated flights, by IBSS."""
-    exact = jaxos4.simulate(model, model.alpha, jnp.asarray(found.designed.inputs), dt=DT)
-    keys = jax.random.split(jax.random.key(seed), (2, flights))
-    problem = jaxos4.ShootingProblem(
-        model, exact, channels=channels, sigma=jaxos4.SENSOR_SIGMA, initial_state=exact.states[0]
-    )
-    states = measure(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), exact, keys[0])
-    estimates = identify(jaxos4.IBSS(), problem, brackets_around(model, keys[1]), states)
-    errors = np.asarray(estimates.parameters) - np.asarray(model.alpha)
-    rmse = np.sqrt(np.square(errors).mean(axis=0))
-    results = count_results(jaxos4.result_names(estimates.result))
-    return {"efficiency": (rmse / found.designed.bounds).tolist(), "results": results, "flights": flights}
+    problem = standard_problem(model, channels, omega=jnp.asarray(found.designed.inputs))
+    row = scores(problem, fit_noisy(jaxos4.IBSS(), problem, flights, seed)[0])
+    return {name: row[name] for name in ("efficiency", "results", "flights")}
 
 
 def main(

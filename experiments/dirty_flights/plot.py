@@ -9,11 +9,11 @@ from jaxos4.report.style import INK, grid, styles
 
 def draw(report: dict) -> Figure:
     """A panel an airframe."""
-    airframes = report["airframes"]
-    figure, axes = grid(len(airframes), columns=len(airframes), height=4.2)
+    cases = report["cases"]
+    figure, axes = grid(len(cases), columns=len(cases), height=4.2)
     look = styles(["ibss"])["ibss"]
-    for panel, (name, of) in zip(axes, airframes.items(), strict=True):
-        rows = of["summary"]
+    for panel, case in zip(axes, cases, strict=True):
+        rows = case["summary"]
         y = np.arange(len(rows))
         panel.axvline(95, color=INK, linewidth=1.0)
         panel.errorbar(
@@ -26,7 +26,7 @@ def draw(report: dict) -> Figure:
         )
         panel.set_ylim(len(rows) - 0.5, -0.5)
         panel.set_yticks(y, list(rows))
-        panel.set_title(f"{name}, {len(of['flights'])} flights")
+        panel.set_title(f"{case['airframe']}, {len(case['flights'])} flights")
         panel.set_xlabel("intervals that hold the truth [%]")
     return figure
 

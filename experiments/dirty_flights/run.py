@@ -7,7 +7,6 @@ recording is averaged to 4 ms and fitted by the likelihood of its innovations. P
 counted.
 """
 
-import functools
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, continued, fill, print_table, write_report
+from experiments.monte_carlo import Row, monte_carlo, print_table
 from jaxos4.estimators import make_estimator
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import corrected
@@ -207,15 +206,14 @@ def main(
 ) -> None:
     """Coverage of 95 % intervals on dirty flights."""
     settings = {"seed": seed, "duration": duration, "estimator": estimator}
-    report = continued(out, settings, "airframes")
-    report["airframes"] = report["airframes"] or {}
-    for name in airframes:
-        case = report["airframes"].setdefault(name, {"summary": {}, "flights": []})
-        numbers = ({"flight": i} for i in range(flights))
-        fill(out, report, case["flights"], numbers, functools.partial(identify, AIRFRAMES[name], estimator, settings))
-        case["summary"] = summary(case["flights"])
-        write_report(out, report)
+
+    def row_of(flight: int, i: int, airframe: str) -> Row:
+        return identify(AIRFRAMES[airframe], estimator, settings, flight)
+
+    cases = [{"airframe": name} for name in airframes]
+    report = monte_carlo(out, settings, cases, lambda airframe: range(flights), row_of, summary)
+    for case in report["cases"]:
         seconds = float(np.median([flight["seconds"] for flight in case["flights"]]))
-        title = f"95 % intervals of {flights} flights of {duration:g} s, {name}, {seconds:.1f} s a fit"
+        title = f"95 % intervals of {flights} flights of {duration:g} s, {case['airframe']}, {seconds:.1f} s a fit"
         headings = "parameter", "identified", "covered [%]", "+-", "bias [std]", "spread [std]", "mean error", "/ CRB"
         print_table(title, headings, table_rows(case["summary"]), width=120)

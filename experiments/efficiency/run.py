@@ -4,20 +4,15 @@ Many noisy standard flights are identified in one call, by IBSS if the case name
 with the model that is fitted (the inverse crime), so that the bound applies.
 """
 
-import time
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, continued, count_results, in_words, print_table, write_report
-from experiments.shared import PARAMETERS
-from jaxos4.results import NINETY_FIVE
+from experiments.monte_carlo import Row, continued, fill, in_words, print_table
+from experiments.shared import PARAMETERS, fit_noisy, scores, standard_problem
 
 
 class Case(NamedTuple):
@@ -43,50 +38,6 @@ CASES = {
 }
 
 
-def study(case: Case, flights: int, seed: int, *, scale: float) -> Row:
-    """Identify noisy standard flights, each from a random start within 80 % of the default bracket."""
-    model = case.model(jaxos4.OS4)
-    flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
-    bracket = jaxos4.Bracket.default(model)
-    sigma = scale * jaxos4.SENSOR_SIGMA
-    noise = jaxos4.WhiteNoise(sigma)
-
-    def problem(data: jaxos4.Flight) -> jaxos4.ShootingProblem:
-        settings = {"channels": case.channels, "windows": case.windows}
-        start = flight.states[0] if case.known else None
-        return jaxos4.ShootingProblem(model, data, sigma=sigma, initial_state=start, **settings)
-
-    @eqx.filter_jit
-    @eqx.filter_vmap(in_axes=(None, 0))
-    def identify(key, trial) -> jaxos4.Estimate:
-        noise_key, start_key = jax.random.split(jax.random.fold_in(key, trial))
-        start = bracket.center + 0.8 * bracket.half_width * jax.random.uniform(start_key, (8,), minval=-1, maxval=1)
-        noisy = problem(noise(flight, key=noise_key))
-        if case.estimator is jaxos4.IBSS:
-            return jaxos4.IBSS()(noisy, bracket, start=start)
-        return case.estimator()(noisy, jaxos4.Bracket.around(start, bracket.half_width))
-
-    arguments = jax.random.key(seed), jnp.arange(flights)
-    begin = time.perf_counter()
-    compiled = identify.lower(*arguments).compile()
-    built = time.perf_counter()
-    estimates = jax.block_until_ready(compiled(*arguments))
-    done = time.perf_counter()
-
-    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(flight), model.alpha)))
-    error = np.asarray(estimates.parameters - model.alpha) / bound
-    return {
-        "efficiency": np.sqrt(np.mean(error**2, axis=0)).tolist(),
-        "bias": error.mean(axis=0).tolist(),
-        "monte_carlo_error": 1 / np.sqrt(2 * flights),
-        "covered": float(np.mean(np.abs(error * bound) < NINETY_FIVE * np.asarray(estimates.std))),
-        "results": count_results(jaxos4.result_names(estimates.result)),
-        "rollouts": float(np.mean(estimates.rollouts)),
-        "compile_seconds": built - begin,
-        "seconds": done - built,
-    }
-
-
 def main(
     flights: Annotated[int, typer.Option(help="Number of flights for each case.")] = 512,
     seed: Annotated[int, typer.Option(help="Random seed for noise and starts.")] = 0,
@@ -95,18 +46,22 @@ def main(
     out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure RMSE / Cramer-Rao bound for each parameter."""
+
+    def row_of(case: str) -> Row:
+        of = CASES[case]
+        settings = {"scale": scale, "known": of.known, "windows": of.windows}
+        problem = standard_problem(of.model(jaxos4.OS4), of.channels, **settings)
+        found, seconds = fit_noisy(of.estimator(), problem, flights, seed)
+        return scores(problem, found) | {"seconds": flights * seconds}
+
     report = continued(out, {"flights": flights, "seed": seed, "scale": scale}, "cases")
-    report["cases"] = dict(report["cases"])
-    for case in cases:
-        if case not in report["cases"]:
-            report["cases"][case] = study(CASES[case], flights, seed, scale=scale)
-            write_report(out, report)
+    fill(out, report, report["cases"], ({"case": name} for name in cases), row_of)
     cells = (
         (
-            *(case, *(f"{x:.2f}" for x in row["efficiency"]), f"{row['covered']:.3f}"),
+            *(row["case"], *(f"{x:.2f}" for x in row["efficiency"]), f"{np.mean(row['covered']):.3f}"),
             *(in_words(row["results"]), f"{row['rollouts']:.0f}", f"{row['seconds']:.1f}"),
         )
-        for case, row in report["cases"].items()
+        for row in report["cases"]
     )
     title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
     print_table(title, ("case", *PARAMETERS, "covered", "results", "rollouts", "s"), cells)

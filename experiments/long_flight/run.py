@@ -11,15 +11,13 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import typer
 
 import jaxos4
 from experiments.monte_carlo import Row, continued, count_results, fill, in_words, print_table
-from experiments.shared import PARAMETERS
+from experiments.shared import PARAMETERS, identify, many_times
 
 SHOOTING = {"ibss": jaxos4.IBSS, "output-error": jaxos4.OutputError}
 # The parameters that are compared: those that are identifiable and not 0.
@@ -42,32 +40,15 @@ def drifting(duration: float, drift: float, flights: int, seed: int) -> tuple[ja
     return recorded, fly(jax.random.split(jax.random.key(seed), flights))
 
 
-def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int, steps: int) -> Row:
+def fit(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int) -> Row:
     """The results of one estimator with one number of windows: a row of the table."""
     model, flights = jaxos4.PublishedOS4(jaxos4.OS4), states.shape[0]
-    bracket = jaxos4.Bracket.default(model)
-    bracket = jaxos4.Bracket.around(bracket.center + 0.3 * bracket.half_width, bracket.half_width)
-
-    def problem(states: jax.Array) -> jaxos4.ShootingProblem:
-        flight = eqx.tree_at(lambda f: f.states, recorded, states)
-        return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", windows=windows)
-
-    if name == "hybrid":
-        # Windows start at the measured states of this flight, so the network serves this flight only.
+    bracket = many_times(jaxos4.Bracket.around(model.alpha + 0.3 * model.half_width, model.half_width), flights)
+    problem = jaxos4.ShootingProblem(model, recorded, sigma=jaxos4.SENSOR_SIGMA, channels="rates", windows=windows)
+    for _ in range(2):  # the first call compiles
         begin = time.perf_counter()
-        found = []
-        for flown in states:
-            network = jaxos4.NetworkEstimator(steps=steps).fit(problem(flown), bracket, key=jax.random.key(0))
-            found.append(jaxos4.Hybrid(network)(problem(flown), bracket))
-        seconds = (time.perf_counter() - begin) / flights
-        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-    else:
-        estimator = SHOOTING[name]()
-        one = eqx.filter_jit(eqx.filter_vmap(lambda states: estimator(problem(states), bracket)))
-        jax.block_until_ready(one(states))
-        begin = time.perf_counter()
-        found = jax.block_until_ready(one(states))
-        seconds = (time.perf_counter() - begin) / flights
+        found = jax.block_until_ready(identify(SHOOTING[name](), problem, bracket, states))
+    seconds = (time.perf_counter() - begin) / flights
     results = jaxos4.result_names(found.result)
     answered = results == "successful"
     errors = np.asarray(found.parameters / model.alpha - 1)[:, COMPARED]
@@ -86,15 +67,14 @@ def main(
     seed: Annotated[int, typer.Option(help="Random seed for drifts and noise.")] = 3,
     drifts: Annotated[list[float], typer.Option(help="Standard deviations of the factors.")] = (0.0, 1e-4, 1e-3),
     windows: Annotated[list[int], typer.Option(help="Numbers of windows.")] = (1, 6, 30, 120),
-    estimators: Annotated[list[str], typer.Option(help="Names; also hybrid (slow).")] = tuple(SHOOTING),
-    steps: Annotated[int, typer.Option(help="Training steps of the hybrid's networks.")] = 1000,
+    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = tuple(SHOOTING),
     out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Compare one window with many on long flights."""
     flown = functools.cache(lambda drift: drifting(duration, drift, flights, seed))
 
     def row_of(drift: float, windows: int, estimator: str) -> Row:
-        return identify(estimator, *flown(drift), windows, steps)
+        return fit(estimator, *flown(drift), windows)
 
     report = continued(out, {"seed": seed, "duration": duration, "flights": flights}, "rows")
     trials = (

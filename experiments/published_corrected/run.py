@@ -17,7 +17,7 @@ import typer
 import xarray as xr
 
 import jaxos4
-from experiments.shared import measure, save_results
+from experiments.shared import identify, many_times, measure, save_results, standard_problem
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
@@ -43,13 +43,6 @@ def model_of(study: Study, name: str) -> jaxos4.AbstractModel:
     return MODELS[name](jaxos4.load_airframe(study.airframes[0]))
 
 
-@eqx.filter_jit
-@eqx.filter_vmap(in_axes=(None, None, 0))
-def identify(exact: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, states: jax.Array) -> jaxos4.Estimate:
-    """Fit noisy flights. They differ from the flight of `exact` in their measured states."""
-    return jaxos4.IBSS()(eqx.tree_at(lambda p: p.flight.states, exact, states), bracket)
-
-
 def judge(exact: jaxos4.ShootingProblem, found: jaxos4.Estimate, states: jax.Array) -> Fits:
     """The fits with their diagnostics."""
     least = []
@@ -66,15 +59,14 @@ def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
     truth, model = model_of(study, flown), model_of(study, fitted)
     omega = EXCITATIONS[study.excitations[0]](model.airframe, duration=study.durations[0], dt=study.dt)
     sigma = study.scales[0] * jaxos4.SENSOR_SIGMA
-    own = jaxos4.simulate(model, model.alpha, omega, dt=study.dt)
-    exact = jaxos4.ShootingProblem(model, own, sigma=sigma, initial_state=jnp.zeros(12), channels=channels)
+    exact = standard_problem(model, channels, scale=study.scales[0], omega=omega)
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(exact, model.alpha)))
 
     flight, noise = jaxos4.simulate(truth, truth.alpha, omega, dt=study.dt), jaxos4.WhiteNoise(sigma)
     keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(study.seed), i))(jnp.arange(study.flights))
     bracket = jaxos4.Bracket.around(model.alpha + 0.3 * model.half_width, model.half_width)
     states = measure(noise, flight, keys)
-    found = judge(exact, identify(exact, bracket, states), states)
+    found = judge(exact, identify(jaxos4.IBSS(), exact, many_times(bracket, study.flights), states), states)
     answered = np.isin(found.result, ["successful", "unidentifiable"])
     error = found.estimate - np.asarray(model.alpha)
     return xr.Dataset(
