@@ -204,20 +204,6 @@ def test_coverage(tmp_path):
         assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
 
 
-def test_dirty_flights(tmp_path):
-    report = result_of(tmp_path, "dirty_flights", flights=2, duration=6.0, seed=17, airframes=["os4"])
-    plot(tmp_path, "dirty_flights")
-    found, summary = (report["cases"][0][name] for name in ("flights", "summary"))
-    assert {flight["result"] for flight in found} == {"successful"}
-    assert max(flight["fastest"] for flight in found) < 5
-    # The lag of 60 ms and the delay of 8 ms are found within a few standard errors.
-    for name in ("rotor_lag", "rotor_delay", "alpha3", "alpha6", "roll_damping", "thrust_gain"):
-        assert summary[name]["identified"] == 2
-        assert abs(summary[name]["bias"]) < 4
-    assert abs(summary["rotor_lag"]["mean_error"]) < 3e-3
-    assert abs(summary["rotor_delay"]["mean_error"]) < 2e-3
-
-
 def test_long_flight(tmp_path):
     """Windows follow a drift that one shot cannot. One shot ends at the bounds, and its result says so."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
