@@ -64,9 +64,11 @@ class SVSF(AbstractRecursion):
     - `passes`: number of passes over the flight. Each begins with the parameters of the pass before (iterative SVSF).
 
     The answer is the mean of the parameters over the second half of the last pass, whose parameters are the `history`.
-    A free initial state is fitted to them at the end. The method gives no covariance: ours follows the errors through
-    the slope of each correction (in the manner of Gadsden and Habibi 2010), and only its size is right, as all passes
-    see the same noise.
+    Only the body rates are used. A free initial state is fitted to the parameters at the end.
+
+    The method gives no covariance. Ours follows the errors through the slope of each correction (in the manner of
+    Gadsden and Habibi 2010). Only its size is right, because all passes see the same noise. A pass counts as one
+    rollout for each rate and parameter, and one for the state.
 
     Reference: Habibi 2007, Proc. IEEE 95(5), 1026-1059; Al-Shabi and Habibi 2011, ISRN Signal Processing 725108, for
     the idea of iterating it.
