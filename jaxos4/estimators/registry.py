@@ -28,8 +28,8 @@ ESTIMATORS = Estimators(
         "filter-error": "estimators.levenberg_marquardt:FilterError",
         "equation-error": "estimators.equation_error:EquationError",
         "rls": "estimators.equation_error:RecursiveLeastSquares",
-        "svsf": "estimators.recursive:SVSF",
-        "kalman": "estimators.recursive:JointEKF",
+        "svsf": "estimators.svsf:SVSF",
+        "kalman": "estimators.kalman:JointEKF",
         "ant-colony": "estimators.ant_colony:AntColony",
     },
 )
