@@ -127,7 +127,10 @@ def _read_text(
 
 
 def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST) -> None:
-    """Refuse, at any depth, a text that is not one printable line, and a number beyond `largest`, by default none."""
+    """Refuse, at any depth, a text that is not one printable line, and a number beyond `largest`.
+
+    Infinity and NaN are allowed with the default `largest`, and refused with another.
+    """
     pending = [("", value)]
     while pending:
         place, each = pending.pop()

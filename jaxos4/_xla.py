@@ -1,8 +1,8 @@
 """Flags of XLA for a CPU: loops become native functions, and vectors are whole.
 
 By default, XLA calls a function for every few operations of a loop, which takes ten times as long. JAX reads
-`XLA_FLAGS` when it starts to compute. An unknown flag ends the process: `pyproject.toml` names the versions that know
-all.
+`XLA_FLAGS` when it starts to compute. An unknown flag ends the process, so `pyproject.toml` allows only versions of JAX
+that know all of these.
 """
 
 import os

@@ -69,7 +69,7 @@ class Comparison(NamedTuple):
 def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Comparison:
     """Compare results of repeated flights quantity by quantity.
 
-    jaxos4.compare_results(["monday.json", "tuesday.json"]).different
+        jaxos4.compare_results(["monday.json", "tuesday.json"]).different
 
     The test is chi-squared, of the equality of independent estimates with known standard deviations. Mass and arms are
     the same in all results, so that agreement says nothing about them.

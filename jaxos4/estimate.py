@@ -44,7 +44,8 @@ class Estimate(eqx.Module):
     - `covariance`: of `parameters`, from the Fisher information and the problem's `sigma`; a network's from its errors
       on simulated flights. Infinite without an estimate.
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
-    - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own), or infinite.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own). Infinite without
+      an estimate.
     - `rollouts`: simulated flights: one for a shot, and one for each of its derivatives; IBSS, and the fit of an
       initial state alone, count the derivatives only. `sweeps`: number of iterations, summed over the stages.
     - `result`: how the search ended.
@@ -217,7 +218,11 @@ class AbstractEstimator(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, problem: Any, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight, in the problem's own bracket or in another. For a batch use `eqx.filter_vmap`."""
+        """Identifies one flight, in the problem's own bracket or in another.
+
+        `problem`: a `ShootingProblem`, or any other `AbstractProblem`. For a batch use `eqx.filter_vmap`: a lane that
+        fails does not change the others.
+        """
 
 
 class AbstractRecursion(AbstractEstimator):

@@ -92,9 +92,10 @@ class Flight(eqx.Module):
       (`jaxos4.join`), and their time counts samples. `None`: the flight is one stretch.
     - `commanded`: whether `omega` holds commands, which the rotors follow with a lag, and not measured speeds.
     - `voltage`: of the battery [V], an input of some models; no NaN. `None`: not logged.
-    - `within`: the root mean square of each rotor's speed in equal parts of the sample around `time[k]`. `None`:
-      unknown.
-    - `averaging_time`: how long measurements are averaged around `time[k]` [s]; 0: instants.
+    - `held`: see `omega`.
+    - `within`: the root mean square of each rotor's speed in equal parts of the sample, from `time[k]` - dt/2 to
+      `time[k]` + dt/2 [rad/s]. `None`: unknown.
+    - `averaging_time`: how long measurements are averaged around `time[k]` [s]; 0: they are those at this instant.
 
     **Raises:** `ValueError` for arrays whose shapes do not agree, or fewer than two samples.
     """

@@ -1,4 +1,4 @@
-"""Sine and cosine in one polynomial evaluation over lanes, because a CPU's library functions are slow in steps."""
+"""Sine and cosine in one polynomial evaluation that vectorises over a batch of lanes (see docs/measured.md)."""
 
 import math
 

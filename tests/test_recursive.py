@@ -10,7 +10,7 @@ from helpers import DT, REFERENCES, noisy_states, published_derivative, random_s
 from lanes import HALF, LANES, bound, errors, identify, lanes, lost, names, noisy
 
 import jaxos4
-from jaxos4.estimators.recursive import SVSF, JointEKF
+from jaxos4.estimators import SVSF, JointEKF
 
 pytestmark = pytest.mark.slow
 

@@ -16,7 +16,7 @@ from jaxos4 import PublishedOS4, compare_results
 from jaxos4.design import Design
 from jaxos4.design.task import Designed
 from jaxos4.report import write_comparison, write_flight_page, write_log_page, write_report
-from jaxos4.report.flights import write_design
+from jaxos4.report.design import write_design
 
 pytestmark = pytest.mark.slow
 

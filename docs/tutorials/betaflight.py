@@ -80,7 +80,7 @@ print(*wrong.verdicts["Iz"].reasons, sep="\n")
 # %% [markdown]
 # ## Identify
 #
-# The reason names the remedy, so the spins are turned round:
+# The reason names the remedy: we reverse the spins.
 
 # %%
 Path("mine.toml").write_text(MINE.format(spins=[-1, 1, 1, -1]))

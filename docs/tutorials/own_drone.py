@@ -48,7 +48,7 @@ print(*Path("mylog.csv").read_text().splitlines()[:3], sep="\n")
 # ## Say what the columns are
 #
 # A [column map](../logs.md#any-csv-by-a-column-map) names the source of each quantity and its
-# unit. A table in Python does, or a TOML file for the command line (`--columns map.toml`).
+# unit. Here it is a table in Python; the command line takes a file (`--columns map.toml`).
 
 # %%
 columns = {"t": {"source": "time_ms", "unit": "ms"}}
@@ -102,8 +102,8 @@ found = jaxos4.identify(recording, airframe, settings=jaxos4.VehicleSettings(sam
 print(found.summary())
 
 # %% [markdown]
-# `sample_time` makes this page faster; without it, a rule chooses the sample time. We know the
-# truth here, which nobody knows about a real vehicle:
+# `sample_time` makes this page faster; without it, a rule chooses the sample time. This flight
+# is simulated, so we know the truth:
 
 # %%
 for name, true in (("Ix", 1.66e-5), ("Iy", 1.70e-5)):

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Predict another flight, and export the vehicle
 #
-# A model is worth what it predicts. One flight identifies a vehicle, another one tests it, and
-# MuJoCo gets it.
+# A model is worth what it predicts. Here one flight identifies a vehicle, another flight tests
+# it, and the vehicle is exported to MuJoCo.
 
 # %%
 import json
@@ -17,9 +17,9 @@ import jaxos4
 # %% [markdown]
 # ## Two flights
 #
-# They are simulated: 20 s each in gusts of 2 rad/s², by [the vehicle of the first
-# tutorial](own_drone.md), with other references. The vehicle is written as a file, which
-# `jaxos4 simulate --closed-loop --airframe vehicle.toml` takes too.
+# Both are simulated: 20 s in gusts of 2 rad/s², with [the vehicle of the first
+# tutorial](own_drone.md). Their references differ. `jaxos4 simulate --closed-loop --airframe
+# vehicle.toml` takes the same file of the vehicle.
 
 # %%
 Path("vehicle.toml").write_text("""
@@ -94,7 +94,7 @@ print(jaxos4.read_result("found.json").verdicts["Ix"].status)
 # %% [markdown]
 # ## Export
 #
-# Each note is a difference between the identified vehicle and the simulator's.
+# Each note names a difference between the identified vehicle and the one in the simulator.
 
 # %%
 exported = jaxos4.export.export_vehicle(jaxos4.export.read_result("found.json"), "mujoco")

@@ -43,8 +43,8 @@ for name, value, std in zip(model.parameter_names, estimate.parameters, estimate
 # ## A network for these inputs
 #
 # It is trained on simulated flights with the same inputs and random parameters from the
-# bracket. By default it sees the body rates alone, in 4,000 steps; 1,000 steps make this page
-# fast.
+# bracket. It sees the body rates alone. By default, training takes 4,000 steps; 1,000 steps
+# keep this page fast.
 
 # %%
 network = jaxos4.NetworkEstimator(steps=1000).fit(
@@ -55,8 +55,8 @@ network = jaxos4.NetworkEstimator(steps=1000).fit(
 # ## 64 flights at once
 #
 # Estimators are written for one flight, and `vmap` makes a batch of them. All flights have the
-# same true parameters, those of the OS4, in the centre of the bracket; `jaxos4 study` draws
-# others for each flight.
+# same true parameters, those of the OS4, in the centre of the bracket. `jaxos4 study` moves the
+# bracket at random for each flight, or draws other parameters.
 
 # %%
 ESTIMATORS = {
@@ -92,9 +92,9 @@ for name, each in ratio.items():
     print(f"{name:20} RMSE / bound {each.min():.2f} to {each.max():.2f}")
 
 # %% [markdown]
-# The network cannot be better than the bound of the body rates, which is up to six times as
-# large as this one. The hybrid does not suffer from this: the network only chooses where IBSS
-# begins, and IBSS finds the optimum in all channels.
+# The network sees the body rates alone, and their bound is up to six times as large as the
+# bound of all channels. The hybrid does not suffer from this: the network only chooses where
+# IBSS begins, and IBSS finds the optimum in all channels.
 
 # %%
 figure, axes = plt.subplots(figsize=(7, 3.2))

@@ -2,8 +2,8 @@
 # # A term of your own
 #
 # The model of a vehicle is a rigid body and a list of terms. Here is a term that jaxos4 lacks:
-# friction of the air against yaw that grows with the square of the rate. We see what happens
-# to a fit that ignores it, and to one that knows it. [Add a vehicle term](../extend/term.md)
+# friction of the air against yaw that grows with the square of the rate. We compare a fit that
+# ignores the friction with a fit that has the term. [Add a vehicle term](../extend/term.md)
 # describes all that a term can do.
 
 # %%
@@ -50,9 +50,8 @@ print(f"largest yaw rate: {np.abs(clean.states[:, 11]).max():.2f} rad/s")
 # %% [markdown]
 # ## Two fits
 #
-# Both search the maximum of the same likelihood of the body rates. Half of a sum of squared
-# normal residuals is about half of their number; a much larger cost says that something is
-# missing.
+# Both maximise the same likelihood of the body rates. If the model is right, the cost is about
+# half of the number of measurements. A much larger cost means that the model lacks an effect.
 
 # %%
 expected = 3 * flight.time.size / 2
@@ -76,7 +75,7 @@ def fit(terms):
 without, within = fit(()), fit(("friction",))
 
 # %% [markdown]
-# Without the term, the moment of inertia about yaw pays for it:
+# Without the term, the error goes into alpha8, so the moment of inertia about yaw is wrong:
 
 # %%
 for name, found in (("without", without), ("with", within)):

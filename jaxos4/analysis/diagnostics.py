@@ -14,9 +14,11 @@ from .evaluation import Evaluation
 class Correlations(NamedTuple):
     """Correlations of the residuals of some channels: with themselves, and with the roll, pitch and yaw torque.
 
-    - `own`: at 1, 2, ... samples apart. `with_torque`: at lags of the residual from -`lags` to `lags`; controllers
-      answer residuals, at negative lags.
-    - `bound`, `torque_bound`: larger than 95 % of those of white residuals, and of coloured ones without a torque.
+    - `own`: at 1, 2, ... samples apart.
+    - `with_torque`: at lags from -`lags` to `lags`; at a positive lag, the residual is the later one. A controller
+      answers residuals, so a vehicle has correlations at negative lags.
+    - `bound`: larger than 95 % of `own` if residuals are white. `torque_bound`: larger than 95 % of `with_torque` if no
+      torque causes the residuals, white or coloured.
     """
 
     own: Float[np.ndarray, "channels lags"]
@@ -33,7 +35,7 @@ class Diagnostics(eqx.Module):
 
     - `feasible`: whether the trajectory did not fail before its end. If not, the other fields mean nothing.
     - `count`: number of measured samples. `rms`: of the residuals, in the channel's unit.
-    - `percent`: 100 (1 - |y - x| / |y - mean y|). 100 is a perfect prediction, 0 is as good as the mean, or no motion.
+    - `percent`: 100 (1 - |y - x| / |y - mean y|). 100: a perfect prediction. 0: as good as the mean, or no motion.
     - `level`: mean square of the weighted residuals (the *normalised innovation level*). `level_p`: p-value of a level
       of 1, two-sided (chi-squared).
     - `autocorrelation`: of residuals 1, 2, ... samples apart. `colour`: that of the first lag with measured pairs.

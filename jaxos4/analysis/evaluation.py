@@ -157,8 +157,10 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
     too. The residuals are taken as the noise, and lack slow noise that the fit explained as motion: a flight must be
-    many times longer than the noise's correlation time. The noise is stationary, or, with 20 windows or more of at most
-    4,000 residuals each, of one covariance in all windows. Infinite if the trajectory diverges or nothing was measured.
+    many times longer than the noise's correlation time. The noise is assumed to be stationary. With 20 windows or more
+    of at most 4,000 residuals each, it is assumed instead to have the same covariance in all windows.
+
+    **Returns:** the covariance; infinite if the trajectory diverges or nothing was measured.
 
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """
@@ -216,7 +218,10 @@ def _window_by_window(errors: np.ndarray, measured: np.ndarray, moves: np.ndarra
 
 
 def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
-    """The inverse of symmetric positive semidefinite matrices in any units; huge, but finite, without information."""
+    """The inverse of symmetric positive semidefinite matrices in any units.
+
+    A direction without information gets a variance that is huge, but neither infinite nor negative.
+    """
     scale, values, vectors = unit_eigen(information)
     inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return inverse / scale[..., :, None] / scale[..., None, :]
@@ -225,7 +230,10 @@ def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "
 def unit_eigen(
     matrix: Float[np.ndarray, "*batch n n"],
 ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n n"]]:
-    """The scale that makes the diagonal 1, and the eigenvalues, at least the rounding errors, and eigenvectors then."""
+    """The scale that makes the diagonal 1, and eigenvalues and eigenvectors of the scaled matrix.
+
+    An eigenvalue below the rounding errors counts as large as these.
+    """
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where((diagonal > 0) & np.isfinite(diagonal), diagonal, 1.0))
     unit = matrix / scale[..., :, None] / scale[..., None, :]

@@ -77,8 +77,11 @@ class Identifiability(eqx.Module):
 def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability:
     """Analyse which parameters of the problem's model its flight can identify, at the problem's sigma.
 
-    `bracket`: says how well each is known without the flight. The standard deviations are infinite if the trajectory
-    diverges or the bracket is not valid. Raises `ValueError` for a bracket of another length.
+    - `evaluation`: the flight, evaluated where the information is computed.
+    - `bracket`: its half-widths say how well each parameter is known without the flight.
+
+    Standard deviations are infinite if the trajectory diverges or the bracket is not valid. Raises `ValueError` for a
+    bracket of another length.
     """
     if bracket.lower.shape != evaluation.nominal.shape:
         raise ValueError(f"`bracket` must hold {evaluation.nominal.size} parameters, got {bracket.lower.shape[0]}.")

@@ -65,7 +65,10 @@ def filtered(
     stretch: Int[Numeric, " samples"],
     dt: Scalar,
 ) -> Filtered:
-    """Rates and disturbances at each sample, anew in each stretch. `modelled`: p', q', r'; 0 for a specific force."""
+    """The rates and disturbances at each sample. Filters begin anew in each stretch.
+
+    `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model.
+    """
     begins = jnp.diff(stretch, prepend=-1) != 0
     is_known, memory = ~jnp.isnan(measured), is_rate(measured.shape[1])
     gains = gains_of(Observed(measured[:, :, None], begins[:, None], begins[:, None]), noise, dt)
@@ -92,9 +95,10 @@ class Traced(NamedTuple):
 
 
 def traced(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Traced:
-    """The knowledge of Kalman filters at each sample from the measurements until then, at the measured rates.
+    """The knowledge of Kalman filters at each sample from the measurements until then.
 
-    An innovation is a measured rate less its prediction. `noise`: its first three channels are p, q and r.
+    The model is evaluated at the measured rates. An innovation is a measured rate less its prediction from the sample
+    before. `noise`: its first three channels are p, q and r.
     """
     rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
     modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))

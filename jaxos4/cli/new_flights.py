@@ -170,7 +170,7 @@ def design(
         found.task.write(found.designed, out)
     from rich.console import Console
 
-    from ..report.flights import print_design, write_design
+    from ..report.design import print_design, write_design
 
     if figure is not None:
         with stages("drawing"):

@@ -18,7 +18,8 @@ from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
-from .settings import BodyMotion, ClosedLoop, PerAxis, Sense, Signals, log
+from .sensors import BodyMotion, Sense, Signals, log
+from .settings import ClosedLoop, PerAxis
 
 
 def fly_closed_loop(

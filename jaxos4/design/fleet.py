@@ -92,7 +92,8 @@ class Fleet(eqx.Module):
 
     - `still`: so many vehicles fly in still air, and show velocity and distance: gusts carry the others away.
     - `least_gust`: disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2].
-    - `slowest`, `fastest`: speeds of rotors, as shares of that in hover, if no maximum is known.
+    - `slowest`: rotors turn at least with this share of the speed in hover. `fastest`: and at most with this multiple,
+      if no maximum is known.
     - `gust_share`: gusts alone use at most this share of a limit that is not given.
     """
 

@@ -1,4 +1,7 @@
-"""Estimators: from a `ShootingProblem` and a `Bracket` to an `Estimate`. `__init__.pyi` names them."""
+"""Estimators: from a `ShootingProblem` and a `Bracket` to an `Estimate`. Each algorithm has its own file.
+
+`__init__.pyi` names them; each is imported when it is first used.
+"""
 
 import lazy_loader
 

@@ -241,7 +241,7 @@ class EquationError(AbstractEstimator):
     A known initial state is exact for a `memory` of 1, and one more sample for a smaller one. Without noise the answer
     is exact for forward Euler; for another `method` the trapezoidal rule leaves a small error. The covariance has the
     white noise of `sigma` in regressors and outputs, to first order, but neither the bias nor forces that the model
-    lacks.
+    lacks. Without measurements of a rate the result is `unidentifiable`.
 
     References: Klein and Morelli, Aircraft System Identification, ch. 5; Jategaonkar, Flight Vehicle System
     Identification, ch. 6; Ljung, System Identification, section 7.3.

@@ -28,8 +28,8 @@ ESTIMATORS = Estimators(
         "filter-error": "estimators.levenberg_marquardt:FilterError",
         "equation-error": "estimators.equation_error:EquationError",
         "rls": "estimators.equation_error:RecursiveLeastSquares",
-        "svsf": "estimators.recursive:SVSF",
-        "kalman": "estimators.recursive:JointEKF",
+        "svsf": "estimators.svsf:SVSF",
+        "kalman": "estimators.kalman:JointEKF",
         "ant-colony": "estimators.ant_colony:AntColony",
     },
 )
@@ -38,7 +38,10 @@ entry point of another package in the group `jaxos4.estimators`, with the class.
 
 
 def make_estimator(name: str, network: "TrainedNetwork | None" = None) -> "AbstractEstimator":
-    """The estimator of that name with its default settings and, if needed, a `network`. Raises `ValueError`."""
+    """The estimator of that name with its default settings. If it needs a network, it has `network`, or is `network`.
+
+    Raises `ValueError` for an unknown name, or if the estimator needs a network and there is none.
+    """
     if name not in ESTIMATORS:
         raise ValueError(f"`name` must be one of {', '.join(ESTIMATORS)}, got {name!r}.")
     kind = ESTIMATORS[name]

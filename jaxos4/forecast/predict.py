@@ -129,8 +129,8 @@ def predict(
 ) -> FlightPrediction:
     """Predict position, velocity, attitude and body rates from many starts of a flight, with its rotor speeds.
 
-    prediction = jaxos4.predict("found.json", "flight.csv") prediction.quality["attitude"].error       # by horizon
-    [rad]
+        prediction = jaxos4.predict("found.json", "flight.csv")
+        prediction.quality["attitude"].error       # by horizon [rad]
 
     A prediction begins with the measured position, velocity and attitude, and with the rates and disturbances that
     Kalman filters know from the measurements until then. After that it knows rotor speeds or commands, and the

@@ -74,9 +74,9 @@ def few_parts(seconds: float, tolerance: Tolerance = TOLERANCE) -> Iterator[Doub
 def stronger_or_weaker(
     response: FrequencyResponse, constants: Mapping[str, Constant], tolerance: Tolerance = TOLERANCE
 ) -> Iterator[Doubt]:
-    """An axis that answers the rotors clearly more or less than the model says, by a regression that knows no model.
+    """An axis that clearly answers the rotors more or less strongly than the model, by its frequency response.
 
-    A reservation, and no refusal: the regression has two to three times the error of the fit.
+    A reservation, and no refusal, because the frequency response has two to three times the error of the fit.
     """
     for (axis, found), name in zip(response._asdict().items(), INVERSE, strict=True):
         agreement, row = found.agreement(), constants.get(name)

@@ -29,7 +29,7 @@ _MCAP, _CHUNK_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, b"\x05"
 
 
 def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
-    """Refuse a file or folder of a bag that decompresses to more than `limits`. Damage is left to the reader."""
+    """Raises `InputError` for a bag, file or folder, that decompresses to more than `limits`. Readers report damage."""
     place = FilePath(path)
     for each in sorted(file for file in place.iterdir() if file.is_file()) if place.is_dir() else [place]:
         with opened(each, "rb") as file:

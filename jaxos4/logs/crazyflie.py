@@ -1,4 +1,7 @@
-"""Logs of the Crazyflie's micro-SD deck: versions 1, 2, and of 2019. Reference: its firmware and usdlog tools."""
+"""Logs of the Crazyflie's micro-SD card: versions 1 and 2, and that of 2019. Variables and frames: docs/logs.md.
+
+Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
+"""
 
 import array
 import math

@@ -1,4 +1,7 @@
-"""ULog: the logs of PX4, decoded by pyulog. Reference: `FunctionMotors::updateValues`, `MixingOutput` of PX4."""
+"""ULog: the logs of PX4, decoded by pyulog. Topics, frames and commands: docs/logs.md.
+
+Reference: `FunctionMotors::updateValues`, `MixingOutput` and `logged_topics.cpp` of PX4.
+"""
 
 import contextlib
 import functools
@@ -293,7 +296,7 @@ def _decoded(path: Path) -> Messages:
 
 
 class _Content(io.BytesIO):
-    """Ends the search in a corrupt file: pyulog seeks for each corrupt byte, and a few times in an intact file."""
+    """Ends a long search in a corrupt file: pyulog seeks once for each corrupt byte, and a few times if all is well."""
 
     seeks = 0
 

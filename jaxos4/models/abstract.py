@@ -66,7 +66,10 @@ class ByRecording(NamedTuple):
 
 
 class AbstractModel(eqx.Module):
-    """A quadrotor: a table of unknown parameters, whose values are `parameters`, a forcing, equations, and sensors."""
+    """A quadrotor: a table of unknown parameters, a forcing, equations of motion and sensors.
+
+    Methods take the values of the unknowns as `parameters`: an array, or a tuple of its scalars.
+    """
 
     airframe: eqx.AbstractVar[Airframe]
 

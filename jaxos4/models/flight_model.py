@@ -30,13 +30,14 @@ Row = tuple[Term, str, Parameter]
 class FlightModel(AbstractModel):
     """`CorrectedOS4` and the effects that real vehicles show. Each term is optional.
 
-    p' = alpha1 q r - alpha2 Omega_r q + alpha3 d_roll + roll_offset + roll_thrust (U_c / m - 9.81)
-    - roll_damping p + roll_velocity v_y q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset +
-      pitch_thrust (U_c / m - 9.81)
-    - pitch_damping q + pitch_velocity v_x r' = alpha7 p q + alpha8 d_yaw + yaw_offset - yaw_damping r - rotor_reaction
-      Omega_r' rotor_lag w_i' = g(u_i(t - rotor_delay) - thrust_curve w_i) - (1 - thrust_curve) w_i^2 u_i = command_i (V
-      / V_0)^voltage_exponent (1 - battery_fade t) a_z = thrust_gain U_c / m + az_bias,    a_x = ax_bias - x_drag v_x,
-      a_y = ay_bias - y_drag v_y
+        p' = alpha1 q r - alpha2 Omega_r q + alpha3 d_roll + roll_offset + roll_thrust (U_c / m - 9.81)
+             - roll_damping p + roll_velocity v_y
+        q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset + pitch_thrust (U_c / m - 9.81)
+             - pitch_damping q + pitch_velocity v_x
+        r' = alpha7 p q + alpha8 d_yaw + yaw_offset - yaw_damping r - rotor_reaction Omega_r'
+        rotor_lag w_i' = g(u_i(t - rotor_delay) - thrust_curve w_i) - (1 - thrust_curve) w_i^2
+        u_i = command_i (V / V_0)^voltage_exponent (1 - battery_fade t)
+        a_z = thrust_gain U_c / m - z_drag v_z + az_bias,  a_x = ax_bias - x_drag v_x,  a_y = ay_bias - y_drag v_y
 
     The last line is the specific force, as an accelerometer at the centre of mass measures it. `jaxos4.models.rotors`
     explains the motors, whose speeds w_i = omega_i / `max_rotor_speed`.

@@ -1,11 +1,11 @@
 from .comparison import print_comparison as print_comparison, write_comparison as write_comparison
-from .flights import print_prediction as print_prediction, write_prediction_figure as write_prediction_figure
 from .identification_figures import Plots as Plots
 from .identification_page import (
     identification_html as identification_html,
     write_flight_page as write_flight_page,
 )
 from .log_page import write_log_page as write_log_page
+from .prediction import print_prediction as print_prediction, write_prediction_figure as write_prediction_figure
 from .study_page import write_report as write_report
 from .study_tables import error_table as error_table
 from .terminal import (

@@ -45,7 +45,10 @@ _MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 
 
 
 def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
-    """Writes the page of an identification, titled by its logs, completely or not at all. Raises `OSError`."""
+    """Writes the page of an identification, completely or not at all. Raises `OSError`.
+
+    `title`: by default the names of the logs.
+    """
     check_writable(path)
     look, used = styles([found.estimator])[found.estimator], found.provenance
     center = centers_of_mass(found)

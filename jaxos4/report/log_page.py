@@ -28,12 +28,13 @@ from .timeline import Axis, Line, Panel, View, signals, spans, thinned
 
 
 class PageRules(NamedTuple):
-    """The content of the page of a log.
+    """Sizes and limits of the page of a log.
 
     - `samples`: of each signal at most; a page then has less than 600 kB.
     - `parts`: rows of the table of parts at most, the longest parts.
     - `segment`: of which the spectra are means [s]. `slowest`: the lowest frequency of a spectrum [Hz].
-    - `bins`: of the motors' speeds. `usual`: the share of the time of the speeds in the band of the spectra.
+    - `bins`: of the motors' speeds. `usual`: the share of the time in which the rotors' speeds lie in the
+      band of the spectra.
     """
 
     samples: int = 5000
@@ -235,7 +236,8 @@ def amplitude_density(
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies channels"]]:
     """Frequencies [Hz] and the amplitude spectral density of signals, by Welch's means of overlapping segments.
 
-    A channel has the mean over the segments in which it was measured, or NaN. Reference: Welch 1967, IEEE Trans. AU 15.
+    A channel has the mean over the segments in which it was measured, or NaN. Reference: Welch 1967, IEEE
+    Trans. Audio Electroacoustics 15.
     """
     size = max(round(rules.segment / dt), 8)
     window = np.hanning(size)[:, None]

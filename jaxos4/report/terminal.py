@@ -29,7 +29,11 @@ Section = Iterator[str | Listing]
 
 
 def print_identification(console: Console, found: Identification, *, verbose: bool = False) -> None:
-    """Prints verdicts, quantities, reservations and notes, `verbose` all parameters too; or why there is no answer."""
+    """Prints verdicts, quantities, reservations and notes; or why there is no answer.
+
+    `verbose`: for a vehicle, also all parameters, the noise and the quality of predictions. An OS4 always has its
+    parameters.
+    """
     sections = [_verdicts, _quantities, _reasons, _notes]
     if not found.is_vehicle:
         sections = [_verdicts, _reasons, _notes, _parameters, _fit, _inertias, _validation]

@@ -125,7 +125,7 @@ def signals(
     shaded: Sequence[tuple[float, float]] = (),
     names: Sequence[str] = (),
 ) -> str:
-    """The content of `timeline.js`, as JSON.
+    """The data that `timeline.js` draws, as JSON.
 
     - `common`: views below the chosen one of `views`. `shown`: the number of the first that is chosen.
     - `shaded`: from when to when the background is grey, on the axis. `names`: of the logs, if there are several.
@@ -187,7 +187,10 @@ Times = Float[np.ndarray, " samples"]
 
 
 def identified_signals(found: Identification, look: Style) -> str:
-    """The signals of a result's page as JSON, or "": a vehicle's by horizon, an OS4's by group of channels."""
+    """The signals of a result's page, as JSON; empty if the result has none.
+
+    A vehicle has a view for each horizon of its predictions, an OS4 one for each group of channels.
+    """
     traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
     if traces is None:
         return ""

@@ -106,7 +106,7 @@ class Unknowns(eqx.Module):
 
     @property
     def usable(self) -> "Unknowns":
-        """The unknowns if they are valid, else 0 +- 1, so that a batch stays finite. No half-width is 0, but 1."""
+        """The unknowns if they are valid, else 0 +- 1, so that a batch stays finite. A half-width of 0 becomes 1."""
         center = jnp.where(self.valid, self.center, 0.0)
         half_width = jnp.where(self.valid & (self.half_width > 0), self.half_width, 1.0)
         return dataclasses.replace(self, center=center, half_width=half_width)
@@ -139,9 +139,10 @@ def _fixed(
 
 
 class Shot(NamedTuple):
-    """One simulated window: the cost of the samples before it fails, and whether it is `feasible`.
+    """One simulated window: the cost of the samples before the trajectory fails, and whether it is `feasible`.
 
-    It fails at a pitch of 90 degrees or a rate above `FASTEST`. The derivative still points back to feasible ones.
+    It fails at a pitch of +-90 degrees, or a body rate above `FASTEST` in `scans.py`. The cost of a failed shot means
+    nothing, but its derivative still points back to feasible trajectories.
     """
 
     cost: Scalar

@@ -123,7 +123,8 @@ def for_threads(function: Callable[P, R]) -> Callable[P, R]:
 def on_all_cores(function: Callable) -> Callable:
     """A batch on all cores of a CPU: threads run one compiled program. Results are the same on any number of cores.
 
-    The first argument of the result is a batch with flights first; the others are those of one call of `function`.
+    The returned function takes a batch of `function`'s first argument, with the flights along the first axis of all
+    arrays, and the other arguments as they are.
     """
 
     @eqx.filter_jit

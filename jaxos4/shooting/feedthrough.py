@@ -3,7 +3,7 @@
 If a sample lasts longer than the controller takes to answer, its torque holds answers to the noise of what is measured
 in it, and a likelihood that takes this torque for an input is biased. All of the torque is known before the sample, but
 for its *input innovation* v. With white noise in the log's rows, v depends on what is measured through the filter's
-innovation e alone. So e - k v is compared, with an unknown *feedthrough* k: see `docs/method/filter_error.md`.
+innovation e alone. So e - gamma v is compared, with an unknown *feedthrough* gamma (`docs/method/filter_error.md`).
 """
 
 from collections.abc import Iterator

@@ -4,9 +4,11 @@ A disturbance d acts in each channel: on a body rate as an angular acceleration 
 force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
 
 A measurement is the mean over a window of its sample (`Window`). The filter of a body rate knows the rate and the
-disturbance at the beginning of a sample; from them and the noise follow both at its end, and what is measured, with
-their exact joint covariance: innovations of the right model are white at every sample time. The filter of a specific
-force knows the disturbance alone. Arrays have the axes (time, channels, segments). A segment is a part of the flight.
+disturbance at the beginning of a sample. From them and from the noise within the sample follow three numbers: rate and
+disturbance at its end, and what is measured. Their joint covariance is exact, so innovations of the right model are
+white at every sample time. The filter of a specific force knows the disturbance alone.
+
+Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
 
 from typing import NamedTuple
@@ -33,7 +35,7 @@ _NODES = 8
 
 
 class Window(NamedTuple):
-    """The part of a sample over which a measurement is averaged, from `begin` in it on [s]; `length` 0: an instant."""
+    """The part of a sample over which a measurement is averaged: from `begin` on, for `length` [s]; 0: an instant."""
 
     begin: Scalar | float = 0.0
     length: Scalar | float = 0.0

@@ -215,7 +215,8 @@ class ShootingProblem(AbstractProblem):
     def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
 
-        Infinite if the trajectory diverges or reaches theta = +-90 degrees. `initial_state`: or `first_state`.
+        Infinite, with an undefined derivative, if the trajectory diverges or reaches theta = +-90 degrees.
+        `initial_state` defaults to `first_state`.
         """
         start = self.first_state()[0] if initial_state is None else initial_state
         cost, feasible = self.shots(parameters, start)

@@ -1,6 +1,7 @@
 """The plan of a search in stages: the body rates of a short part of the flight first, then more.
 
-Rates do not depend on the others. Errors grow with time, and so does the number of minima of the cost.
+Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, so the cost of a long
+flight has other minima: the first stages are short.
 """
 
 from typing import NamedTuple

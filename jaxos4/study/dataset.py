@@ -174,7 +174,10 @@ def _short(value: Any) -> str:
 
 
 def assemble(store: Store) -> xr.Dataset:
-    """The Dataset of a study's finished cells; the result of all others is `not_run`. Raises `InputError`."""
+    """The Dataset of a study's finished cells; the result of all others is `not_run`. Raises `InputError`.
+
+    Its dimensions are all axes of the grid, `flight`, `parameter` and `level`.
+    """
     study, coordinates, failures = store.study, _coordinates(store.study), []
     blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {

@@ -55,7 +55,8 @@ def error(dataset: xr.Dataset) -> xr.DataArray:
 def no_percentage(dataset: xr.Dataset, bound: xr.DataArray | None = None) -> xr.DataArray:
     """Why percentages of the truth have no meaning, for each scenario and parameter: an index into `NO_PERCENTAGE`.
 
-    1: the truth of a flight is 0. 2: it is below `NINETY_FIVE` bounds, and so cannot be distinguished from 0. Or 0.
+    1: the truth of a flight is 0. 2: the truth of a flight is below `NINETY_FIVE` bounds, so that it cannot be
+    distinguished from 0. 0: percentages have a meaning.
     """
     truth, bound = dataset["truth"], dataset["bound"] if bound is None else bound
     below = (abs(truth) < NINETY_FIVE * bound).any("flight")
@@ -85,7 +86,8 @@ def normalised_error(dataset: xr.Dataset) -> xr.DataArray:
 def efficiency(dataset: xr.Dataset) -> xr.Dataset:
     """RMSE / bound of converged flights, each relative to its own bound, with a 95 % Monte-Carlo interval.
 
-    `low` and `high`: of a Gaussian's standard deviation from `count` draws (chi-squared); NaN for fewer than two.
+    1 is the best value for an unbiased estimator. `low` and `high`: of a Gaussian's standard deviation from `count`
+    draws (chi-squared); NaN for fewer than two.
     """
     ratio = normalised_error(dataset)
     count = ratio.notnull().sum("flight")

@@ -45,9 +45,10 @@ def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
 
 
 def run_here(store: Store) -> Iterator[tuple[str, int]]:
-    """Computes the remaining cells one after another, each on all cores; one that cannot be computed is kept as failed.
+    """Computes the remaining cells one after another, each on all cores.
 
-    Yields the label of each cell that is finished, and the number of finished cells.
+    Yields the label of each cell that is finished, and the number of finished cells. A cell that cannot be computed is
+    kept as failed; delete its file to try it again.
     """
 
     def submit(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -91,8 +91,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
       `jaxos4 design`, with `t` and `omega1..4`, relative to the folder of the specification.
     - `durations` [s], at a sample time of `dt` [s].
     - `methods`: the integration method of true flights; estimators simulate by `fit_method`.
-    - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At 0, estimators assume the noise of
-      1.
+    - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At scale 0 flights are exact, and
+      estimators assume the noise of scale 1.
     - `widths`: widths of the brackets, in multiples of the model's default half-width.
     - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's centre is off them by up to
       80 % of its half-width; `"drawn"`: each flight has its own parameters, uniform in a bracket around the airframe's.

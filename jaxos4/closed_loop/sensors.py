@@ -1,0 +1,111 @@
+"""The sensors of a flight in closed loop: vibration and filters, and what a recorder loses and confuses."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._custom_types import Key, Scalar
+from ..flight import ANGLES, RATES, VELOCITY, Flight
+from ..models.state import Attitude, Rates, Vector, to_earth
+from ..simulation import until_failure
+from ..trigonometry import sincos
+from .settings import ClosedLoop, PerAxis, Sensors
+
+
+class BodyMotion(NamedTuple):
+    """Body rates [rad/s], attitude [rad], and the velocity along the body's axes [m/s]; `None`: not simulated."""
+
+    rates: Rates
+    attitude: Attitude
+    velocity: Vector | None
+
+
+class Signals(NamedTuple):
+    """Gyro of the log, that of the controller, and accelerometer, raw and filtered; `angles` of the rotors [rad]."""
+
+    raw: Float[Array, "9"]
+    filtered: Float[Array, "9"]
+    angles: Float[Array, "4"]
+
+
+class Sense(NamedTuple):
+    """Vibration and first-order low-pass filters, y' = (x - y) / T, exact for signals linear in each run.
+
+    `sine`, `cosine`: the amplitude of each rotor in hover in gyro and accelerometer. `decay`, `last`: of the filters of
+    `Signals`. `own`: whether the controller has a gyro of its own.
+    """
+
+    hover_speed: Scalar
+    sine: Float[Array, "4 6"]
+    cosine: Float[Array, "4 6"]
+    decay: Float[Array, "9"]
+    last: Float[Array, "9"]
+    own: Bool[Array, ""]
+
+    @classmethod
+    def of(cls, sensors: Sensors, hover_speed: Scalar, period: Scalar, key: Key) -> "Sense":
+        """The sensors of a flight, with random phases of the vibration."""
+        phases = jax.random.uniform(key, (4, 6), maxval=2 * np.pi)
+        amplitude = jnp.repeat(jnp.stack([sensors.gyro_vibration, sensors.force_vibration]), 3)
+        times = jnp.repeat(jnp.stack([sensors.gyro_filter, sensors.controller_gyro_filter, sensors.force_filter]), 3)
+        decay, own = jnp.exp(-period / times), ~jnp.isnan(sensors.controller_gyro_noise)
+        last = (1 - decay) * times / period
+        return cls(hover_speed, amplitude * jnp.cos(phases), amplitude * jnp.sin(phases), decay, last, own)
+
+    def __call__(
+        self, signals: Signals, speeds: Float[Array, "4"], gyro: PerAxis, own_gyro: PerAxis, force: PerAxis
+    ) -> tuple[Signals, PerAxis]:
+        """The signals of the next run, and the body rates that the controller answers."""
+        strength, (sin, cos) = jnp.square(speeds / self.hover_speed), sincos(signals.angles)
+        shaken = (strength * sin) @ self.sine + (strength * cos) @ self.cosine
+        raw = jnp.concatenate([gyro + shaken[:3], own_gyro, force + shaken[3:]])
+        filtered = self.decay * signals.filtered + (self.last - self.decay) * signals.raw + (1 - self.last) * raw
+        return Signals(raw, filtered, signals.angles), jnp.where(self.own, filtered[3:6], filtered[:3])
+
+
+def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Array, Array], key: Key) -> Flight:
+    """The log up to the first sample at which the vehicle pitches to 90 degrees or a number is not finite.
+
+    `logged`: rotor speeds, motion, body rates, attitude and specific force in each run of the controller.
+    """
+    every, sensors, keys = loop.log_every, loop.sensors, jax.random.split(key, 3)
+    commands = loop.logged == "commands"
+    omega = logged[0]
+    if sensors is not None:  # recorded late, not only by whole runs
+        runs, latest = sensors.clock_offset * every / dt, len(omega) - 1
+        whole = jnp.floor(runs).astype(int)
+        now, before = (omega[jnp.clip(jnp.arange(latest + 1) - whole - i, 0, latest)] for i in (0, 1))
+        omega = now + (runs - whole) * (before - now)
+    omega, motion, rates, attitude, specific = jax.tree.map(lambda x: x[::every], (omega, *logged[1:]))
+    axes = loop.airframe.sensor_axes
+    rates, specific = rates @ axes, specific @ axes  # along the axes of the sensors
+    states = jnp.full((omega.shape[0], 12), jnp.nan).at[:, ANGLES].set(attitude)
+    if sensors is not None:
+        omega, step = omega + sensors.speed_noise * jax.random.normal(keys[0], omega.shape), sensors.speed_step
+        omega = jnp.where(step > 0, step * jnp.round(omega / jnp.where(step > 0, step, 1.0)), omega)
+        bad_key, lost_key = jax.random.split(keys[1])
+        measured = jnp.concatenate([rates, specific], axis=1)
+        draw = jax.random.uniform(bad_key, measured.shape)
+        beyond = jnp.append(jnp.sort(draw.ravel()), 1.0)[sensors.bad_samples.astype(int)]
+        measured = jnp.where(draw < beyond, sensors.impossible, measured)
+        lost = jax.random.uniform(lost_key, (len(measured), 2)) < sensors.dropouts
+        rates, specific = jnp.split(jnp.where(jnp.repeat(lost, 3, axis=1), jnp.nan, measured), 2, axis=1)
+    if sensors is not None and motion.velocity is not None:
+        velocity = jnp.stack(to_earth(motion.attitude, motion.velocity), axis=1)
+        noise = sensors.velocity_noise * jax.random.normal(keys[2], velocity.shape)
+        states = states.at[:, VELOCITY].set(velocity + noise)
+    states = states.at[:, RATES].set(rates)
+
+    valid, result = until_failure(jnp.stack(jax.tree.leaves(motion), axis=1), motion.attitude.theta)
+    return Flight(
+        time=dt * jnp.arange(omega.shape[0]),
+        omega=jnp.where(valid[:, None], omega, 0.0),
+        states=jnp.where(valid[:, None], states, jnp.nan),
+        specific_force=jnp.where(valid[:, None], specific, jnp.nan),
+        result=result,
+        commanded=commands,
+        held=commands,
+    )
