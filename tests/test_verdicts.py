@@ -16,7 +16,8 @@ from jaxos4.identification.answers import Solution, vehicle_constants
 from jaxos4.identification.checks import consequences
 from jaxos4.identification.doubts import doubts_of, doubts_of_log, few_parts, stronger_or_weaker
 from jaxos4.identification.identify import describe
-from jaxos4.identification.results import Constant, ParameterEstimate
+from jaxos4.identification.quantities import prediction_horizons
+from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
@@ -121,6 +122,15 @@ def test_an_axis_that_answers_otherwise_than_the_model_has_a_reservation(ratio, 
         assert doubts[0].moves["Iy"].share == pytest.approx(move, abs=1e-3)
         assert doubts[0].moves["Iy"].deviations == pytest.approx(20 * move, rel=0.01)
         assert f"from 4 to 20 Hz, pitch answers the rotors {ratio:.2f}" in str(doubts[0])
+
+
+def test_predictions_reach_as_far_as_their_skill_is_clear():
+    """0.03 +- 0.21 cannot be distinguished from 0; a longer horizon does not count behind it."""
+    clear = RateSkill([0.9, 0.8, 0.5], [0.1, 0.1, 0.2], *[[None] * 3] * 3)
+    poor = RateSkill([0.5, 0.03, 0.4], [0.1, 0.21, 0.1], *[[None] * 3] * 3)
+    found = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, clear, poor, clear), ["yaw"])
+    assert found.value == "better than constant rates up to roll 0.5 s, pitch 0.1 s ahead"
+    assert found.reservations == ("yaw cannot be checked",)
 
 
 def test_the_result_is_that_of_what_was_asked():

@@ -43,7 +43,7 @@ def vehicle_quantities(
         rows = {name: table[name] for name in names if name in table}
         reservations = ((which,) if unseen else ()) + _notes(rows, shares)
         found[quantity] = Quantity("", 0.0, "" if rows else which, reservations)
-    return found | {PREDICTIONS: _predictions(skill, still)}
+    return found | {PREDICTIONS: prediction_horizons(skill, still)}
 
 
 def _interval(row: Constant) -> str:
@@ -60,14 +60,15 @@ def _notes(rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tupl
     return tuple(found)
 
 
-def _predictions(skill: PredictionSkill | None, still: Sequence[str]) -> Quantity:
-    """How far ahead predictions are better than constant rates, about each axis that moves."""
+def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> Quantity:
+    """How far ahead predictions are better than constant rates by a standard error, about each axis that moves."""
     if skill is None:
         return Quantity(missing="nothing was held out; give `holdout` or `validate`")
     reach = {axis: 0.0 for axis in AXES.values() if axis not in still}
     for rate, axis in AXES.items():
-        for horizon, value in zip(skill.horizons, getattr(skill, rate).skill, strict=True):
-            if axis not in reach or (value is not None and value <= 0):
+        own = getattr(skill, rate)
+        for horizon, value, std in zip(skill.horizons, own.skill, own.std, strict=True):
+            if axis not in reach or (value is not None and value <= (std or 0.0)):
                 break
             reach[axis] = horizon if value is not None else reach[axis]
     unseen = (f"{' and '.join(still)} cannot be checked",) if still else ()
