@@ -187,12 +187,18 @@ def test_the_vehicle_is_drawn_as_it_was_identified(tmp_path):
 
 
 WRONG = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
+CAREFUL = Verdict("identified with a reservation", "", ("it is known to 20% only",))
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({}, "What was asked is identified: Ix."),
+        (
+            {"verdicts": {"Ix": CAREFUL, "Iy": Verdict("identified"), "Iz": CAREFUL}},
+            "What was asked is identified: Iy; identified with a reservation: Ix and Iz.",
+        ),
+        ({"verdicts": {}}, "What was asked is identified."),
         ({"result": "implausible", "verdicts": WRONG}, "Not to be trusted: Ix is contradicted."),
         ({"result": "max_sweeps", "verdicts": {}}, "Not to be trusted: the search did not converge"),
         ({"result": "nonfinite_trajectory"}, "There is no answer: "),

@@ -20,7 +20,7 @@ from ..analysis.inertia import CenterOfMass
 from ..errors import printable
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Constant, Identification, SampleTime
-from ..identification.verdict import RIGID_BODY, headline, reasons
+from ..identification.verdict import IDENTIFIED, RIGID_BODY, STATUSES, headline, reasons
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .identification_figures import (
@@ -122,9 +122,12 @@ def verdict(found: Identification) -> str:
     if not found.has_answer:
         return f"There is no answer: {meaning(found.result)}."
     if found.successful:
-        return (
-            f"What was asked is identified: {_joined(name for name, each in found.verdicts.items() if each.trusted)}."
+        named = {each.status for each in found.verdicts.values() if each.trusted}
+        said = (
+            f"{status}: {_joined(name for name, each in found.verdicts.items() if each.status == status)}"
+            for status in sorted(named, key=STATUSES.index)
         )
+        return f"What was asked is {'; '.join(said) or IDENTIFIED}."
     refused = _joined(f"{name} is {each.status}" for name, each in found.verdicts.items() if not each.trusted)
     return f"Not to be trusted: {refused or meaning(found.result)}."
 
