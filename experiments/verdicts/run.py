@@ -299,6 +299,7 @@ def print_tables(rows: list[Row]) -> None:
 def main(
     flights: Annotated[int, typer.Option(help="Number of flights of each effect.")] = 100,
     spoiled: Annotated[int, typer.Option(help="Number of flights of each fault and size.")] = 20,
+    rotorpy: Annotated[int, typer.Option(help="Number of flights of RotorPy, calm and in gusts.")] = 20,
     cases: Annotated[list[str], typer.Option(help="The cases.")] = tuple(CASES),
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
     seed: Annotated[int, typer.Option(help="Random seed of references, gusts, noise and effects.")] = 48,
@@ -306,7 +307,7 @@ def main(
 ) -> None:
     """Count right and wrong verdicts for each effect, and for each fault in three sizes."""
     report = continued(out, {"duration": duration, "seed": seed}, "rows")
-    numbers = {name: flights if CASES[name][1] is None else spoiled for name in cases}
+    numbers = {name: spoiled if CASES[name][1] else rotorpy if name in ROTORPY else flights for name in cases}
     flown = functools.cache(lambda kind: good_flights(kind, max(numbers.values()), duration, seed))
     # An interrupted report has about as many flights of each case.
     trials = ({"case": name, "flight": i} for i in range(max(numbers.values())) for name in cases if i < numbers[name])
