@@ -119,8 +119,8 @@ def weights(doubts: Sequence[Doubt], name: str, tolerance: Tolerance = TOLERANCE
     they contradict the quantity: an impossible parameter shows that the model errs, and another doubt by how much.
     """
     alone = [_weight(doubt, name, tolerance) for doubt in doubts]
-    moves = {i: doubts[i].moves[name] for i, status in enumerate(alone) if status == RESERVED}
-    sized = {i: move for i, move in moves.items() if move is not None}
+    reserved = (i for i, status in enumerate(alone) if status == RESERVED)
+    sized = {i: move for i in reserved if (move := doubts[i].moves[name]) is not None}
     total = Move(sum(move.share for move in sized.values()), sum(move.deviations for move in sized.values()))
     if all(doubts[i].result == "successful" for i in sized) or _far(total, tolerance) < 2:
         return alone
@@ -194,13 +194,11 @@ def reasons(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
         for name, verdict in verdicts.items():
             for reason in verdict.reasons if verdict.status == status else ():
                 concerned.setdefault(reason, []).append(name)
-    statuses_of = zip(*(weights(doubts, name) for name in verdicts), strict=True)
-    notes = (
-        [doubt for doubt, own in zip(doubts, statuses_of, strict=True) if {*own} == {IDENTIFIED}] if verdicts else []
-    )
+    every = [weights(doubts, name) for name in verdicts]
+    notes = [doubt for i, doubt in enumerate(doubts) if all(own[i] == IDENTIFIED for own in every)]
     return [
         *(f"{', '.join(names)}: {reason}." for reason, names in concerned.items()),
-        *(f"note: {doubt}. It moves nothing." for doubt in notes),
+        *(f"note: {doubt}. It moves nothing." for doubt in notes if verdicts),
     ]
 
 
