@@ -84,6 +84,31 @@ def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_re
     assert len(read_store(out).missing()) == 96 - len(finished)
 
 
+class InterruptedAtItsEnd:
+    """Is interrupted where Python drops the exception."""
+
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+def test_an_interrupt_that_python_drops_ends_a_study_too(whole, copy, run, monkeypatch):
+    (copy / "results.nc").unlink()
+    (copy / "cells/00000019.npz").unlink()
+    write = pathlib.Path.write_bytes
+
+    def interrupted(path: pathlib.Path, data: bytes) -> int:
+        InterruptedAtItsEnd()
+        return write(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pathlib.Path, "write_bytes", interrupted)
+        code, _, err = run("study", "spec.toml", "--out", "out")
+    assert (code, err) == (130, "jaxos4: out: interrupted; run the same command again to continue.\n")
+    assert cells(copy) == cells(whole)
+    assert not (copy / "results.nc").exists()
+    assert run("study", "spec.toml", "--out", "out")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("after", "name"), [(0, "00000019.npz"), (1, "00000040.npz"), (2, "results.nc"), (0, "study.json")]
 )

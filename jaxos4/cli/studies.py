@@ -1,7 +1,10 @@
 """`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
 
 import shlex
+import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -41,11 +44,38 @@ def study(
 def run_with_bar(wanted: "jaxos4.study.Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
     """The Dataset of `jaxos4.study.carry_out`, with a progress bar. `device`: by default those of this process."""
     try:
-        with stages("compiling", wanted.count) as show:
-            return jaxos4.study.carry_out(wanted, out, device or jaxos4.study.device_name(), progress=show, **how)
+        with stages("compiling", wanted.count) as show, _kept_interrupt() as raise_it:
+
+            def progress(label: str, done: int) -> None:
+                raise_it()
+                show(label, done)
+
+            return jaxos4.study.carry_out(wanted, out, device or jaxos4.study.device_name(), progress=progress, **how)
     except KeyboardInterrupt:
         typer.echo(f"jaxos4: {out}: interrupted; run the same command again to continue.", err=True)
         raise
+
+
+@contextmanager
+def _kept_interrupt() -> Iterator[Callable[[], None]]:
+    """Keeps a Ctrl-C that arrives in a finaliser or a weak reference's callback, where Python drops any exception.
+
+    Yields a function that raises it.
+    """
+    dropped: list[Any] = []
+
+    def keep(what: Any) -> None:
+        (dropped.append if what.exc_type is KeyboardInterrupt else before)(what)
+
+    def raise_it() -> None:
+        if dropped:
+            raise KeyboardInterrupt
+
+    before, sys.unraisablehook = sys.unraisablehook, keep
+    try:
+        yield raise_it
+    finally:
+        sys.unraisablehook = before
 
 
 def _print_plan(wanted: "jaxos4.study.Study", out: Path) -> None:
