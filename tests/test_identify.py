@@ -226,7 +226,7 @@ OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
         (MODEL, {"settings": OF_FLIGHT(initial_state="guessed")}, "`initial_state`: must be free or known"),
         (MODEL, {"settings": OF_FLIGHT(channels="some")}, "`channels`: must be one of rates"),
         (MODEL, {"settings": OF_VEHICLE()}, "`settings`: must be FlightSettings for a model"),
-        (jaxos4.FlightModel(), {}, "`subject`: must be a model in alpha_1..8"),
+        (jaxos4.FlightModel(), {}, "`subject`: must be a model in alpha_1..8 or an airframe, which"),
         (OS4, {"settings": OF_FLIGHT()}, "`settings`: must be VehicleSettings for an airframe"),
         (OS4, {"network": "none.net"}, "`network`: a vehicle's network is trained for its own flights"),
         (OS4, {"settings": OF_VEHICLE(holdout=0.9)}, "`holdout`: must be a share from 0 to 0.5"),

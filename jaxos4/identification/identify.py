@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..flight import CHANNEL_NAMES
 from ..logs import Source, as_recording, as_recordings
-from ..models.abstract import AbstractModel
+from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..networks import TrainedNetwork
 from .answers import Solution
 from .checks import Checked
@@ -68,7 +68,10 @@ def identify(
 
     **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
     """
-    given = subject if isinstance(subject, Airframe) else getattr(subject, "airframe", None)
+    if not isinstance(subject, Airframe) and getattr(subject, "parameter_names", None) != PARAMETER_NAMES:
+        kinds = "a model in alpha_1..8 or an airframe, which `jaxos4.load_airframe` reads"
+        raise InputError(f"`subject`: must be {kinds}, got {type(subject).__name__}.")
+    given = subject if isinstance(subject, Airframe) else subject.airframe
     recordings = as_recordings(flights, airframe=given)
     if not recordings:
         raise InputError("`flights`: holds no flight; give one.")

@@ -17,7 +17,7 @@ from ..estimate import AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, Hybrid, make_estimator
 from ..logs import Recording
 from ..models import MODELS
-from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..networks.file import load_network
@@ -87,8 +87,6 @@ def prepare_flight(
     progress: Progress,
 ) -> FlightCase:
     """A flight of an OS4. Arguments as of `identify`."""
-    if getattr(model, "parameter_names", None) != PARAMETER_NAMES:
-        raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(model).__name__}.")
     recording, *others = recordings
     subject = class_name(model, MODELS)
     if others:
