@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 import jaxos4
@@ -144,9 +145,9 @@ def print_table(
     """
     rows = [list(row) for row in rows]
     tables.append(Published(title, list(headings), rows))
-    table = Table(title=title)
+    table = Table(title=escape(title))
     for heading in headings:
-        table.add_column(heading, no_wrap=heading != "results")
+        table.add_column(escape(heading), no_wrap=heading != "results")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     Console(width=width).print(table)

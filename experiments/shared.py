@@ -2,10 +2,11 @@
 
 import functools
 import io
+import itertools
 import json
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from jaxtyping import Array, Float, Key as Keys
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.monte_carlo import count_results
+from experiments.monte_carlo import count_results, in_words, print_table
 from jaxos4._custom_types import Key, States
 from jaxos4._files import write_atomically, write_netcdf
 from jaxos4.analysis.evaluation import cramer_rao_bound
@@ -30,6 +31,7 @@ from jaxos4.excitation import multisine
 from jaxos4.flight import Flight
 from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import SENSOR_SIGMA, AbstractNoise, WhiteNoise
+from jaxos4.report.study_tables import scenarios
 from jaxos4.report.style import Style, drawing, svg
 from jaxos4.results import result_names
 from jaxos4.shooting import ShootingProblem
@@ -55,9 +57,38 @@ def flight_files(folder: Path | None, names: Iterable[str]) -> list[Path]:
 
 
 def run_studies(studies: dict[str, Study], out: Path) -> None:
-    """Runs or resumes each study in the folder of its name in `out`. Raises what `open_store` raises."""
-    for name, study in studies.items():
-        run_with_bar(study, out / name)
+    """Runs or resumes each study in the folder of its name in `out`. Raises what `open_store` raises.
+
+    Prints a line for each study, scenario, noise scale and estimator.
+    """
+    found = {name: run_with_bar(study, out / name) for name, study in studies.items()}
+    titles = {f"{study.title}: {study.flights} flights, seed {study.seed}" for study in studies.values()}
+    error = 1 / np.sqrt(2 * max(study.flights for study in studies.values()))
+    headings = "scenario", "noise", "estimator", "RMSE / bound", "95 % intervals that hold [%]", "rollouts", "results"
+    lines = (line for name, data in found.items() for line in study_lines(name, data))
+    print_table(f"{', '.join(titles)}, Monte-Carlo error {error:.2g} of the RMSE", headings, lines)
+
+
+def study_lines(name: str, dataset: xr.Dataset) -> Iterator[tuple[str, ...]]:
+    """The lines of a study, for each scenario, noise scale and estimator; `name`: begins the first cell of each."""
+    several = sum(1 for _ in scenarios(dataset)) > 1
+    for one in scenarios(dataset):
+        label = ", ".join(filter(None, (name, one.label if several else "")))
+        ratio, held = metrics.efficiency(one.data)["efficiency"], metrics.mean_coverage(one.data).sel(level=0.95)
+        spent, results = metrics.mean_rollouts(one.data), metrics.result_counts(one.data)
+        for scale, estimator in itertools.product(one.data["scale"].values, one.data["estimator"].values):
+            at = {"scale": scale, "estimator": estimator}
+            counts = {str(code): int(n) for code, n in results.sel(at).to_series().items() if n}
+            yield (
+                *(label, f"{scale:g}", estimator, span(ratio.sel(at))),
+                *(f"{100 * held['coverage'].sel(at):.1f}", f"{spent.sel(at):.0f}", in_words(counts)),
+            )
+
+
+def span(values: xr.DataArray | np.ndarray, digits: int = 3) -> str:
+    """The smallest and the largest number as the text of a table cell; empty if there is none."""
+    known = np.asarray(values)[np.isfinite(values)]
+    return f"{known.min():.{digits}g} to {known.max():.{digits}g}" if known.size else ""
 
 
 def save_results(dataset: xr.Dataset, study: Study, out: Path) -> None:

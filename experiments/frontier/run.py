@@ -14,6 +14,7 @@ import typer
 import xarray as xr
 
 import jaxos4
+from experiments.monte_carlo import print_table
 from experiments.shared import save_results
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
@@ -44,3 +45,9 @@ def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for
     shape = [len(axis) for axis in coordinates.values()]
     frontier = xr.DataArray(values.reshape(shape), coordinates, DIMS, attrs={"units": "1"})
     save_results(xr.Dataset({"frontier": frontier}), study, out)
+    lines = (
+        (*map(str, known), *("" if np.isnan(limit) else f"{limit:.2g}" for limit in row))
+        for known, row in zip(itertools.product(*axes), values, strict=True)
+    )
+    title = "largest noise at which a parameter can be distinguished from 0, in multiples of the standard noise"
+    print_table(title, ("model", "excitation", "duration [s]", "channels", *names), lines, width=170)

@@ -17,7 +17,8 @@ import typer
 import xarray as xr
 
 import jaxos4
-from experiments.shared import identify, many_times, measure, save_results, standard_problem
+from experiments.monte_carlo import print_table
+from experiments.shared import identify, many_times, measure, save_results, span, standard_problem
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
@@ -94,4 +95,18 @@ def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for
         )
         for case in itertools.product(*cases)
     ]
-    save_results(xr.combine_by_coords(parts), study, out)
+    results = xr.combine_by_coords(parts)
+    save_results(results, study, out)
+    print_table(
+        f"models fitted to flights of each other, {study.flights} flights, seed {study.seed}",
+        ("channels", "fitted model", "flights of", "answered [%]", "RMSE / bound", "residuals not white [%]"),
+        (line_of(results, channels, flown, fitted) for channels, flown, fitted in itertools.product(*cases)),
+    )
+
+
+def line_of(results: xr.Dataset, channels: str, flown: str, fitted: str) -> tuple[str, ...]:
+    """A line of the table; residuals are not white if the p-value is below 1 %."""
+    one = results.sel(channels=channels, flown=flown, fitted=fitted)
+    rms = (one["error"].where(one["answered"]) ** 2).mean("flight") ** 0.5
+    answered, alien = 100 * one["answered"].mean(), 100 * (one["white_p"] < 0.01).mean()
+    return channels, fitted, flown, f"{answered:.0f}", span(rms), f"{alien:.0f}"

@@ -5,6 +5,7 @@ All flights have the same true vehicle. Each bracket's center is drawn within 80
 the truth.
 """
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +15,8 @@ import typer
 import xarray as xr
 
 import jaxos4
-from experiments.shared import DT, fit_noisy, save_results, standard_problem
+from experiments.monte_carlo import print_table
+from experiments.shared import DT, fit_noisy, save_results, span, standard_problem
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
@@ -54,3 +56,16 @@ def main(
         {"channels": list(study.channels), "search": list(names), "limit": list(limits)},
     )
     save_results(results, study, out)
+    rms, spent = (results["error"] ** 2).mean("flight") ** 0.5, results["rollouts"].mean("flight")
+    lines = (
+        (
+            channels,
+            search,
+            str(limit),
+            span(rms.loc[channels, search, limit]),
+            f"{spent.loc[channels, search, limit]:.0f}",
+        )
+        for channels, search, limit in itertools.product(study.channels, names, limits)
+    )
+    title = f"accuracy by limit, {study.flights} flights, Monte-Carlo error {1 / np.sqrt(2 * study.flights):.2g}"
+    print_table(title, ("channels", "search", "most sweeps or steps", "RMSE / bound", "rollouts"), lines)
