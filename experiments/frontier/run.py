@@ -15,7 +15,7 @@ import xarray as xr
 
 import jaxos4
 from experiments.monte_carlo import print_table
-from experiments.shared import save_results
+from experiments.shared import save_results, span
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
@@ -46,8 +46,8 @@ def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for
     frontier = xr.DataArray(values.reshape(shape), coordinates, DIMS, attrs={"units": "1"})
     save_results(xr.Dataset({"frontier": frontier}), study, out)
     lines = (
-        (*map(str, known), *("" if np.isnan(limit) else f"{limit:.2g}" for limit in row))
-        for known, row in zip(itertools.product(*axes), values, strict=True)
+        (model, channels, *(span(frontier.sel(model=model, channels=channels, parameter=each), 2) for each in names))
+        for model, channels in itertools.product(study.models, study.channels)
     )
-    title = "largest noise at which a parameter can be distinguished from 0, in multiples of the standard noise"
-    print_table(title, ("model", "excitation", "duration [s]", "channels", *names), lines, width=170)
+    title = "largest noise at which a parameter can be distinguished from 0 [standard noise], over all inputs"
+    print_table(title, ("model", "channels", *names), lines, width=170)
