@@ -33,6 +33,7 @@ from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import SENSOR_SIGMA, AbstractNoise, WhiteNoise
 from jaxos4.report.study_tables import scenarios
 from jaxos4.report.style import Style, drawing, svg
+from jaxos4.report.text import plain
 from jaxos4.results import result_names
 from jaxos4.shooting import ShootingProblem
 from jaxos4.simulation import simulate
@@ -88,7 +89,7 @@ def study_lines(name: str, dataset: xr.Dataset) -> Iterator[tuple[str, ...]]:
 def span(values: xr.DataArray | np.ndarray, digits: int = 3) -> str:
     """The smallest and the largest number as the text of a table cell; empty if there is none."""
     known = np.asarray(values)[np.isfinite(values)]
-    return f"{known.min():.{digits}g} to {known.max():.{digits}g}" if known.size else ""
+    return " to ".join(dict.fromkeys(plain(end, digits) for end in (known.min(), known.max()))) if known.size else ""
 
 
 def save_results(dataset: xr.Dataset, study: Study, out: Path) -> None:
