@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import documented_class, noisy_states, same, standard_flight, standard_problem
+from helpers import documented_class, noisy_states, random_starts, same, standard_flight, standard_problem
 from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
@@ -52,6 +52,28 @@ def test_the_search_of_the_documentation_ends_at_the_minimum_or_says_that_it_did
     assert (off <= 0.05 * best.std).all()
     if kind == "shooting":
         assert names(defined["Descent"](steps=1)(problem)) == "max_sweeps"
+
+
+def test_output_error_takes_no_more_steps_for_a_long_flight():
+    """Of 300 s. A search of the whole from the start, with ten times the steps, ends in the same minimum at best."""
+    problem = standard_problem(channels="rates", duration=300.0)
+    center, keys = random_starts(jaxos4.PublishedOS4(), 6, seed=3), jax.random.split(jax.random.key(3), 6)
+
+    @eqx.filter_jit
+    def fitted(estimator):
+        def one(key, center):
+            noisy = jaxos4.WhiteNoise(problem.sigma)(problem.flight, key=key)
+            data = eqx.tree_at(lambda p: p.flight, problem, noisy)
+            return estimator(data, jaxos4.Bracket.around(center, HALF))
+
+        return jax.vmap(one)(keys, center)
+
+    found, whole = fitted(jaxos4.OutputError()), fitted(jaxos4.OutputError(long=problem.flight.time.size + 1))
+    assert set(names(found)) == {"successful"}
+    assert found.rollouts.max() < 120 < whole.rollouts.max()
+    error = (found.parameters - problem.model.alpha) / found.std
+    assert (np.abs(error) < 5).all()
+    assert (found.cost <= whole.cost + 0.01).all()
 
 
 def test_too_few_sweeps_are_reported():

@@ -156,6 +156,8 @@ class OutputError(AbstractEstimator):
 
     - `tolerance`: the search ends with a step that changes no unknown by more, in half-widths of the bracket.
     - `max_steps`: for each stage.
+    - `long`: a flight of so many samples is long: the rates are fitted to its first 10 %, then to all of it. Errors
+      grow with time, so that a search of all of it from a wide bracket takes many short steps.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -163,10 +165,13 @@ class OutputError(AbstractEstimator):
 
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-5)
     max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
+    long: int = eqx.field(converter=integer("long", 1, static=True), static=True, default=2000)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight. `rollouts` counts trials and tangents. Raises `ValueError` for a wrong bracket."""
-        return LevenbergMarquardt(step_tolerance=self.tolerance, max_steps=self.max_steps)(problem, bracket)
+        shares = (1.0,) if problem.flight.time.size < self.long else (0.1, 1.0)
+        solver = LevenbergMarquardt(step_tolerance=self.tolerance, max_steps=self.max_steps, shares=shares)
+        return solver(problem, bracket)
 
 
 class FilterError(AbstractEstimator):
