@@ -143,7 +143,7 @@ def print_table(
 
     `tables`: gets the table too, to be published, see `published.py`.
     """
-    rows = [list(row) for row in rows]
+    rows = [list(map(str, row)) for row in rows]
     tables.append(Published(title, list(headings), rows))
     table = Table(title=escape(title))
     for heading in headings:

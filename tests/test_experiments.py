@@ -10,6 +10,7 @@ import pytest
 from small_experiments import load, plot, result_of
 
 from experiments import shared
+from experiments.published import RECORDER, read
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # they compute for longer than they compile
@@ -55,6 +56,11 @@ def test_configurations(name):
 def test_comparison_noise_study_and_scale(tmp_path):
     """One study of IBSS and equation error against the noise, and the figures of three experiments."""
     shared.run_studies({"out": load_study(small("comparison"))}, tmp_path)
+    RECORDER.publish("small", ["study.run"], {}, tmp_path)
+    assert [row[:3] for row in read("small", tmp_path).tables[-1].rows[:2]] == [
+        ["out", "0.1", "ibss"],
+        ["out", "0.1", "equation-error"],
+    ]
     for name in ("noise_study", "scale", "comparison"):
         plot(tmp_path, name, results="out", suffixes=(".svg", ".pdf") if name == "comparison" else (".svg",))
     data = read_results(tmp_path / "out").squeeze()
