@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import how_we_compile
+from scipy.signal import lfilter
 from small_experiments import load, plot, result_of
 
 import jaxos4
@@ -126,6 +127,19 @@ def test_rotorpy(tmp_path):
     (case,) = report["cases"]
     assert [row["result"] for row in case["flights"]] == ["successful"]
     assert all(abs(case["summary"][name]["mean"]) < 0.05 for name in ("Ix", "Iy", "Iz", "thrust"))
+
+
+def test_the_order_of_a_disturbance_decides_on_the_thrust():
+    """Under a controller that answers it by half, one order too few is a bias."""
+    pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
+    fit, random, steps = load("rotorpy", "disturbance").fit, np.random.default_rng(0), 5000
+    smooth = lfilter([0.05], np.poly([0.992, 0.95]), random.normal(size=steps))
+    thrust = 10 - 0.5 * lfilter([0.02], [1, -0.98], smooth) + lfilter([0.05], [1, -0.95], random.normal(size=steps))
+    force = 0.9 * thrust + smooth + 0.02 * random.normal(size=steps)
+    first, second = fit(force, thrust, 1), fit(force, thrust, 2)
+    assert second.likelihood > first.likelihood + 100
+    assert abs(second.gain - 0.9) < 3 * second.std
+    assert abs(first.gain - 0.9) > 2 * abs(second.gain - 0.9)
 
 
 def test_commands_that_are_too_rare_are_named(shared_flights, tmp_path):
