@@ -36,6 +36,16 @@ def whole(flight: jaxos4.Flight) -> jaxos4.VehicleSettings:
     return jaxos4.VehicleSettings(begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0)
 
 
+def shares_of_truth(found: jaxos4.Identification, vehicle: jaxos4.Airframe) -> dict[str, Row]:
+    """Error and standard deviation of each moment of inertia that has an estimate, as shares of the truth."""
+    constants, truths = found.rigid_body.constants, np.asarray(vehicle.inertia).tolist()
+    return {
+        name: {"error": constants[name].estimate / truth - 1, "std": constants[name].std / truth}
+        for name, truth in zip(INERTIAS, truths, strict=True)
+        if name in constants
+    }
+
+
 def fit(estimator: str, flight: jaxos4.Flight, vehicle: jaxos4.Airframe, i: int) -> Row:
     """The row of one flight. Errors and standard deviations are shares of the truth."""
     begin, given = time.perf_counter(), given_airframe(vehicle, i)
@@ -45,10 +55,7 @@ def fit(estimator: str, flight: jaxos4.Flight, vehicle: jaxos4.Airframe, i: int)
         return {"result": "refused", "why": str(error), "seconds": time.perf_counter() - begin}
     row: Row = {"result": found.result, "seconds": time.perf_counter() - begin}
     row["doubts"] = [str(doubt) for doubt in found.doubts]
-    for name, truth in zip(INERTIAS, np.asarray(vehicle.inertia).tolist(), strict=True):
-        if name in found.rigid_body.constants:
-            value = found.rigid_body.constants[name]
-            row[name] = {"error": value.estimate / truth - 1, "std": value.std / truth}
+    row |= shares_of_truth(found, vehicle)
     gain = found.parameters.get("thrust_gain")
     if gain is not None and gain.estimate is not None and gain.std is not None:
         truth = float(vehicle.thrust_coefficient / given.thrust_coefficient)

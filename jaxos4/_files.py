@@ -1,12 +1,10 @@
-"""Files are written completely or not at all, JSON and TOML read or refused in one line, templates escaped."""
+"""Files are written completely or not at all; JSON and TOML are read or refused in one line."""
 
 import contextlib
 import errno
-import html
 import json
 import math
 import os
-import re
 import secrets
 import shutil
 import sys
@@ -18,7 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, printable, shortened
+from .errors import InputError, shortened
 
 # Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
 BROKEN = (
@@ -145,27 +143,3 @@ def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST
             continue
         elif isinstance(each, int | float) and not abs(each) <= largest:
             raise InputError(f"{path}: `{shortened(place, 80)}` is beyond {largest:.3g}; {remedy}.")
-
-
-def templates(package: str, escape: Callable[[str], str] | None = None) -> Any:
-    """The templates in a package's folder. `escape`: makes text harmless: `printable`, `in_xml`; by default as HTML."""
-    import jinja2  # slow, and few need it
-    from markupsafe import Markup
-
-    def finalize(value: Any) -> Any:
-        return value if escape is None or isinstance(value, Markup) else Markup(escape(str(value)))  # noqa: S704
-
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader(package, "."),
-        undefined=jinja2.StrictUndefined,
-        autoescape=True,  # macros give markup, which is not escaped twice
-        finalize=finalize,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=escape is not None,
-    )
-
-
-def in_xml(text: str) -> str:
-    """The text in a comment, an attribute or an element of XML. A comment must not contain two hyphens in a row."""
-    return re.sub("-(?=-)", "- ", html.escape(printable(text), quote=False).replace('"', "&quot;"))

@@ -292,6 +292,7 @@ def network_file(tmp_path_factory):
     return network, flight
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["network", "hybrid"])
 def test_a_trained_network_identifies_other_flights_of_its_inputs(run, network_file, estimator):
     simulate(run, "flight.csv", "--noise", "2", "--seed", "5", "--duration", "5")
@@ -303,6 +304,7 @@ def test_a_trained_network_identifies_other_flights_of_its_inputs(run, network_f
         assert row["std"] >= 0.7 * row["bound"]
 
 
+@pytest.mark.slow
 def test_the_architecture_of_a_network_can_be_chosen(run, network_file, monkeypatch):
     small = functools.partial(NetworkEstimator, tilings=2, cells=4, batch=64, held_out=1000)
     monkeypatch.setattr("jaxos4.networks.NetworkEstimator", small)
@@ -312,6 +314,7 @@ def test_the_architecture_of_a_network_can_be_chosen(run, network_file, monkeypa
     assert jaxos4.load_network("flight.net").settings.architecture == "cmac"
 
 
+@pytest.mark.slow
 def test_networks_of_another_problem_are_refused(run, tmp_path, network_file):
     network, flight = (str(path) for path in network_file)
     simulate(run, "chirp.csv", "--excitation", "chirp", "--duration", "5")

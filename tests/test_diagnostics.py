@@ -59,6 +59,7 @@ def test_figures_are_those_of_plain_numpy():
         np.testing.assert_allclose(found.autocorrelation[i], r * n / (n - np.arange(1, LAGS + 1)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_true_models_pass_as_often_as_the_level_says():
     flights = 4 * LANES
     found = judged(noisy_states(flights, seed=21))
@@ -76,6 +77,7 @@ FIFTH = np.arange(501)[:, None] % 5 == 0
 GAPS = {"7 of 10": np.random.default_rng(0).random((2 * LANES, 501, 12)) > 0.7, "4 of 5": FIFTH}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", GAPS.values(), ids=GAPS)
 def test_missing_samples_do_not_look_like_colour(kept):
     """Also of every fifth sample, which leaves pairs at five of 25 lags.

@@ -219,6 +219,7 @@ print(json.dumps([
 """
 
 
+@pytest.mark.slow
 def test_another_package_adds_an_estimator_a_term_and_a_log_format(tmp_path):
     """The files of the documentation, in an installed package that names them as entry points."""
     (packages := tmp_path / "lab").mkdir()

@@ -17,12 +17,11 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 import small_study
-import strange
 import xarray as xr
 from helpers import refused
 from hypothesis import given, settings, strategies as st
 from recorded_logs import ACCIDENTS, damaged, table_csv
-from strange import in_one_line, nodes
+from strange import in_one_line, survives_strange_values
 from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
 
@@ -99,23 +98,9 @@ def test_a_damaged_file_ends_in_one_line(name, tmp_path):
         path.write_bytes(damaged(other.encode(), accidents if not literal else []))
         in_one_line(door, path)
 
-    @given(data=st.data())
-    @settings(max_examples=60)
-    def values_are_strange(data):
-        tree = json.loads(text)
-        for _ in range(data.draw(st.integers(1, 3))):
-            if places := list(nodes(tree)):
-                holder, key = places[data.draw(st.integers(0, len(places) - 1))]
-                if data.draw(st.booleans()) or isinstance(holder, list):
-                    holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(strange.VALUES))))
-                else:
-                    del holder[key]
-        path.write_text(json.dumps(tree), encoding="utf-8")
-        in_one_line(door, path)
-
     bytes_are_damaged()
     if text.startswith("{"):
-        values_are_strange()
+        survives_strange_values(door, path, [text], examples=60)
 
 
 # The cases that were found
@@ -189,6 +174,7 @@ def test_a_dataset_that_no_study_wrote_is_refused(run, tmp_path, case):
     assert [path.name for path in (tmp_path / "study").iterdir()] == ["results.nc"]
 
 
+@pytest.mark.slow
 def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, capfd):
     path = tmp_path / "results.nc"
     synthetic_study(flights=4, scales=(1.0,), estimators=("ibss",), spoiled=False).to_netcdf(path, engine="h5netcdf")
@@ -233,6 +219,7 @@ def parsed(text, target):
     return {token.string for token in tokens if token.type in (tokenize.NAME, tokenize.OP)}
 
 
+@pytest.mark.slow
 def test_hostile_names_are_in_comments_alone(tmp_path):
     path = tmp_path / "found.json"
     path.write_text(json.dumps(RESULT), encoding="utf-8")
@@ -275,6 +262,7 @@ def test_a_name_with_a_line_break_writes_nothing_into_the_drafted_airframe(run, 
     refused(run("estimate", "a\nmass = 1\n.csv", "--model", "flight"), "--airframe-out mine.toml` begins one")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux alone")
 def test_a_name_that_is_not_utf8_is_estimated_and_shown(run, tmp_path):
     name = os.fsencode(write_log(tmp_path / "x.csv").parent) + b"/l\xffg.csv"
@@ -322,9 +310,3 @@ def test_a_corrupt_field_of_an_esc_is_missing():
     log = Messages("log", {"esc_status": {0: fields}}, "")
     assert log.latest("esc_status", "esc[0].actuator_function") is None
     assert log.latest("esc_status", "esc[1].state") == 5.0
-
-
-def test_an_exported_model_of_mujoco_has_four_controls(save):
-    found = read_result(save(json.dumps(RESULT), "found.json"))
-    actuators = ElementTree.fromstring(export_vehicle(found, "mujoco").text).findall("actuator/general")
-    assert [each.get("name") for each in actuators] == ["thrust1", "thrust2", "thrust3", "thrust4"]

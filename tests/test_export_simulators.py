@@ -207,6 +207,7 @@ def flown_by_rotorpy(found, omega, begin):
     return np.array(states)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fly", [flown_by_mujoco, flown_by_rotorpy])
 def test_a_vehicle_flies_the_predicted_flight(mujoco, predicted_flight, fly):
     """For 2 s, from the same start, with the same rotor speeds."""

@@ -110,6 +110,7 @@ def test_the_likelihood_compares_innovations_less_the_feedthrough(rng):
             np.testing.assert_allclose(found.information[0, place, place], second[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_filter_does_not_depend_on_the_feedthrough(rng):
     """Only what is compared does: innovations are e - k v, with e those without feedthrough."""
     problem, k = standard(rng, passed=1), jnp.array([[0.01], [0.02], [-0.03]])

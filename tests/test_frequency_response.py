@@ -63,6 +63,7 @@ def test_intervals_hold_the_truth_although_a_controller_answers_gusts(gain):
     assert abs(np.log(ratio / gain).mean()) > 2 * np.median(errors)
 
 
+@pytest.mark.slow
 def test_intervals_hold_one_for_the_right_vehicle():
     """Whole flights in closed loop: rotors, all axes, and a gyro that the controller answers."""
     trials, vehicle = 24, jaxos4.load_airframe("crazyflie")

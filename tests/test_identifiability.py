@@ -95,6 +95,7 @@ def test_directions_are_those_of_the_information_in_half_widths(model_class):
     assert np.all(found.std_alone <= found.std * (1 + 1e-9))
 
 
+@pytest.mark.slow
 def test_a_profile_is_the_parabola_of_the_bound():
     problem, estimator = standard_problem(channels="rates", states=noisy_states(1, seed=3)[0]), jaxos4.OutputError()
     best = estimator(problem)
@@ -123,6 +124,7 @@ def residual_noise(flights, correlation_time):
     return np.array(naive), np.array(robust)
 
 
+@pytest.mark.slow
 def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_not():
     naive, robust = residual_noise(2 * LANES, 0.05)
     covered = [(np.abs(x) < 1.96).mean() for x in (naive, robust)]

@@ -171,6 +171,22 @@ def test_a_flight_has_the_numbers_of_the_command(run, tmp_path, flight):
     assert row.ci95[0] < row.estimate < row.ci95[1]
 
 
+def test_identify_takes_paths(tmp_path):
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=1.0, dt=0.01), dt=0.01)
+    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
+    jaxos4.write_flight(flight, tmp_path / "flight.csv")
+    found = [
+        jaxos4.identify(source, model, estimator="equation-error", validate=tmp_path / "flight.csv")
+        for source in (tmp_path / "flight.csv", str(tmp_path / "flight.csv"), [tmp_path / "flight.csv"])
+    ]
+    assert len({json.dumps(each.to_dict()["parameters"]) for each in found}) == 1
+    assert found[0].provenance.flight == str(tmp_path / "flight.csv")
+    assert found[0].validation.flight == str(tmp_path / "flight.csv")
+    with pytest.raises(jaxos4.InputError, match="there is no such file"):
+        jaxos4.identify(tmp_path / "none.csv", model)
+
+
 def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_path, vehicle, monkeypatch):
     monkeypatch.chdir(vehicle)
     files = ("--out", str(tmp_path / "found.json"), "--report", str(tmp_path / "found.html"))

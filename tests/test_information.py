@@ -35,7 +35,7 @@ def test_the_standard_flights_bounds_are_the_known_figures(channels):
 PUBLISHED, CORRECTED = MODELS = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 
 
-@pytest.mark.parametrize("free", [False, True, 5])
+@pytest.mark.parametrize("free", [*(pytest.param(each, marks=pytest.mark.slow) for each in (False, True)), 5])
 @pytest.mark.parametrize(
     ("model_class", "channels"), [(PUBLISHED, "attitude"), (CORRECTED, "rates"), (CORRECTED, "all")]
 )

@@ -55,6 +55,7 @@ def test_a_bad_log_is_refused_in_one_line(name, case, save):
         assert word in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_a_damaged_log_and_any_bytes_after_a_part_of_the_header(name, path):
     content, header, _ = SUBJECTS[name]
@@ -119,6 +120,7 @@ def write(path, lines, end="\n"):
     path.write_bytes(end.join(map(",".join, lines)).encode("utf-8", "surrogatepass"))
 
 
+@pytest.mark.slow
 @given(lines=flights(), data=st.data(), end=st.sampled_from(["\n", "\r\n", "\r"]))
 @settings(max_examples=250)
 def test_good_flights_after_accidents(lines, data, end, path):

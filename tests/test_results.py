@@ -5,18 +5,15 @@ import json
 import sys
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
-import strange
 from helpers import CRAZYFLIE, refused
-from hypothesis import given, settings, strategies as st
 from matplotlib.figure import Figure
 from pages import stands_alone, words
 from rich.console import Console
-from strange import in_one_line, nodes
+from strange import survives_strange_values
 from synthetic_identification import (
     SAMPLE_TIMES,
     behind_an_estimate,
@@ -262,22 +259,6 @@ def test_figures_are_on_one_axis_each():
             wrong()
 
 
-def test_identify_takes_paths(tmp_path):
-    model = jaxos4.PublishedOS4()
-    flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=1.0, dt=0.01), dt=0.01)
-    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
-    jaxos4.write_flight(flight, tmp_path / "flight.csv")
-    found = [
-        jaxos4.identify(source, model, estimator="equation-error", validate=tmp_path / "flight.csv")
-        for source in (tmp_path / "flight.csv", str(tmp_path / "flight.csv"), [tmp_path / "flight.csv"])
-    ]
-    assert len({json.dumps(each.to_dict()["parameters"]) for each in found}) == 1
-    assert found[0].provenance.flight == str(tmp_path / "flight.csv")
-    assert found[0].validation.flight == str(tmp_path / "flight.csv")
-    with pytest.raises(InputError, match="there is no such file"):
-        jaxos4.identify(tmp_path / "none.csv", model)
-
-
 # Comparison
 
 
@@ -353,16 +334,4 @@ def test_a_damaged_result_ends_in_one_line(tmp_path):
     path = tmp_path / "found.json"
     few = identified_vehicle(**FULL, predictions=synthetic_predictions(6)).to_dict()
     tables = [json.dumps(few), json.dumps(identified_flight().to_dict())]
-
-    @given(data=st.data())
-    @settings(max_examples=25)
-    def law(data):
-        tree = json.loads(data.draw(st.sampled_from(tables)))
-        for _ in range(data.draw(st.integers(1, 3))):
-            places = list(nodes(tree))
-            holder, key = places[data.draw(st.integers(0, len(places) - 1))]
-            holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(strange.VALUES))))
-        path.write_text(json.dumps(tree), encoding="utf-8")
-        in_one_line(shown, path)
-
-    law()
+    survives_strange_values(shown, path, tables, examples=25)

@@ -11,6 +11,17 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from experiments.sample_times.run import VEHICLE as CINERAT
+from experiments.verdicts.faults import (
+    along_the_earth,
+    clipped,
+    impossible,
+    late,
+    scaled,
+    shortened,
+    thinned,
+    turned,
+    without_rows,
+)
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES, VELOCITY
 from jaxos4.logs import write_flight
@@ -25,7 +36,7 @@ pytestmark = pytest.mark.slow
 
 INERTIAS = {"Ix", "Iy", "Iz"}
 WIND = {"wind": 1.0, "drag": 0.3, "inflow": 0.6, "flapping": 2.0}
-P, Q, AX, AY, AZ = 7, 9, 0, 1, 2
+P, FORCE, AZ = 7, np.array([12, 13, 14]), 14  # of the channels
 
 
 @pytest.fixture(scope="module")
@@ -41,50 +52,15 @@ def flights():
     return [*(flown(*each, seed) for seed, each in enumerate(settings)), flown("commands", 2.0, 9, **moving)]
 
 
-def scaled(columns, factor):
-    def spoil(flight):
-        flight.states[:, columns] *= factor
-        return flight
-
-    return spoil
-
-
-def late(columns, seconds, *, force=False):
-    """Recorded so much later; negative: earlier."""
-
-    def spoil(flight):
-        array = flight.specific_force if force else flight.states
-        for i in columns:
-            array[:, i] = np.interp(flight.time - seconds, flight.time, array[:, i])
-        return flight
-
-    return spoil
-
-
-def clipped(array, column, share):
-    def spoil(flight):
-        values = getattr(flight, array)[:, column]
-        limit = share * np.abs(values).max()
-        np.clip(values, -limit, limit, out=values)
-        return flight
-
-    return spoil
-
-
 def rotated(matrix):
     """Gyro and accelerometer along other axes."""
 
-    def spoil(flight):
-        flight.states[:, RATES] = flight.states[:, RATES] @ np.transpose(matrix)
-        return flight._replace(specific_force=flight.specific_force @ np.transpose(matrix))
+    def spoil(flight, _):
+        states, force = flight.states.copy(), flight.specific_force @ np.transpose(matrix)
+        states[:, RATES] = states[:, RATES] @ np.transpose(matrix)
+        return flight._replace(states=states, specific_force=force)
 
     return spoil
-
-
-def turned(degrees):
-    """A rotation about z: the components along axes that are turned counter-clockwise."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return rotated([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
 
 def tilted(degrees):
@@ -92,59 +68,42 @@ def tilted(degrees):
     return rotated([[1, 0, 0], [0, c, s], [0, -s, c]])
 
 
-def along_the_earth(flight):
-    (sx, cx), (sy, cy), (sz, cz) = ((np.sin(a), np.cos(a)) for a in flight.states[:, ANGLES].T)
-    thrust = flight.specific_force[:, AZ]
-    up = np.stack([cz * sy * cx + sz * sx, sz * sy * cx - cz * sx, cy * cx], axis=1)
-    return flight._replace(specific_force=thrust[:, None] * up + flight.specific_force * [1, 1, 0])
+def timed(flight, factor):
+    return flight._replace(time=factor * flight.time)
 
 
-def timed(factor):
-    return lambda flight: flight._replace(time=factor * flight.time)
-
-
-def thinned(every):
-    return lambda flight: flight._replace(omega=flight.omega[np.arange(flight.time.size) // every * every])
-
-
-def impossible(flight):
-    flight.omega[[1000, 3000], 2] = 60 * flight.omega.mean(), 19 * flight.omega.mean()
-    return flight
-
-
-def rows_missing(flight):
-    keep = np.random.default_rng(0).random(flight.time.size) < 0.7
-    arrays = {name: x[keep] for name, x in flight._asdict().items() if isinstance(x, np.ndarray)}
-    return flight._replace(**arrays)
-
-
-def in_g(flight):
-    return flight._replace(specific_force=flight.specific_force / 9.80665)
+def in_units(flight, size):
+    return flight._replace(specific_force=flight.specific_force / size)
 
 
 SCALE, TIME = "the gyro's scale", "the time stamps"
-# By fault: how a flight gets it, words of the cause, what it concerns, and whether it contradicts that.
+# By fault: how a flight gets it, its size, words of the cause, what it concerns, and whether it contradicts that.
 FAULTS = {
-    "gyro scale": (scaled(RATES, 0.5), [SCALE, TIME], INERTIAS, True),
-    "gyro scale, a little": (scaled(RATES, 1.2), ["0.83", SCALE], INERTIAS, True),
-    "time scale": (timed(2.0), ["0.5 times", TIME], INERTIAS, True),
-    "attitude scale": (scaled(ANGLES, 0.5), ["scale of the attitude"], {"attitude"}, True),
-    "sign of the attitude": (scaled(ANGLES[1:2], -1.0), ["opposite signs in pitch"], INERTIAS | {"attitude"}, True),
-    "attitude late": (late(ANGLES, 0.1), ["attitude is recorded 100 ms late"], {"attitude"}, True),
-    "gyro early": (late(RATES, -0.03), ["gyro is recorded", "early"], INERTIAS, True),
-    "force late": (late(range(3), 0.03, force=True), ["accelerometer is recorded"], INERTIAS | {"thrust"}, True),
-    "gyro clipped": (clipped("states", P, 0.3), ["clipped"], {"Ix"}, True),
-    "force clipped": (clipped("specific_force", AZ, 0.9), ["clipped"], INERTIAS | {"thrust"}, False),
-    "turned": (turned(20), ["mounted at an angle about the vertical axis"], INERTIAS, True),
-    "turned back": (turned(-30), ["mounted at an angle about the vertical axis"], INERTIAS, True),
-    "tilted": (tilted(40), ["not along its z axis"], {"thrust"}, True),
-    "along the earth": (along_the_earth, ["axes of the earth"], {"thrust"}, True),
-    "in g": (in_g, ["units of g"], {"thrust"}, True),
-    "impossible speeds": (impossible, ["impossible"], {"thrust"}, False),
-    "thinned": (thinned(10), ["more rarely"], {"damping"}, True),
-    "short": (lambda flight: flight.rows(slice(500)), ["short"], INERTIAS, False),
-    "rows missing": (rows_missing, ["not uniform"], INERTIAS, True),
+    "gyro scale": (scaled(RATES), 0.5, [SCALE, TIME], INERTIAS, True),
+    "gyro scale, a little": (scaled(RATES), 1.2, ["0.83", SCALE], INERTIAS, True),
+    "time scale": (timed, 2.0, ["0.5 times", TIME], INERTIAS, True),
+    "attitude scale": (scaled(ANGLES), 0.5, ["scale of the attitude"], {"attitude"}, True),
+    "sign of the attitude": (scaled(ANGLES[1:2]), -1.0, ["opposite signs in pitch"], INERTIAS | {"attitude"}, True),
+    "attitude late": (late(ANGLES), 0.1, ["attitude is recorded 100 ms late"], {"attitude"}, True),
+    "gyro early": (late(RATES), -0.03, ["gyro is recorded", "early"], INERTIAS, True),
+    "force late": (late(FORCE), 0.03, ["accelerometer is recorded"], INERTIAS | {"thrust"}, True),
+    "gyro clipped": (clipped(P), 0.3, ["clipped"], {"Ix"}, True),
+    "force clipped": (clipped(AZ), 0.9, ["clipped"], INERTIAS | {"thrust"}, False),
+    "turned": (turned, 20, ["mounted at an angle about the vertical axis"], INERTIAS, True),
+    "turned back": (turned, -30, ["mounted at an angle about the vertical axis"], INERTIAS, True),
+    "tilted": (tilted(40), 0, ["not along its z axis"], {"thrust"}, True),
+    "along the earth": (along_the_earth, 1.0, ["axes of the earth"], {"thrust"}, True),
+    "in g": (in_units, 9.80665, ["units of g"], {"thrust"}, True),
+    "impossible speeds": (impossible, 19.0, ["impossible"], {"thrust"}, False),
+    "thinned": (thinned, 10, ["more rarely"], {"damping"}, True),
+    "short": (shortened, 2.0, ["short"], INERTIAS, False),
+    "rows missing": (without_rows, 0.3, ["not uniform"], INERTIAS, True),
 }
+
+
+def with_fault(fault, flight):
+    spoil, size, *_ = FAULTS[fault]
+    return spoil(flight, size)
 
 
 def copied(flight):
@@ -160,9 +119,9 @@ def test_good_flights_have_no_findings(flights):
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_with_its_cause(fault, flights):
-    spoil, words, quantities, contradicted = FAULTS[fault]
+    _, _, words, quantities, contradicted = FAULTS[fault]
     for flight in flights[:2]:
-        found = self_checks(spoil(copied(flight)), CRAZYFLIE)
+        found = self_checks(with_fault(fault, flight), CRAZYFLIE)
         assert found, flight.name
         for word in words:
             assert word in str(found[0])
@@ -175,7 +134,7 @@ def test_a_fault_is_named_with_its_cause(fault, flights):
 @pytest.mark.parametrize("rows", [2, 3, 4])
 def test_speeds_at_instants_that_are_far_apart_are_noted(rows, flights):
     """Motion of the rotors in between is not known; 8 ms are good enough."""
-    found = self_checks(copied(flights[1]).rows(slice(None, None, rows)), CRAZYFLIE)
+    found = self_checks(flights[1].rows(slice(None, None, rows)), CRAZYFLIE)
     assert [each.name for each in found] == ["rare_speeds"] * (rows > 2)
     assert not any(each.contradicted for each in found)
 
@@ -183,13 +142,13 @@ def test_speeds_at_instants_that_are_far_apart_are_noted(rows, flights):
 def test_each_fault_of_one_sensor_says_nothing_of_another(flights):
     """A late attitude leaves the inertias alone, and so does one of another scale."""
     for fault in ("attitude late", "attitude scale"):
-        (found,) = self_checks(FAULTS[fault][0](copied(flights[2])), CRAZYFLIE)
+        (found,) = self_checks(with_fault(fault, flights[2]), CRAZYFLIE)
         assert found.quantities == ("attitude",)
 
 
 @pytest.mark.parametrize(("sensor", "name"), [(RATES, "gyro_or_accelerometer_clock"), (ANGLES, "attitude_clock")])
 def test_two_causes_are_both_named_if_the_log_does_not_show_which(sensor, name, flights):
-    flight = late(sensor, -0.02 if sensor is RATES else 0.1)(copied(flights[0]))
+    flight = late(sensor)(flights[0], -0.02 if sensor is RATES else 0.1)
     if sensor is RATES:
         flight.states[:, ANGLES] = np.nan
     else:
@@ -212,8 +171,8 @@ def test_an_attitude_of_other_axes_leaves_the_inertias_alone(flights):
 
 def test_a_velocity_tells_the_gyro_from_the_time_and_its_own_axes(flights):
     flight = flights[-1]
-    for spoil, cause in ((scaled(RATES, 0.5), SCALE), (timed(2.0), TIME)):
-        (found,) = self_checks(spoil(copied(flight)), CRAZYFLIE)
+    for fault, cause in (("gyro scale", SCALE), ("time scale", TIME)):
+        (found,) = self_checks(with_fault(fault, flight), CRAZYFLIE)
         assert f"{cause} {'is' if cause is SCALE else 'are'} wrong" in found.cause
         assert (TIME in found.cause) == (cause is TIME)
     north_east = copied(flight)
@@ -232,7 +191,7 @@ def given_rotation(finding):
 def test_the_advised_rotation_of_the_sensors_cures_their_mounting(flights, angles):
     """Without a rotation about z, the thrust shows two angles, and the rotors then the third."""
     axes = Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix()
-    turned_flight, airframe = rotated(axes.T)(copied(flights[0])), CRAZYFLIE
+    turned_flight, airframe = rotated(axes.T)(flights[0], 0), CRAZYFLIE
     for _ in range(2):
         found = {each.name: each for each in self_checks(turned_flight, airframe)}
         if not found:
@@ -261,21 +220,22 @@ def test_simulated_sensors_are_mounted_as_the_airframe_says(flights):
 
 
 def test_a_turned_sensor_seems_to_lie_on_the_ground(flights):
-    flight = tilted(100)(copied(flights[0]))
+    flight = tilted(100)(flights[0], 0)
     flight.states[:, ANGLES] = np.nan
     found = self_checks(flight, CRAZYFLIE)
     assert [each.name for each in found if each.contradicted] == ["force_direction"]
 
 
 def test_faulty_values_count_as_not_measured(flights):
-    flight = impossible(clipped("states", P, 0.5)(copied(flights[1])))
+    flight = impossible(clipped(P)(flights[1], 0.5), 19.0)
     found = plausible(flight)
     count, share, end = found.clipped["p"]
     assert count == np.isnan(found.recording.states[:, P]).sum() > 20
     assert share == pytest.approx(count / flight.time.size)
     assert abs(end) == pytest.approx(np.abs(flight.states[:, P]).max())
-    assert found.impossible["rotor 3"][0] == 2
-    np.testing.assert_array_equal(found.recording.omega[1000], flight.omega[[1000, 1000, 999, 1000], np.arange(4)])
+    assert found.impossible["rotor 4"][0] == 2
+    row = len(flight.omega) // 3
+    np.testing.assert_array_equal(found.recording.omega[row], flight.omega[[row, row, row, row - 1], np.arange(4)])
     assert plausible(flights[0]).recording is flights[0]
 
 
@@ -340,7 +300,7 @@ def test_little_or_nothing_measured_is_no_fault(flights):
 
 
 def test_inspect_prints_cause_size_and_remedy(flights, run, tmp_path):
-    write_flight(scaled(RATES, 0.5)(copied(flights[1])).flight, tmp_path / "flight.csv", CRAZYFLIE)
+    write_flight(with_fault("gyro scale", flights[1]).flight, tmp_path / "flight.csv", CRAZYFLIE)
     code, out, err = run("inspect", "flight.csv", "--out", "found.json")
     assert (code, err) == (0, "")
     assert "contradicts Ix, Iy, Iz: the attitude turns 2 times as much as the gyro says" in out

@@ -69,6 +69,7 @@ def likelihood(problem, values):
     return float(found.cost[0] - prior), parts.gradient, parts.information
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_the_sum_over_recordings():
     """Cost, gradient and information, of parameters that are shared and of those that are not."""
     flights = [flight_of(samples, seed) for seed, samples in enumerate(LENGTHS)]

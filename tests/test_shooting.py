@@ -138,9 +138,10 @@ def central_differences(problem, parameters, start, step):
 
 
 CASES = [
-    (PUBLISHED, "rates", False, "euler"),
-    (PUBLISHED, "attitude", True, "euler"),
-    (PUBLISHED, "all", False, "euler"),
+    *(
+        pytest.param(PUBLISHED, channels, free, "euler", marks=pytest.mark.slow)
+        for channels, free in (("rates", False), ("attitude", True), ("all", False))
+    ),
     (CORRECTED, "all", True, "euler"),
     (CORRECTED, "rates", False, "rk4"),
 ]

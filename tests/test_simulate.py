@@ -48,6 +48,7 @@ def refinements(request):
     return model, np.asarray(alpha), np.asarray(omega), exact, errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "order"), [("euler", 1), ("rk4", 4)])
 def test_converges_at_its_order(refinements, method, order):
     model, _, _, exact, errors = refinements
@@ -57,6 +58,7 @@ def test_converges_at_its_order(refinements, method, order):
     np.testing.assert_allclose(np.log2(relative[:-1] / relative[1:]), order, atol=0.04)
 
 
+@pytest.mark.slow
 def test_diffrax_agrees_with_another_library_on_other_equations(refinements):
     model, alpha, omega, exact, _ = refinements
     derivative, state, states = REFERENCES[type(model)], np.zeros(12), [np.zeros(12)]

@@ -7,22 +7,17 @@ is identified with all commands, and with one in 10, 20 and 40, each held until 
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 import jaxos4
 from experiments.monte_carlo import interval, print_table, write_report
 from experiments.shared import flight_files
-from jaxos4.recording import Recording, read_recording
+from experiments.verdicts.faults import thinned
+from jaxos4.recording import read_recording
 
 AIRFRAME = jaxos4.load_airframe("crazyflie")
 FLIGHT, STEP = "arpl_crazyflie_rollpitch.csv", 0.01
 SHOWN = {"roll_damping": 1.0, "pitch_damping": 1.0, "Ix": 1e5, "Iy": 1e5}
-
-
-def thinned(recording: Recording, every: int) -> Recording:
-    """The recording with one command of `every`, held until the next."""
-    return recording._replace(omega=recording.omega[np.arange(len(recording.omega)) // every * every])
 
 
 def main(
@@ -35,7 +30,7 @@ def main(
     recording = read_recording(*flight_files(flights, [FLIGHT]), AIRFRAME)
     settings, report = jaxos4.VehicleSettings(sample_time=STEP, end=end), {}
     for n in every:
-        found = jaxos4.identify([thinned(recording, n)], AIRFRAME, settings=settings).to_dict()
+        found = jaxos4.identify([thinned(recording, float(n))], AIRFRAME, settings=settings).to_dict()
         report[n] = {name: found[name] for name in ("result", "doubts", "parameters", "constants")}
         write_report(out, report)
     rows = []

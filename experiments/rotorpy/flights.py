@@ -19,6 +19,7 @@ from jaxos4.flight import STATE_NAMES
 from jaxos4.logs.csv import write_flight
 
 DT = 0.004
+GUSTS = {"calm": 0.0, "gusty": 1.5}  # [m/s]
 GYRO_NOISE, FORCE_NOISE, ATTITUDE_NOISE = 0.01, 0.1, 0.002
 POSITION_NOISE, VELOCITY_NOISE = 0.002, 0.02  # of motion capture
 # The gusts are sums of sines with the spectrum of a first-order process with this correlation time [s].
@@ -86,12 +87,12 @@ class Gusts:
         return sum((wind.update(t, None) for wind in self.winds), np.zeros(3))
 
 
-def fly(gust: float, duration: float, seed: int, *, captured: bool = False) -> jaxos4.Flight:
-    """A flight with gyro, attitude, accelerometer, and the speed of each rotor, all at the same instants.
+def fly(gust: float, duration: float, seed: int, i: int, *, captured: bool = False) -> jaxos4.Flight:
+    """Flight `i` of a seed, with gyro, attitude, accelerometer, and the speed of each rotor, all at the same instants.
 
     `captured`: with position and velocity too. All other columns are the same.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1000 * seed + i)
     references, gusts = References(duration, random), Gusts(gust, random)
     vehicle, controller = Multirotor(quad_params), SE3Control(quad_params)
     hover = np.full(4, float(VEHICLE.hover_speed))
@@ -124,5 +125,5 @@ def recorded(folder: Path, i: int, gust: float, duration: float, seed: int, *, c
     path = folder / f"gust{gust:g}_{duration:g}s_seed{seed}_{i:03}{'_captured' * captured}.csv"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_flight(fly(gust, duration, 1000 * seed + i, captured=captured), path)
+        write_flight(fly(gust, duration, seed, i, captured=captured), path)
     return path

@@ -17,10 +17,9 @@ import typer
 import jaxos4
 from experiments.fits import fit, print_summaries, summary
 from experiments.monte_carlo import Row, continued, fill, monte_carlo, print_table
-from experiments.rotorpy.flights import VEHICLE, recorded
+from experiments.rotorpy.flights import GUSTS, VEHICLE, recorded
 from experiments.rotorpy.predictions import QUANTITIES, prediction
 
-GUSTS = {"calm": 0.0, "gusty": 1.5}  # [m/s]
 KINDS, ESTIMATORS = tuple(GUSTS), ("filter-error", "ibss", "hybrid")
 
 

@@ -4,14 +4,14 @@ The good flights, and the airframe that is given, are those of `closed_loop/effe
 needs RotorPy to be installed. Each fault spoils the flights `gusts` in three sizes, alone. Ix and Iy are judged. A
 quantity is *identified* with or without a reservation. It is *wrong* if it is off by more than three standard
 deviations, or, without a reservation, by more than 12 %. An answer is *right* if its 95 % interval holds the truth. A
-cause is right if the faults of the table below are named as they are, wherever the answer says so.
+cause is right if a fault of `faults.py` is named as it is, wherever the answer says so.
 """
 
 import functools
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -19,146 +19,19 @@ import typer
 import jaxos4
 from experiments.closed_loop.effects import ALL, EFFECTS, flights_of
 from experiments.closed_loop.run import VEHICLE
-from experiments.fits import INERTIAS, given_airframe
+from experiments.fits import INERTIAS, given_airframe, shares_of_truth
 from experiments.monte_carlo import Row, continued, fill, print_table
+from experiments.verdicts.faults import FAULTS, Fault
 from jaxos4 import FrequencyResponse
 from jaxos4.errors import InputError
-from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification.verdict import IDENTIFIED
 from jaxos4.recording import Recording
-from jaxos4.recording.motion import rotations_to_body
 from jaxos4.results import NINETY_FIVE
 
 JUDGED = "Ix", "Iy"
 SURE, FAR = 3.0, 0.12  # an answer beyond either is wrong: standard deviations, and share of the truth
-FORCE = slice(12, 15)  # of the channels
 LOST = "lost"  # the result of a vehicle that turns over
-
-
-class Fault(NamedTuple):
-    """`spoil`: makes spoiled recordings of a good one and a size. `cause`: words of the right cause; empty: none."""
-
-    spoil: Callable[[Recording, float], Recording | list[Recording]]
-    sizes: tuple[float, ...]
-    cause: str
-
-
-def changed(recording: Recording, channels: np.ndarray) -> Recording:
-    """The recording with other states and specific force."""
-    return recording._replace(states=channels[:, :12], specific_force=channels[:, FORCE])
-
-
-def scaled(columns: np.ndarray) -> Callable[[Recording, float], Recording]:
-    """Some channels have another scale."""
-
-    def spoil(recording: Recording, size: float) -> Recording:
-        channels = recording.channels.copy()
-        channels[:, columns] *= size
-        return changed(recording, channels)
-
-    return spoil
-
-
-def late(columns: np.ndarray) -> Callable[[Recording, float], Recording]:
-    """Some channels are recorded late by `size` [s]; negative: early."""
-
-    def spoil(recording: Recording, size: float) -> Recording:
-        channels = recording.channels.copy()
-        for i in columns:
-            channels[:, i] = np.interp(recording.time - size, recording.time, channels[:, i])
-        return changed(recording, channels)
-
-    return spoil
-
-
-def clipped(column: int) -> Callable[[Recording, float], Recording]:
-    """The range of a sensor ends at this share of its largest value."""
-
-    def spoil(recording: Recording, size: float) -> Recording:
-        channels = recording.channels.copy()
-        end = size * np.nanmax(np.abs(channels[:, column]))
-        channels[:, column] = np.clip(channels[:, column], -end, end)
-        return changed(recording, channels)
-
-    return spoil
-
-
-def turned(recording: Recording, degrees: float) -> Recording:
-    """Gyro and accelerometer are mounted at an angle about z."""
-    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    channels = recording.channels.copy()
-    for x, y in ((RATES[0], RATES[1]), (12, 13)):
-        channels[:, [x, y]] = channels[:, [x, y]] @ np.array([[cos, -sin], [sin, cos]])
-    return changed(recording, channels)
-
-
-def along_the_earth(recording: Recording, size: float) -> Recording:
-    """Specific force is along the axes of the earth; `size`: the share of the turn."""
-    channels = recording.channels.copy()
-    turns = rotations_to_body(*(size * channels[:, ANGLES]).T)
-    channels[:, FORCE] = np.einsum("tji,tj->ti", turns, channels[:, FORCE])
-    return changed(recording, channels)
-
-
-def impossible(recording: Recording, size: float) -> Recording:
-    """Two impossible rotor speeds: 60 and `size` times the mean."""
-    omega = recording.omega.copy()
-    omega[[len(omega) // 3, len(omega) // 2], 3] = np.array([60.0, size]) * omega[:, 3].mean()
-    return recording._replace(omega=omega)
-
-
-def noisy(recording: Recording, size: float) -> Recording:
-    """White noise of the motors, as a share of their changes from sample to sample."""
-    change = np.mean(np.median(np.abs(np.diff(recording.omega, axis=0)), axis=0))
-    noise = np.random.default_rng(0).normal(0.0, size * change, recording.omega.shape)
-    return recording._replace(omega=np.maximum(recording.omega + noise, 0.0))
-
-
-def shortened(recording: Recording, seconds: float) -> Recording:
-    """The first seconds of a flight."""
-    return recording.rows(recording.time <= recording.time[0] + seconds)
-
-
-def without_rows(recording: Recording, lost: float) -> Recording:
-    """This share of the rows is missing, at random."""
-    return recording.rows(np.random.default_rng(0).uniform(size=recording.time.size) >= lost)
-
-
-def two_vehicles(recording: Recording, size: float) -> list[Recording]:
-    """Two halves; the second is of a vehicle whose mass and moments of inertia are so many times smaller.
-
-    With rotor speeds that are smaller by the root, it flies the same path.
-    """
-    first = recording.time <= (recording.time[0] + recording.time[-1]) / 2
-    second = recording.rows(~first)
-    return [recording.rows(first), second._replace(omega=second.omega / np.sqrt(size), name="second flight")]
-
-
-def thinned(recording: Recording, every: float) -> Recording:
-    """Motors are logged once in so many samples."""
-    rows = np.arange(len(recording.omega)) // int(every) * int(every)
-    return recording._replace(omega=recording.omega[rows])
-
-
-FAULTS = {
-    "gyro scale": Fault(scaled(RATES), (0.5, 0.8, 1.25), "the attitude turns"),
-    "time scale": Fault(lambda r, size: r._replace(time=size * r.time), (2.0, 1.25, 0.8), "the attitude turns"),
-    "attitude scale": Fault(scaled(ANGLES), (0.5, 0.8, 1.25), "the attitude turns"),
-    "attitude late": Fault(late(ANGLES), (0.2, 0.1, 0.05), "attitude is recorded"),
-    "gyro clipped": Fault(clipped(int(RATES[0])), (0.5, 0.65, 0.8), "is clipped"),
-    "force clipped": Fault(clipped(14), (0.9, 0.85, 0.8), "is clipped"),
-    "gyro early": Fault(late(RATES), (-0.05, -0.03, -0.02), "gyro is recorded"),
-    "force late": Fault(late(np.array([12, 13, 14])), (0.05, 0.03, 0.02), "accelerometer is recorded"),
-    "turned": Fault(turned, (30.0, 20.0, 10.0), "at an angle about the vertical axis"),
-    "earth's axes": Fault(along_the_earth, (1.0,), "along the axes of the earth"),
-    "impossible speeds": Fault(impossible, (40.0, 19.0, 5.0), "are impossible"),
-    "noisy motors": Fault(noisy, (0.3, 1.0, 3.0), ""),
-    "short": Fault(shortened, (2.0, 4.0, 6.0), "s were fitted"),
-    "rows missing": Fault(without_rows, (0.1, 0.3, 0.5), "is not uniform"),
-    "two vehicles": Fault(two_vehicles, (1.1, 1.2, 1.3), "of different mass or thrust"),
-    "rare motors": Fault(thinned, (5.0, 10.0, 20.0), "more rarely"),
-}
-ROTORPY = {"RotorPy calm": 0.0, "RotorPy gusts": 1.5}  # [m/s]
+ROTORPY = {"RotorPy calm": "calm", "RotorPy gusts": "gusty"}
 CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL, *ROTORPY)}
 CASES |= {f"{name} {size:g}": ("gusts", fault, size) for name, fault in FAULTS.items() for size in fault.sizes}
 
@@ -171,7 +44,7 @@ def good_flights(
         return VEHICLE, flights_of(kind, count, duration, seed).__getitem__
     from experiments.rotorpy import flights
 
-    return flights.VEHICLE, lambda i: flights.fly(ROTORPY[kind], duration, 1000 * seed + i)
+    return flights.VEHICLE, lambda i: flights.fly(flights.GUSTS[ROTORPY[kind]], duration, seed, i)
 
 
 def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> Row:
@@ -179,20 +52,15 @@ def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault
     begin, recording = time.perf_counter(), Recording.of(flight, "flight")
     row: Row = {"result": "refused"}
     try:
-        found = jaxos4.identify(
-            recording if fault is None else fault.spoil(recording, size), given_airframe(vehicle, i)
-        )
+        spoiled = recording if fault is None else fault.spoil(recording, size)
+        found = jaxos4.identify(spoiled, given_airframe(vehicle, i))
     except InputError as error:
         causes = [str(error)]
     else:
-        row["result"], constants = found.result, found.rigid_body.constants
+        row["result"] = found.result
         causes = [*map(str, found.doubts), *(r for v in found.verdicts.values() for r in v.reasons)]
         causes += found.provenance.notes
-        for name, truth in zip(INERTIAS, np.asarray(vehicle.inertia).tolist(), strict=True):
-            if name in constants:
-                value = constants[name]
-                row[name] = {"error": value.estimate / truth - 1, "std": value.std / truth}
-                row[name]["status"] = found.verdicts[name].status
+        row |= {n: each | {"status": found.verdicts[n].status} for n, each in shares_of_truth(found, vehicle).items()}
         if found.response is not None:
             row["response"] = agreements(found.response)
     named = None if fault is None or not fault.cause else any(fault.cause in cause for cause in causes)
@@ -215,11 +83,8 @@ def counts(rows: list[Row]) -> dict[str, int]:
             if name not in row:
                 continue
             off, status = abs(row[name]["error"]), row[name]["status"]
-            trusted, unreserved, wide = (
-                status.startswith("identified"),
-                status == IDENTIFIED,
-                off > SURE * row[name]["std"],
-            )
+            trusted, unreserved = status.startswith("identified"), status == IDENTIFIED
+            wide = off > SURE * row[name]["std"]
             found["identified"] += trusted
             found["unreserved"] += unreserved
             found["far"] += unreserved and (wide or off > FAR)
@@ -287,12 +152,7 @@ def print_tables(rows: list[Row]) -> None:
     headings += "of unreserved far [%]", "refused, right [%]", "named [%]"
     print_table("verdicts of Ix and Iy", ("case", *headings), lines, width=140)
     headings = (f"{name} {what} [%]" for name in INERTIAS for what in ("mean error", "intervals that hold"))
-    print_table(
-        "errors of good flights",
-        ("case", *headings),
-        errors_of(unspoiled),
-        width=160,
-    )
+    print_table("errors of good flights", ("case", *headings), errors_of(unspoiled), width=160)
     print_responses("frequency response of good flights", {"good flights": good})
 
 

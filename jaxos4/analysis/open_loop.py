@@ -111,8 +111,3 @@ def traced(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) ->
     innovation = np.full(rates.shape, np.nan)
     innovation[1:] = np.where(np.diff(number)[:, None] == 0, rates[1:] - later[:-1], np.nan)
     return Traced(np.asarray(known.disturbance), innovation)
-
-
-def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Float[np.ndarray, "samples 3"]:
-    """The disturbance of each body rate [rad/s^2] at each sample, see `traced`."""
-    return traced(problem, parameters, noise).disturbance

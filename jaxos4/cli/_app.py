@@ -1,60 +1,21 @@
-"""The application: its commands, their exit codes, and how JAX is prepared for them."""
+"""The application: its commands, and their exit codes."""
 
 import functools
 import io
 import os
 import sys
-import tempfile
-import warnings
 from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
 
-from .._xla import add_flags
 from ..errors import InputError, TrainingError, printable
+from ._jax import NO_CACHE, prepare
 from .estimate import estimate, train
 from .identified import export, predict
 from .information import identifiability, inspect
 from .new_flights import design, simulate
 from .studies import compare, report, study
-
-NO_CACHE = "JAXOS4_NO_CACHE"
-"""The environment variable that switches off the cache of compiled programs."""
-
-
-def prepare(*, batch: bool) -> None:
-    """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off.
-
-    `batch`: whether the command computes many flights at once; those of a single one should compile quickly.
-    """
-    if not batch:
-        add_flags(quick=True)
-
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    if os.environ.get(NO_CACHE):
-        jax.config.update("jax_enable_compilation_cache", False)
-        return
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        import platformdirs
-
-        # JAX removes the oldest programs only from a folder that has had a limit since its first one.
-        folder = platformdirs.user_cache_path("jaxos4", appauthor=False) / "compiled"
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        except OSError:
-            return
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_compilation_cache_max_size", 1 << 30)  # 1 GB
-    if jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 1.0:  # JAX's default [s]
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
-    # Another process may be writing the same program, or remove it: it is then compiled again.
-    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
-
 
 _EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1: nothing is kept."
 

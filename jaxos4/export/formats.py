@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._files import in_xml, templates
+from .._templates import in_xml, templates
 from .._version import __version__
 from ..errors import InputError, printable
 from ..results import meaning

@@ -127,6 +127,10 @@ def prepare_vehicle(
         raise InputError("`network`: a vehicle's network is trained for its own flights; use `estimator` hybrid.")
     if validate is not None and settings.holdout:
         raise InputError("`holdout`: `validate` is predicted instead of a part of the flights; leave one of them out.")
+    if validate is not None and any(validate.same_data(recording) for recording in recordings):
+        raise InputError(
+            f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
+        )
     by_default = HOLDOUT if validate is None else 0.0
     holdout = by_default if settings.holdout is None else settings.holdout
     prepared = prepare(
@@ -256,7 +260,7 @@ def _held_out(
     name, notes, seconds = recordings[0].name, prepared.notes, prepared.seconds[1]
     remedy = "give `holdout` 0 or `validate`"
     if validate is not None:
-        other = _prepare_other(recordings, validate, prepared, model)
+        other = _prepare_other(validate, float(prepared.fitted.dt), model)
         own = dataclasses.replace(model, recordings=other.recordings)
         clock = Clock(np.full(other.time.size, len(recordings)), other.time)
         held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, clock), other.seconds[0]
@@ -274,16 +278,9 @@ def _held_out(
     return held_out, seconds, notes
 
 
-def _prepare_other(
-    recordings: Sequence[Recording], validate: Recording, prepared: Prepared, model: FlightModel
-) -> Prepared:
-    """The recording to predict, with the sample time of those that are fitted."""
-    if any(validate.same_data(recording) for recording in recordings):
-        raise InputError(
-            f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
-        )
-    step = float(prepared.fitted.dt)
-    (other,) = prepare([validate], model.airframe, sample_time=step, holdout=0.0, predicted=True)
+def _prepare_other(validate: Recording, sample_time: float, model: FlightModel) -> Prepared:
+    """The recording to predict, with the sample time [s] of those that are fitted."""
+    (other,) = prepare([validate], model.airframe, sample_time=sample_time, holdout=0.0, predicted=True)
     for term in model.terms:
         if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
             raise InputError(

@@ -9,7 +9,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 
-from .._files import templates
+from .._templates import templates
 from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
 from .text import MISSING, plain
 

@@ -48,12 +48,16 @@ def battery(samples, dt):
     return VOLTS + 0.6 - 0.4 * t + 0.3 * np.sin(7.0 * t)
 
 
+# Of the airframe, once: each conversion costs more than all equations.
+ALPHA = np.asarray(jaxos4.CorrectedOS4(FULL).alpha).tolist()
+CONSTANTS = [float(getattr(FULL, n)) for n in ("thrust_coefficient", "drag_coefficient", "mass", "gravity")]
+PLACES, SPINS = np.asarray(FULL.rotor_positions).T, np.asarray(FULL.rotor_spins)
+
+
 def accelerations(state, speeds, change, v):
     """The derivative of the state, and what an accelerometer measures, by the values `v` of all parameters."""
-    airframe, (p, q, r, phi, theta, psi) = FULL, state[:6]
-    a1, a2, a3, a4, a5, a6, a7, a8 = np.asarray(jaxos4.CorrectedOS4(airframe).alpha)
-    b, d, m, g = (float(getattr(airframe, n)) for n in ("thrust_coefficient", "drag_coefficient", "mass", "gravity"))
-    (x, y), spin = np.asarray(airframe.rotor_positions).T, np.asarray(airframe.rotor_spins)
+    (p, q, r, phi, theta, psi), (a1, a2, a3, a4, a5, a6, a7, a8), (b, d, m, g) = state[:6], ALPHA, CONSTANTS
+    (x, y), spin = PLACES, SPINS
     # The centre of mass (x_c, y_c): its torque in hover belongs to the offset.
     x_c, y_c = v["pitch_thrust"] / (a6 * m), -v["roll_thrust"] / (a3 * m)
     force = b * speeds**2

@@ -1,5 +1,9 @@
 """Strange values for the files of users, and the law of each door: an error is one line."""
 
+import json
+
+from hypothesis import given, settings, strategies as st
+
 from jaxos4.errors import InputError
 
 VALUES = [1e308, -1e29, 1e20, -1.0, 0, 1e-300, None, True, "x", "", "a\x07", "\n", "x" * 20_000, "-->", "\u2028"]
@@ -16,6 +20,26 @@ def in_one_line(door, path):
     assert message.isprintable()
     assert len(message) <= 5000
     return not message
+
+
+def survives_strange_values(door, path, texts, *, examples):
+    """Each of these texts of JSON with up to three of its values replaced by strange ones, or removed."""
+
+    @given(data=st.data())
+    @settings(max_examples=examples)
+    def law(data):
+        tree = json.loads(data.draw(st.sampled_from(texts)))
+        for _ in range(data.draw(st.integers(1, 3))):
+            if places := list(nodes(tree)):
+                holder, key = places[data.draw(st.integers(0, len(places) - 1))]
+                if data.draw(st.booleans()) or isinstance(holder, list):
+                    holder[key] = json.loads(json.dumps(data.draw(st.sampled_from(VALUES))))
+                else:
+                    del holder[key]
+        path.write_text(json.dumps(tree), encoding="utf-8")
+        in_one_line(door, path)
+
+    law()
 
 
 def nodes(tree):

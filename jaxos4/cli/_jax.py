@@ -1,0 +1,43 @@
+"""How a command prepares JAX: the precision, how loops compile, and where compiled programs are kept."""
+
+import os
+import tempfile
+import warnings
+
+from .._xla import add_flags
+
+NO_CACHE = "JAXOS4_NO_CACHE"
+"""The environment variable that switches off the cache of compiled programs."""
+
+
+def prepare(*, batch: bool) -> None:
+    """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off.
+
+    `batch`: whether the command computes many flights at once; those of a single one should compile quickly.
+    """
+    if not batch:
+        add_flags(quick=True)
+
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if os.environ.get(NO_CACHE):
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        import platformdirs
+
+        # JAX removes the oldest programs only from a folder that has had a limit since its first one.
+        folder = platformdirs.user_cache_path("jaxos4", appauthor=False) / "compiled"
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError:
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_compilation_cache_max_size", 1 << 30)  # 1 GB
+    if jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 1.0:  # JAX's default [s]
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
+    # Another process may be writing the same program, or remove it: it is then compiled again.
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
