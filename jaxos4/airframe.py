@@ -175,7 +175,10 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
             raise InputError(f"`{short}` and `{whole}` exclude each other; keep one of them.")
     given = table.keys() | {_REPLACES.get(name) for name in table}
     if missing := [name for name in _REQUIRED if name not in given]:
-        raise InputError(f"`{missing[0]}` is missing; an airframe needs {', '.join(_REQUIRED)}.")
+        listed = ", ".join(f"`{name}`" for name in missing)
+        are, them = ("is", "it") if len(missing) == 1 else ("are", "them")
+        instead = " (`hover_speed` can replace `thrust_coefficient`)" if "thrust_coefficient" in missing else ""
+        raise InputError(f"{listed} {are} missing; write {them} into the airframe, in SI units{instead}.")
     keys = (*_REPLACES, *_SHAPES)
     if unknown := [name for name in table if name not in keys]:
         raise InputError(f"`{unknown[0]}` is not a known key; the keys are {', '.join(keys)}.")

@@ -1,4 +1,4 @@
-"""How a computation ended, as a value: one result for each lane of a batch, and no exception inside the batch."""
+"""The result of a computation as a value: one for each lane of a batch, and no exception inside the batch."""
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ NINETY_FIVE = 1.959963984540054
 
 
 class RESULTS(eqx.Enumeration):
-    """How a simulation or an estimate ended. Codes are valid in this process; files store names (`result_names`)."""
+    """The result of a simulation or estimate. Codes are valid in this process; files store names (`result_names`)."""
 
     successful = ""
     at_bound = "a parameter reached the limit of the search around its bracket: widen the bracket or correct the model"

@@ -5,6 +5,7 @@ import functools
 import json
 import math
 import pathlib
+import re
 import sys
 
 import pytest
@@ -268,6 +269,7 @@ def test_the_help_shows_each_text_whole(run):
     """Units stand in brackets, which are easily taken for markup. Without arguments the help is shown, too."""
     code, out, err = run()
     assert (code, "identifiability" in out + err) == (2, True)
+    assert not re.search(r"\w\.\.\.", out + err)  # the list of commands has whole sentences
     for command in ("simulate", "design", "estimate"):
         code, out, _ = run(command, "--help")
         texts = [vars(option)["help"] for option in typer.main.get_group(app).commands[command].params]

@@ -282,7 +282,7 @@ def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tm
         (vehicle_result(covariance=(-np.eye(len(VALUES))).tolist()), ("`covariance`", "run `jaxos4 estimate` again")),
         (vehicle_result({}), ("holds no estimate",)),
         (vehicle_result(VALUES | {"alpha6": 0.0}), ("alpha6 is 0",)),
-        (vehicle_result(airframe={"mass": 1.0}), ("found.json", "`inertia` is missing")),
+        (vehicle_result(airframe={"mass": 1.0}), ("found.json: `inertia`, `rotor_positions`", "are missing")),
         (vehicle_result(VALUES | {"alpha8": 1e4}), ("Iz = 0.00011 kg m^2 exceeds", "correct the airframe")),
         (vehicle_result(VALUES | {"alpha3": -6e4}), ("Ix", "not positive")),
         (vehicle_result(VALUES | {"thrust_gain": -1.0}), ("found.json: no vehicle is like this",)),

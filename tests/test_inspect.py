@@ -123,7 +123,7 @@ def test_real_logs_give_airframes(name, shared_flights, run, tmp_path):
     text = (tmp_path / "mine.toml").read_text()
     x, y = ([{1: name, -1: f"-{name}"}[sign] for sign in each] for name, each in zip("xy", SIGNS, strict=False))
     assert f"# rotor_positions = [{', '.join(f'[{a}, {b}]' for a, b in zip(x, y, strict=True))}]" in text
-    refused(run("estimate", log, "--airframe", "mine.toml"), "mine.toml: `mass` is missing")
+    refused(run("estimate", log, "--airframe", "mine.toml"), "`mass`, `rotor_positions` are missing; write them")
     (tmp_path / "mine.toml").write_text(filled(text))
     airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
     np.testing.assert_array_equal(airframe.rotor_spins, SIGNS[2])
@@ -169,10 +169,11 @@ def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
     assert (code, err) == (0, "")
     assert "fill in: mass, rotor_positions, rotor_spins, hover_speed" in out
     text = (tmp_path / "mine.toml").read_text()
-    for line, key in (("", "mass"), ("mass = 1", "rotor_positions"), ("arm = 0.1", "thrust_coefficient")):
+    keys = "`mass`, `rotor_positions`, `thrust_coefficient` are missing"
+    for line, missing in (("", keys), ("mass = 1\narm = 0.1", "`thrust_coefficient` is missing")):
         text = f"{line}\n{text}"
         (tmp_path / "mine.toml").write_text(text)
-        refused(run("inspect", "log", "--airframe", "mine.toml"), f"`{key}` is missing")
+        refused(run("inspect", "log", "--airframe", "mine.toml"), missing, "in SI units (`hover_speed` can replace")
     (tmp_path / "mine.toml").write_text(f"hover_speed = 500\n{text}")
     refused(run("inspect", "log", "--airframe", "mine.toml"), "`rotor_spins` must be finite numbers of shape [4]")
 

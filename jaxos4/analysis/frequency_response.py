@@ -107,7 +107,7 @@ class AxisResponse(NamedTuple):
 
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
-        """Where the gain is known to half of the model's, whatever the gain."""
+        """Whether the gain at each frequency is known to half of the model's, whatever the gain."""
         return self.gain * self.error < _UNCLEAR
 
 

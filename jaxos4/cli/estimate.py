@@ -50,7 +50,10 @@ def estimate(
         bool, Option("--verbose", "-v", help="Real vehicle: all parameters, noise and predictions.")
     ] = False,
 ) -> None:
-    """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
+    """Estimate the parameters of a vehicle from its logs.
+
+    Prints each with its 95 % interval: alpha_1..8 of an OS4; constants and verdicts of a real vehicle.
+    """
     check_outputs(*flights, airframe, columns, bracket, network, validate, out=out, report=report)
     listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
     asked = {"channels": channels, "initial_state": initial_state, "window": window}
@@ -154,7 +157,10 @@ def train(
     steps: Annotated[int, Option(help="Number of training steps.")] = STEPS,
     seed: options.SeedOption = 0,
 ) -> None:
-    """Train a network that identifies any flight with the inputs of this one."""
+    """Train a network for the inputs of a flight.
+
+    The network then identifies any flight with these inputs.
+    """
     with stages("loading the library") as progress:
         from ..identification.problem import train_network
         from ..models import MODELS

@@ -28,7 +28,10 @@ def export(
     ] = None,
     seed: options.SeedOption = 0,
 ) -> None:
-    """Write an identified vehicle as a model for a simulator, and vehicles drawn from its uncertainty."""
+    """Write an identified vehicle for a simulator.
+
+    With --samples, also vehicles that are drawn from its uncertainty.
+    """
     if samples > (most := 100_000):
         raise InputError(f"--samples: must be at most {most}, got {samples}.")
     if samples and out is None:
@@ -77,7 +80,10 @@ def predict(
     json: Annotated[Path | None, Option(help="The errors, as JSON.")] = None,
     figure: Annotated[Path | None, Option(help="A figure of the predictions (.svg).")] = None,
 ) -> None:
-    """Predict a flight with an identified vehicle, and compare with constant rates and a regression."""
+    """Predict another flight with an identified vehicle.
+
+    Compares the errors with those of constant rates and of a regression.
+    """
     check_outputs(result, flight, columns, out=out, json=json, figure=figure)
     with stages("loading the library") as progress, option_names():
         from ..recording import read_recording

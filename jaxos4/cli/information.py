@@ -29,7 +29,10 @@ def inspect(
     ] = None,
     out: options.OutOption = None,
 ) -> None:
-    """Show what a log contains, whether it agrees with itself, which parts can be used, and how much they excite."""
+    """Check a log: its content, consistency and usable parts.
+
+    Also shows how much each part excites each axis.
+    """
     check_outputs(log, airframe, columns, out=out, airframe_out=airframe_out, report=report)
     if airframe_out is not None and airframe_out.exists():
         raise InputError(f"{airframe_out}: exists, and may hold what you measured; give another name.")
@@ -72,7 +75,10 @@ def identifiability(
     window: options.WindowOption = None,
     out: options.OutOption = None,
 ) -> None:
-    """Find which of alpha_1..8 a flight can identify, and why not the others."""
+    """Find which parameters a flight can identify.
+
+    Says of each other one of alpha_1..8 why it cannot be identified.
+    """
     check_outputs(flight, airframe, bracket, out=out)
     with stages("loading the library") as progress, option_names(bracket=bracket):
         from rich.console import Console

@@ -67,7 +67,10 @@ def simulate(
         Path | None, Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones.")
     ] = None,
 ) -> None:
-    """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
+    """Simulate a flight and write it as CSV.
+
+    An OS4 flies in open loop. With --closed-loop, a controller flies a real vehicle.
+    """
     given = dict(locals())
     asked = of_kind(closed_loop, given)
     check_outputs(airframe, references, speeds, out=out)
@@ -158,7 +161,10 @@ def design(
     figure: Annotated[Path | None, Option(help="SVG file: what to fly, and the bounds over time.")] = None,
     seed: options.SeedOption = 0,
 ) -> None:
-    """Design the most informative flight within limits: rotor speeds, or the references of a controller."""
+    """Design the most informative flight within limits.
+
+    Designs rotor speeds; with --closed-loop, references for a controller.
+    """
     asked = of_kind(closed_loop, locals())
     check_outputs(airframe, bracket, out=out, figure=figure)
     if not 0 < asked["accuracy"] < 1e6:

@@ -24,7 +24,10 @@ def study(
     dry_run: Annotated[bool, Option("--dry-run", help="Only show the plan.")] = False,
     scheduler: Annotated[str | None, Option(help="Address of a Dask scheduler. Default: this machine.")] = None,
 ) -> None:
-    """Run a noise study, or resume it: finished cells are kept."""
+    """Run a noise study, or resume it.
+
+    Finished cells are kept.
+    """
     with stages("loading the library"):
         wanted = jaxos4.study.load_study(specification)
     if dry_run:
@@ -107,7 +110,10 @@ def report(
     source: Annotated[Path, Argument(metavar="SOURCE", help="The folder of a study, or a file of `estimate --out`.")],
     out: Annotated[Path | None, Option(help="Of a file: the page to write. Default: beside it, as .html.")] = None,
 ) -> None:
-    """Write the report of a study: report.html, and figures/ as SVG; or the page of a result."""
+    """Make the page of a result, or the report of a study.
+
+    The report of a study is report.html, with figures/ as SVG.
+    """
     page = source.with_suffix(".html") if out is None else out
     if not source.exists():
         raise InputError(
@@ -144,7 +150,10 @@ def compare(
     out: Annotated[Path | None, Option(help="The folder to write. Default: comparison, or comparison-quick.")] = None,
     quick: Annotated[bool, Option("--quick", help="Only body rates, 128 flights and four estimators.")] = False,
 ) -> None:
-    """Compare results of repeated flights; or, without results, all estimators on the standard flight."""
+    """Compare results of repeated flights, or all estimators.
+
+    Without results, compares all estimators on the standard flight.
+    """
     if results:
         if quick or out is not None:
             raise InputError(f"{'--quick' if quick else '--out'}: is for a comparison of estimators; leave it out.")

@@ -42,7 +42,7 @@ _PRECISION = 1e-3
 
 
 class Search(NamedTuple):
-    """How the coefficients of a task are searched.
+    """Settings of the search for the coefficients of a task.
 
     - `starts`: the number of searches. `first`: the length of their first coefficients, which are random.
     - `steps`: the most steps of BFGS in a stage. `tolerance`: of its unknowns and of its cost.

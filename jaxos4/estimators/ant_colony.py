@@ -109,7 +109,7 @@ class AntColony(AbstractSolver[Colony]):
 
     @property
     def _keys(self) -> tuple[Key, Key]:
-        """Of the sweeps, and of the first archive."""
+        """The random keys of the sweeps and of the first archive."""
         sweeps, first = jax.random.split(jax.random.key(0))
         return sweeps, first
 

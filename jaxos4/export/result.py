@@ -141,7 +141,7 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
 
 
 def _given_note(found: Identified, inertia_z: float) -> str:
-    """How the vehicle differs from the result because the user gave Iz."""
+    """A note on the difference of the vehicle from the result if the user gave Iz."""
     vehicle, note = found.vehicle, f"Iz: given, not estimated: {inertia_z:.4g} kg m^2"
     if not math.isclose(vehicle.inertia[2], inertia_z, rel_tol=1e-6):
         note += f"; a rigid body with these Ix and Iy allows {vehicle.inertia[2]:.4g}"

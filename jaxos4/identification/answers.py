@@ -40,7 +40,7 @@ NEGATIVE_NOTE = "came out negative, which is impossible; at the limit"
 
 
 class Tables(NamedTuple):
-    """How answers are tabulated.
+    """Settings of the table of answers.
 
     - `scale`: an accelerometer, with what forward flight adds to the lift of rotors, has a scale known to this share.
     - `unknown`: the standard deviation of an alpha that was not estimated, in half-widths: as good as unknown.
@@ -98,7 +98,7 @@ class Answer(NamedTuple):
 
     @property
     def restarts(self) -> int:
-        """How often the search of a vehicle began again where the cost is lower."""
+        """The number of times that the search of a vehicle began again where the cost is lower."""
         return 0 if self.optimum is None else self.optimum.restarts
 
     @property
@@ -108,7 +108,7 @@ class Answer(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """What was fitted, and the answer.
+    """The fitted data, and the answer.
 
     - `data`: of a vehicle, at the chosen sample time.
     - `sample_times`: the answers at all sample times that belong together; empty for an OS4.

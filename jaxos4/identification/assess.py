@@ -37,7 +37,7 @@ class ParameterInformation(msgspec.Struct, frozen=True):
 
 
 class FlightInformation(msgspec.Struct, frozen=True, eq=False):
-    """Which parameters one flight can identify. Made by `jaxos4.assess`.
+    """The parameters that one flight can identify. Made by `jaxos4.assess`.
 
     - `flight`: its name.
     - `fitted`: whether the model could be fitted; otherwise all numbers hold at the bracket's centre.

@@ -1,4 +1,4 @@
-"""What an answer says of each quantity, what speaks against it, and which can be trusted all the same."""
+"""The checks of an answer: the estimate of each quantity, the doubts about it, and its verdict."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -224,7 +224,7 @@ def verdicts_of(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt]) -> 
 def consequences(
     answer: Answer, optimum: Optimum, constants: dict[str, Constant], name: str, value: float
 ) -> dict[str, Move | None]:
-    """How far each quantity moves if a parameter is fixed at a value, and all others are fitted again.
+    """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
 
     Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
     moves if the search did not find this parameter. `None`: there is no such fit.

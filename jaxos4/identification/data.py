@@ -20,7 +20,7 @@ def silent(stage: str) -> None:
 
 
 class Clock(NamedTuple):
-    """Of each sample, the number of its log, and its time in this log [s]."""
+    """The number of the log of each sample, and the time of the sample in its log [s]."""
 
     log: Int[np.ndarray, " samples"] = np.zeros(0, int)
     time: Float[np.ndarray, " samples"] = np.zeros(0)

@@ -21,11 +21,11 @@ Found = dict[str, tuple[float, float]]
 """Value and standard deviation of each parameter that has an estimate."""
 Moves = dict[str, Move | None]
 Consequences = Callable[[str, float], Mapping[str, Move | None]]
-"""How far quantities move if a parameter has another value; see `consequences`."""
+"""The changes of quantities if a parameter has another value; see `consequences`."""
 
 
 class Plausible(NamedTuple):
-    """What a vehicle can be.
+    """Limits of what is physically plausible for a vehicle.
 
     - `heaviest`, `lightest`: the squared radius of gyration, as a share of that of all mass at the rotors; the second
       is that of a heavy centre.
@@ -204,7 +204,7 @@ def neighbours(sample_times: Sequence[SampleTime], step: float) -> tuple[SampleT
 
 
 def moves_between(own: SampleTime, other: SampleTime) -> dict[str, Move]:
-    """How far the moments of inertia move from one sample time to another."""
+    """The changes of the moments of inertia from one sample time to another."""
     both = [(name, row, other.constants[name]) for name, row in own.constants.items() if name in other.constants]
     return {
         name: Move(abs(two.estimate / one.estimate - 1), abs(two.estimate - one.estimate) / max(one.std, two.std))

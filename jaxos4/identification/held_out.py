@@ -117,7 +117,7 @@ def _regression(problem: ShootingProblem, values: Array, fixed: Numeric) -> Arra
 
 
 def validate_on(answer: Answer, held_out: HeldOut) -> Validation:
-    """How well the parameters explain another flight; only its initial state is fitted."""
+    """The fit of the parameters to another flight, of which only the initial state is estimated."""
     other, name = eqx.tree_at(lambda p: p.sigma, held_out.problem, answer.problem.sigma), held_out.recording or ""
     start, cost, feasible, _ = eqx.filter_jit(fit_start)(padded(other), answer.estimate.parameters)
     if not bool(feasible):

@@ -35,7 +35,7 @@ from .settings import FlightSettings, class_name, name_and_class
 
 
 class NoiseLevels(NamedTuple):
-    """How the noise levels of the sensors are found from residuals.
+    """Settings with which the noise levels of the sensors are found from residuals.
 
     - `passes`: they are computed at most this often before the last estimate.
     - `settled`: they have settled if none changes by more than this share. Weights this close to the right ones cost
@@ -69,7 +69,7 @@ class FlightCase:
         return Solution(self.data, fit_flight(self.estimator, self.data.likelihood, progress=progress))
 
     def check(self, solution: Solution, progress: Progress) -> Checked:
-        """What the answer says of each quantity, and what speaks against it."""
+        """The estimate of each quantity, and the doubts about it."""
         del progress
         return check_flight(solution.data, solution.answer, self.estimator.prior)
 

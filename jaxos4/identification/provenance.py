@@ -1,4 +1,4 @@
-"""Where an identification comes from: inputs, settings, versions."""
+"""The provenance of an identification: inputs, settings, versions."""
 
 from typing import Any
 

@@ -61,7 +61,7 @@ def _notes(rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tupl
 
 
 def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> Quantity:
-    """How far ahead predictions are better than constant rates by a standard error, about each axis that moves."""
+    """The horizon up to which predictions beat constant rates by a standard error, about each axis that moves."""
     if skill is None:
         return Quantity(missing="nothing was held out; give `holdout` or `validate`")
     reach = {axis: 0.0 for axis in AXES.values() if axis not in still}

@@ -90,7 +90,7 @@ COLOURED = 0.3
 
 
 class ChannelFit(msgspec.Struct, frozen=True):
-    """How well the model explains one channel; see `jaxos4.Diagnostics`. `correlation`: of neighbouring residuals."""
+    """The fit of the model to one channel; see `jaxos4.Diagnostics`. `correlation`: of neighbouring residuals."""
 
     rms: float
     unit: str
@@ -104,7 +104,7 @@ class ChannelFit(msgspec.Struct, frozen=True):
 
 
 class Validation(msgspec.Struct, frozen=True):
-    """How well the model explains a flight that was not fitted; `None` if its trajectory diverges."""
+    """The fit of the model to a flight that was not fitted; `None` if its trajectory diverges."""
 
     flight: str
     cost: float | None
@@ -257,7 +257,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def motor_clock(self) -> str:
-        """How late motors are recorded, if `rotor_delay` is clearly negative; else empty."""
+        """The delay of the recorded motors in words, if `rotor_delay` is clearly negative; else empty."""
         delay = self.parameters.get("rotor_delay")
         if delay is None or delay.estimate is None or delay.estimate > -TOLERANCE.late:
             return ""

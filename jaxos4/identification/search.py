@@ -37,7 +37,7 @@ PRETESTS = Pretests()
 
 
 class Optimum(NamedTuple):
-    """Where a search of innovations ended.
+    """The optimum that a search found with the likelihood of innovations.
 
     - `likelihood`: with what is fixed. `estimate`: of all its unknowns, with the covariance of the search.
     - `first`: the estimate before any parameter was fixed. `whole`: the parameters at that time.
@@ -72,7 +72,7 @@ class Optimum(NamedTuple):
 
     @property
     def covariance(self) -> Float[np.ndarray, "unknowns unknowns"]:
-        """Of all unknowns, if the model is right and the cost quadratic. It allows for what came out negative."""
+        """The covariance of all unknowns, for a right model and a quadratic cost. Allows for negative estimates."""
         return np.asarray(self.estimate.covariance) + np.asarray(self.freed)
 
     @property
@@ -183,7 +183,7 @@ def deviations(covariance: Float[ArrayLike, "unknowns unknowns"]) -> Float[np.nd
 
 
 def disturbances_of(optimum: Optimum) -> dict[str, Disturbance]:
-    """What acts on each channel besides the model."""
+    """The disturbance of each channel: accelerations that the model does not explain."""
     strength, time_constant, sensor = (np.exp(leaf) for leaf in optimum.noise)
     products = np.asarray(optimum.parts.products).sum(axis=0)
     correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)

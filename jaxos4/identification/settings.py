@@ -1,4 +1,4 @@
-"""How to look at flights: the settings of an identification, and the names of estimators and models."""
+"""The settings of an identification, and the names of estimators and models."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from ..models.abstract import AbstractModel
 
 @dataclasses.dataclass(frozen=True)
 class FlightSettings:
-    """How to look at a flight of an OS4.
+    """Settings of the identification of an OS4.
 
     - `channels`: `"rates"`, `"attitude"` or `"all"`: the compared channels; by default everything that was measured.
     - `initial_state`: `"free"`: estimated too; `"known"`: the first sample is exact.
@@ -28,7 +28,7 @@ class FlightSettings:
 
 @dataclasses.dataclass(frozen=True)
 class VehicleSettings:
-    """How to look at recordings of a vehicle.
+    """Settings of the identification of a vehicle.
 
     - `terms`: of `jaxos4.TERMS`; by default those that the recordings allow.
     - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.

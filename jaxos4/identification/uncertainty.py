@@ -35,7 +35,7 @@ _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 
 
 class Jackknife(NamedTuple):
-    """How parts of flights are compared.
+    """Settings of the comparison of parts of flights.
 
     - `most`, `fewest`: the most parts, and the fewest that can show a disagreement.
     - `chance`: the probability that parts of a flight that the model explains are taken to disagree.
@@ -47,7 +47,7 @@ class Jackknife(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """How the upper end of an interval is looked for.
+    """Settings of the search for the upper end of an interval.
 
     - `well_known`: a standard deviation of at most this share: the cost is nearly quadratic in the interval.
     - `fits`: the most fits for one end. `close`: they end once the root of twice the rise of the cost is this close to
@@ -155,7 +155,7 @@ def at_lowest(
 
 
 def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> tuple[float, Optimum]:
-    """Where the interval of one parameter ends by the profile.
+    """The end of the interval of one parameter by its profile likelihood.
 
     If no fit at an end succeeds, the end is that of the covariance. If a later fit fails, the end is extrapolated from
     the fits before it. The search for the end is over where the cost is lower than at the optimum.

@@ -38,7 +38,7 @@ DEFAULT = "filter-error"
 
 
 class Likelihoods(NamedTuple):
-    """How the likelihood of a vehicle is made.
+    """Settings of the likelihood of a vehicle.
 
     - `segments`: the parts of a flight, which are filtered in parallel. Their disagreement shows errors of the model.
       There are more from twice `recordings` recordings on. None is shorter than `seconds` [s].
@@ -99,7 +99,7 @@ class VehicleCase:
         return Solution(data, answer, (rows[place],) if answer.restarts else tuple(rows))
 
     def check(self, solution: Solution, progress: Progress) -> Checked:
-        """What the answer says of each quantity, and what speaks against it."""
+        """The estimate of each quantity, and the doubts about it."""
         return check_vehicle(*solution, progress)
 
 
@@ -256,7 +256,7 @@ def _held_out(
     fitted: ShootingProblem,
     model: FlightModel,
 ) -> tuple[HeldOut | None, float, tuple[str, ...]]:
-    """What is predicted and not fitted, if there is anything; how long it lasts [s]; the notes about all data."""
+    """The held-out measurements, if there are any; their length [s]; the notes about all data."""
     name, notes, seconds = recordings[0].name, prepared.notes, prepared.seconds[1]
     remedy = "give `holdout` 0 or `validate`"
     if validate is not None:

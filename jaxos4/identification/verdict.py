@@ -22,7 +22,7 @@ PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 
 
 class Move(msgspec.Struct, frozen=True):
-    """How far a quantity would move if a doubt were true.
+    """The change of a quantity if a doubt were true.
 
     - `share`: of the quantity. Parameters can be 0: theirs is a share of the half-width of their bracket.
     - `deviations`: the same in standard deviations of the estimate.
@@ -52,7 +52,7 @@ class Doubt(msgspec.Struct, frozen=True):
 
 
 class Tolerance(msgspec.Struct, frozen=True):
-    """How far a quantity may move, and how well it must be known.
+    """Limits of a verdict: the change that a doubt may cause, and the accuracy that is needed.
 
     - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, by more than one of them
       makes a reservation, by less is a note. Errors of discretisation reach 3 %, and an interval allows for one
@@ -138,7 +138,7 @@ def _weight(doubt: Doubt, name: str, tolerance: Tolerance) -> str:
 
 
 def _far(move: Move, tolerance: Tolerance) -> int:
-    """How many of the two limits a move exceeds."""
+    """The number of the two limits that a move exceeds."""
     return (move.share > tolerance.share) + (move.deviations > tolerance.deviations)
 
 

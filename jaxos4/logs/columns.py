@@ -48,7 +48,7 @@ _REMEDY = "correct its unit or sign in the column map"
 
 
 class Source(NamedTuple):
-    """Where a column comes from: the first of `names` that a log holds. Its values: (value - `zero`) * `factor`."""
+    """The source of a column: the first of `names` that a log holds. Its values: (value - `zero`) * `factor`."""
 
     names: tuple[str, ...]
     factor: float = 1.0

@@ -213,7 +213,7 @@ def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarra
 
 
 def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"] | None:
-    """Which samples are later than all before them. `None` if the share `disorder` of them, or more, are not."""
+    """Whether each sample is later than all before it. `None` if the share `disorder` of them, or more, are not."""
     if not np.isfinite(t).all():
         return None
     later = np.ones(t.size, dtype=bool)
@@ -222,7 +222,7 @@ def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"
 
 
 def logged_rate(t: Times, *, pause: float = 0.9) -> float:
-    """How often samples at the times `t` [s] were written [Hz]: for half of the time, they come at least this often."""
+    """The rate [Hz] of samples at the times `t` [s]: for half of the time, they come at least this often."""
     steps = np.diff(t)
     steps = np.sort(steps[(steps > 0) & (steps <= pause)] if (steps <= pause).any() else steps)
     total = np.cumsum(steps)

@@ -29,7 +29,7 @@ COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 
 
 class Sampling(NamedTuple):
-    """How often something was written to the log: its `source`, as the log names it, and its `rate` [Hz]."""
+    """The `rate` [Hz] at which a log holds something, and its `source`, as the log names it."""
 
     source: str
     rate: float

@@ -146,7 +146,7 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
 
 
 def _isolated(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:
-    """Which values lie far outside of the usual range, while most of those around them do not."""
+    """Whether each value lies far outside of the usual range, while most of those around it do not."""
     out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
     if known.size < rules.fewest:
         return out
@@ -162,7 +162,7 @@ def _isolated(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.nd
 
 
 def _stuck(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:
-    """Which values are equal to the largest one, if these are too many to be chance."""
+    """Whether each value equals the largest one, if too many do to be chance."""
     out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
     if known.size < rules.fewest:
         return out

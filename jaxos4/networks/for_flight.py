@@ -18,7 +18,7 @@ GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
 
 
 class Training(NamedTuple):
-    """How networks are trained for a flight that is identified.
+    """Settings with which networks are trained for a flight that is identified.
 
     - `seed_steps`: of a network that only gives a search its start.
     - `vehicle`: of a network for a vehicle. `windows`: so many of the flight it sees, however long that is.
@@ -62,7 +62,7 @@ def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> Tr
 
 
 def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:
-    """Where a network is from and how it was trained, for JSON."""
+    """The origin of a network and its training, for JSON."""
     bracket = network.bracket
     return {
         "file": None if given is None or isinstance(given, TrainedNetwork) else os.fspath(given),

@@ -16,7 +16,7 @@ from .features import CHUNK, Features, Flights, Purpose, draw_chunks, noisy_chun
 
 
 class Schedule(NamedTuple):
-    """How a network is trained. `NetworkEstimator` explains the first five, which its user sets.
+    """Settings of a training. `NetworkEstimator` explains the first five, which its user sets.
 
     - `check`: steps between two evaluations of the validation loss.
     - `validation`: simulated flights of the validation.

@@ -34,7 +34,7 @@ EXCITED = Excited()
 
 
 class SignRules(NamedTuple):
-    """How the signs of the answer to the rotors are found.
+    """Settings with which the signs of the response to the rotors are found.
 
     - `step`: of the samples [s].
     - `smooth`, `slow`: samples; differences of means over them are the motion between about 2 and 20 Hz.
@@ -63,7 +63,7 @@ SIGNS = SignRules()
 
 
 class Excitation(msgspec.Struct, frozen=True):
-    """How much a flight excites one axis. `None`: not known.
+    """The excitation of one axis by a flight. `None`: not known.
 
     - `torque`: standard deviation of the rotors' torque [N m]; it needs an airframe.
     - `rate`: standard deviation of the body rate [rad/s].
@@ -152,7 +152,7 @@ def rotor_signs(flown: Sequence[Recording], *, signs: SignRules = SIGNS) -> tupl
 def _correlations(
     flown: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"], between: tuple[float, float], signs: SignRules
 ) -> Float[np.ndarray, "delays rows 3"]:
-    """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
+    """Correlations of sums of squared rotor speeds with the angular accelerations after them, at 2 to 20 Hz.
 
     By delay of the gyro, `between` two [s], by row of `mixer`, and by axis; NaN: no clear motion. A controller that
     answers gusts does not change the sign.
@@ -213,7 +213,7 @@ def _response(flown: Recording, mixer: np.ndarray, step: float, signs: SignRules
 def velocity_of(
     recording: Recording, *, forgets: float = 2.0, levels: tuple[float, float] = (2.0, 8.0)
 ) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
-    """How a vehicle moved through still air; `None` if the log does not say enough.
+    """The motion of a vehicle through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
     this sum, and slow changes of the velocity, are forgotten; torque and thrust answer faster ones.

@@ -49,7 +49,7 @@ def force_noise(recording: Recording, step: float, *, share: float = 0.5) -> Flo
 
 
 class SpeedNoise(NamedTuple):
-    """How the noise of rotor speeds is found.
+    """Settings with which the noise of rotor speeds is found.
 
     - `seconds`, `fewest`: how long the samples of one spectrum last [s], and how many they are at least.
     - `neighbours`: spectra are averaged over so many neighbouring frequencies to either side.

@@ -26,7 +26,7 @@ _NEARLY = 1.01  # sample times that differ by less than this factor count as equ
 
 
 class Preparation(NamedTuple):
-    """How recordings become a flight to fit.
+    """Settings with which recordings become a flight to fit.
 
     - `window`: the length of a window [s].
     - `fewest`: samples of a window.

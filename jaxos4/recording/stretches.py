@@ -246,7 +246,7 @@ def _crashed(
 def _resting(
     omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: Samples, dt: float, rules: StretchRules
 ) -> Samples:
-    """Which of the `airborne` samples are of a vehicle at rest, by its accelerometer.
+    """Whether each `airborne` sample is of a vehicle at rest, by its accelerometer.
 
     In flight the specific force along z is the thrust over the mass; on the ground and in a hand it is that of gravity,
     whatever the rotors do, and on its side or back it is across their axes. Constant thrust proves nothing.

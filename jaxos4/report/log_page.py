@@ -110,7 +110,7 @@ def write_log_page(
 
 
 def verdict(found: Inspection) -> str:
-    """How much of a log can be used, and which axes it excites, in one sentence."""
+    """The usable share of a log, and the axes that it excites, in one sentence."""
     used = [part for part in found.parts if part.usable]
     seconds = sum(part.end - part.begin for part in used)
     if not used:
@@ -181,14 +181,14 @@ def fitted(recording: Recording, airframe: Airframe | None) -> str:
 
 
 def rotor_band(flown: Sequence[Recording], rules: PageRules = RULES) -> tuple[float, float]:
-    """How often the rotors usually turn [Hz]: the ends of the band of most speeds."""
+    """The usual frequencies of the rotors [Hz]: the ends of the band of most speeds."""
     speeds, beyond = np.concatenate([each.omega for each in flown]), (1 - rules.usual) / 2
     low, high = np.quantile(speeds, [beyond, 1 - beyond]) / (2 * np.pi)
     return float(low), float(high)
 
 
 def motors(flown: Sequence[Recording], full: float, rules: PageRules = RULES) -> Figure:
-    """How much of the time each motor spends at which speed; dashed: full speed."""
+    """The share of the time that each motor spends at each speed; dashed: full speed."""
     figure, panels = grid(4, columns=4, height=1.9)
     omega = np.concatenate([each.omega for each in flown])
     largest = float(omega.max())

@@ -28,7 +28,7 @@ _DOTTED: Dash = (0, (1, 1.65))
 
 
 class Style(NamedTuple):
-    """How one series is drawn."""
+    """The style of one series."""
 
     color: str
     marker: str

@@ -79,7 +79,7 @@ class Axis(NamedTuple):
     def place(
         self, time: Float[np.ndarray, " moments"], log: Int[np.ndarray, " moments"], *, near: float = 0.05
     ) -> Float[np.ndarray, " moments"]:
-        """Where moments of logs are on the axis; NaN in a gap. So `near` to a piece [s] is at its end."""
+        """The places of moments of logs on the axis; NaN in a gap. So `near` to a piece [s] is at its end."""
         placed = np.full(time.shape, np.nan)
         for at, begin, end, number in zip(*self, strict=True):
             inside = (log == number) & (time >= begin - near) & (time <= end + near)

@@ -211,7 +211,7 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
 
 
 class _Delay(NamedTuple):
-    """How much of each clock is in a delay, the delay and its standard error [s], and what is no error of a clock."""
+    """A delay [s] with its standard error, the share of each clock in it, and the part that no clock causes."""
 
     clocks: tuple[int, int, int, int]
     late: float

@@ -106,7 +106,7 @@ def scaled_angles(stretches: Sequence[Recording], turns: Turns, *, fewest: int =
 
 
 def _turned(stretches: Sequence[Recording], scale: Float[np.ndarray, "3"] | None = None) -> list[Pair]:
-    """How far attitude and gyro turn about the body's axes within `_SPAN` [rad], in each stretch that is long enough.
+    """The angles by which attitude and gyro turn about the body's axes within `_SPAN` [rad], in each stretch.
 
     Angles are divided by `scale` before. NaN in gaps.
     """

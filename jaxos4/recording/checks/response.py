@@ -1,4 +1,4 @@
-"""How gyro and accelerometer answer the rotors: gains, axes and delays, by cross-spectra."""
+"""The response of gyro and accelerometer to the rotors: gains, axes and delays, by cross-spectra."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ Products = Complex[np.ndarray, "frequencies 6 6"]
 
 
 class Spectra(NamedTuple):
-    """How the rotors' answer is measured.
+    """Settings with which the response to the rotors is measured.
 
     - `step`, `seconds`: of the samples, and how long those of one spectrum last [s].
     - `gap`: the longest that is interpolated [s].
