@@ -3,6 +3,7 @@
 import functools
 import io
 import os
+import signal
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -17,6 +18,7 @@ from .information import identifiability, inspect
 from .new_flights import design, simulate
 from .studies import compare, report, study
 
+_INTERRUPTED = 128 + signal.SIGINT  # the parser's code
 _EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1: nothing is kept."
 
 
@@ -55,13 +57,21 @@ def _jaxos4(
 
 
 def main() -> None:
-    """Runs the command line. Exit code 0: done, 1: failed, 2: unusable arguments or input, 130: interrupted."""
+    """Runs the command line. Exit code 0: done, 1: failed, 2: unusable arguments or input.
+
+    A command that is interrupted ends by the signal, which a shell shows as 130: scripts that call it end too, and no
+    thread that still computes meets an interpreter that has ended.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may hold what no encoding can print
     try:
         code = app(prog_name="jaxos4", standalone_mode=False) or 0
         sys.stdout.flush()
+        if code == _INTERRUPTED and os.name == "posix":
+            sys.stderr.flush()
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            signal.raise_signal(signal.SIGINT)
     except BrokenPipeError:  # the reader of our output has gone: Python would complain about what is left of it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
