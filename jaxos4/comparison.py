@@ -19,12 +19,12 @@ Source = Identification | str | os.PathLike[str]
 class ComparedQuantity(NamedTuple):
     """One quantity in all results.
 
-    - `answers`: that of each result, or `None`. `used`: which of them count: with a standard deviation, and not
-      refused.
+    - `answers`: the answer of each result, or `None`. `used`: whether it counts: it has a standard deviation, and no
+      verdict refuses it.
     - `value`, `std`: the mean of these, weighted by 1 / std^2; NaN without any. If they scatter more than their
       intervals say, `std` is widened by the square root of `chi2` over its degrees of freedom.
-    - `chi2`, `p`: the weighted sum of squares about the mean, and the probability of this or more if all results are of
-      one value. NaN if fewer than two count.
+    - `chi2`, `p`: the weighted sum of squares about the mean, and the probability of this or more if all results have
+      the same true value. NaN if fewer than two count.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Comparison(NamedTuple):
 
     - `names`: of the results. `quantities`: each that a result has.
     - `notes`: what makes the results hard to compare.
-    - `level`: the probability with which any quantity is said to differ although all agree.
+    - `level`: the probability that any quantity is reported as different although all agree.
     """
 
     names: tuple[str, ...]

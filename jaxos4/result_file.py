@@ -48,8 +48,8 @@ _File = msgspec.defstruct(
 def read_result(path: str | os.PathLike[str]) -> Identification:
     """Read a file of `jaxos4 estimate --out`: the result of `jaxos4.identify`, without `estimate` and `problem`.
 
-    **Raises:** `InputError`, one line, if it is none, also for texts, numbers and correlations that no result has;
-    `OSError`.
+    **Raises:** `InputError` with one line if the file is no result, or has texts, numbers or correlations that no
+    result can have; `OSError` if it cannot be read.
     """
     value = read_json(path, _REMEDY, _LARGEST)
     with named(path):

@@ -81,8 +81,22 @@ def test_the_last_release_of_the_changelog_is_the_version_of_the_package():
     assert all(re.fullmatch(r" - \d{4}-\d\d-\d\d", date) for _, date in heads[1:])
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     assert heads[1][0] == version
-    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {version}\n" in cited
+    assert f'date-released: "{heads[1][1].removeprefix(" - ")}"\n' in cited
     assert f"version = {{{version}}}," in (ROOT / "docs" / "cite.md").read_text(encoding="utf-8")
+
+
+def test_the_workflow_tests_each_python_and_system_that_the_package_names():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = re.findall(r"Python :: (3\.\d+)", " ".join(project["classifiers"]))
+    assert project["requires-python"] == f">={named[0]}"
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+    (pythons,), (systems,) = (
+        re.findall(rf"^ +{axis}: \[(.+)\]$", workflow, flags=re.MULTILINE) for axis in ("python", "os")
+    )
+    assert re.findall(r"3\.\d+", pythons) == named
+    assert systems == "ubuntu-latest, macos-latest, windows-latest"
 
 
 def table(page: str, of: int = 0) -> list[list[str]]:

@@ -77,7 +77,7 @@ def identifiability(
 ) -> None:
     """Find which parameters a flight can identify.
 
-    Says of each other one of alpha_1..8 why it cannot be identified.
+    Says for each of the others (alpha_1..8) why not.
     """
     check_outputs(flight, airframe, bracket, out=out)
     with stages("loading the library") as progress, option_names(bracket=bracket):

@@ -179,7 +179,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
     - `verdicts`: for each quantity, whether it can be trusted, and why not. Empty without an answer.
-    - `doubts`: what speaks against the estimate, and how far it would move each quantity.
+    - `doubts`: the failed checks of the estimate, and how far each would move each quantity.
     - `provenance`: inputs, settings, versions, and notes about the data.
     - `covariance`: of `parameters`; `None` without an answer.
     - `airframe`: the constants that were not estimated.

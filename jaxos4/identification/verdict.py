@@ -1,4 +1,4 @@
-"""A verdict for each quantity: whether it can be trusted, and what speaks against it.
+"""A verdict for each quantity: whether it can be trusted, and if not, the reasons.
 
 A doubt counts against a quantity by how far the quantity would move if the doubt were true.
 """

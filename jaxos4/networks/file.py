@@ -66,7 +66,7 @@ def encode_network(network: TrainedNetwork) -> bytes:
 
 
 def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
-    """Reads a file of `save_network`, by its path or open. Raises `InputError` for another one, or `OSError`."""
+    """Reads a file of `save_network`, by its path or open. Raises `InputError` for any other file, or `OSError`."""
     content = path if isinstance(path, io.BytesIO) else io.BytesIO(Path(path).read_bytes())
     place = "the network" if isinstance(path, io.BytesIO) else path
     try:

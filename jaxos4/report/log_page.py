@@ -172,12 +172,12 @@ def fitted(recording: Recording, airframe: Airframe | None) -> str:
         ready = prepare([recording], airframe)[0]
     except InputError as error:
         return f"Nothing can be fitted: {error}"
-    told = f"{ready.seconds[0]:.1f} s would be fitted, in samples of {1e3 * float(ready.fitted.dt):.3g} ms"
+    used = f"{ready.seconds[0]:.1f} s would be fitted, in samples of {1e3 * float(ready.fitted.dt):.3g} ms"
     if ready.tested is None:
-        return f"{told}, and nothing held out."
+        return f"{used}, and nothing held out."
     held = spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
     parts = ", ".join(f"{begin:.1f} to {end:.1f}" for begin, end in held[:8]) + ", ..." * (len(held) > 8)
-    return f"{told}; {ready.seconds[1]:.1f} s would be held out and predicted: {parts} s."
+    return f"{used}; {ready.seconds[1]:.1f} s would be held out and predicted: {parts} s."
 
 
 def rotor_band(flown: Sequence[Recording], rules: PageRules = RULES) -> tuple[float, float]:

@@ -239,7 +239,7 @@ def unit_of(channel: str, commands: bool) -> str:
 
 
 def print_inspection(console: Console, found: Inspection, label: str, *, most: int = 14) -> None:
-    """Prints what was measured, what speaks against it, and the `most` longest parts. `label`: of the log's format."""
+    """Prints the channels of a log, the findings of its checks, and the `most` longest parts. `label`: its format."""
     console.print(
         f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
         f"one every {1e3 * found.sample_time:.4g} ms",
