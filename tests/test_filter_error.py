@@ -76,7 +76,7 @@ def test_the_likelihood_is_that_of_a_joint_gaussian():
     problem = standard_problem(channels="rates", free=True, states=jnp.asarray(longer))
     means, total = uncoupled_rates(problem.flight)[:samples], 0.0
     for i, mean in enumerate(means.T):
-        strength, tau, sensor = (float(np.exp(x[i])) for x in NOISE)
+        strength, tau, sensor = (float(np.exp(x[i])) for x in NOISE[:3])
         first = np.diag([1e6, strength**2])
         total += joint_cost(states[:, RATES[i]] - mean, *transition(strength, tau, DT), first, sensor, seen=0)
     found = likelihood(problem, UNCOUPLED, NOISE).cost.sum()
@@ -97,7 +97,7 @@ def test_derivatives_are_those_of_finite_differences():
     for i, step in enumerate(steps):
         costs = []
         for change in (step, -step):
-            noise = LogNoise(*(jnp.asarray(np.asarray(x) + change * (i - 8 == k)) for k, x in enumerate(NOISE)))
+            noise = LogNoise(*(jnp.asarray(np.asarray(x) + change * (i - 8 == k)) for k, x in enumerate(NOISE[:3])))
             costs.append(float(likelihood(problem, alpha + change * (np.arange(8) == i), noise).cost.sum()))
         slope = (costs[0] - costs[1]) / (2 * step)
         np.testing.assert_allclose(gradient[i], slope, rtol=1e-5, atol=1e-4 / step * 1e-3)
@@ -106,7 +106,7 @@ def test_derivatives_are_those_of_finite_differences():
 def test_the_information_is_the_covariance_of_the_gradient():
     """Over flights that the filter's own model made: 64 draws, standard error 18 % of each variance."""
     flight, rng = standard_flight(), np.random.default_rng(3)
-    strength, tau, sensor = (np.exp(np.asarray(x)) for x in NOISE)
+    strength, tau, sensor = (np.exp(np.asarray(x)) for x in NOISE[:3])
     parts = [np.linalg.cholesky(transition(s, t, DT)[1]) for s, t in zip(strength, tau, strict=True)]
     moves = [transition(s, t, DT)[0] for s, t in zip(strength, tau, strict=True)]
     exact = uncoupled_rates(flight)
@@ -211,7 +211,7 @@ def test_lanes_may_differ_in_everything_and_padding_changes_nothing():
         each = eqx.tree_at(lambda p: p.model.airframe.inertia, problem, inertia * (1 + 0.2 * i))
         length = jnp.asarray(501 - 40 * i, dtype=int)
         each = eqx.tree_at(lambda p: (p.flight, p.length), each, (flight, length), is_leaf=lambda leaf: leaf is None)
-        noise = LogNoise(*(leaf + 0.1 * i for leaf in NOISE))
+        noise = LogNoise(*(leaf + 0.1 * i for leaf in NOISE[:3]))
         return InnovationsProblem(each, segments=3, settling=50).innovations(MODEL.alpha * (1 + 0.01 * i), noise)
 
     together = eqx.filter_jit(eqx.filter_vmap(at))(jnp.arange(3.0))

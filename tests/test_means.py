@@ -27,23 +27,31 @@ pytestmark = pytest.mark.slow
 WINDOWS = {"mean": (0.0, 1.0), "middle": (0.5, 0.0), "beginning": (0.0, 0.0), "part": (0.2, 0.5)}
 
 
-@pytest.mark.parametrize("tau", [0.003, 0.01, 0.2, 30.0])
+@pytest.mark.parametrize("tau", [0.003, 0.01, 0.25, 30.0])
+@pytest.mark.parametrize("smoothing", [0.0025, 0.02, 0.2])
 @pytest.mark.parametrize(("begin", "length"), WINDOWS.values(), ids=WINDOWS)
-def test_a_sample_has_the_covariance_of_rate_disturbance_and_measurement(begin, length, tau):
-    """Of body rates, and of a specific force, of which the first number is the mean of its disturbance."""
+def test_a_sample_has_the_covariance_of_state_disturbance_and_measurement(begin, length, smoothing, tau):
+    """Of a body rate, and of a specific force, whose process is stationary and has the standard deviation asked for."""
     dt, strength = 0.01, 3.0
     begin, length = begin * dt, length * dt
-    noise = LogNoise(*(jnp.full(4, np.log(x)) for x in (strength, tau, 0.1)))
+    noise = LogNoise(*(jnp.full(4, np.log(x)) for x in (strength, tau, 0.1, smoothing)))
     found = one_step(noise, jnp.asarray(dt), Window(begin, length))
-    for channel, measured in ((0, 0), (3, 1)):
-        total, added = sample(dt, tau, begin, length, measured)
-        scale = np.diag([1.0 if measured == 0 else 1 / dt, 1.0, 1.0])
-        total, added = scale @ total, strength**2 * scale @ added @ scale
-        own = [np.asarray(leaf)[channel, 0] for leaf in (found.reach, found.kept, found.seen)]
-        np.testing.assert_allclose(own, total[:, 1], rtol=1e-9)
-        joint = [*found.added, found.with_rate, found.with_disturbance, found.noise]
+    for channel, own in ((0, None), (3, smoothing)):
+        total, added = sample(dt, tau, begin, length, own)
+        drive = strength**2 * (1.0 if own is None else (tau + own) / tau)
+        moved = found.moved
+        found_total = [moved.driven_kept, found.driven_seen, moved.reach, moved.kept, found.seen]
+        expected = [total[0, 0], total[2, 0], *total[:, 1]]
+        np.testing.assert_allclose([leaf[channel, 0] for leaf in found_total], expected, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose((found.since_seen * found.driven_seen)[channel], total[0, 0], rtol=1e-9)
+        joint = [*found.added, found.with_driven, found.with_disturbance, found.noise]
         expected = [added[0, 0], added[0, 1], added[1, 1], added[0, 2], added[1, 2], added[2, 2]]
-        np.testing.assert_allclose([leaf[channel, 0] for leaf in joint], expected, rtol=1e-8, atol=1e-22)
+        expected = drive * np.array(expected)
+        np.testing.assert_allclose([leaf[channel, 0] for leaf in joint], expected, rtol=1e-6, atol=1e-12)
+    first = np.array([[leaf[3, 0] for leaf in found.first[i : i + 2]] for i in range(2)])
+    np.testing.assert_allclose(first[0, 0], strength**2, rtol=1e-12)
+    move = total[:2, :2]
+    np.testing.assert_allclose(move @ first @ move.T + drive * added[:2, :2], first, rtol=1e-9)
 
 
 one_step = eqx.filter_jit(step_of)
@@ -81,7 +89,7 @@ def test_the_likelihood_of_rates_is_that_of_a_joint_gaussian_of_means(share):
     noise = LogNoise(*jnp.log(jnp.asarray(levels.T)))
     total = 0.0
     for i, (strength, tau, sensor) in enumerate(levels):
-        moved, added = sample(dt, tau, (1 - share) * dt / 2, share * dt, 0)
+        moved, added = sample(dt, tau, (1 - share) * dt / 2, share * dt)
         # Of what a measurement sees, nothing remains in the next.
         moved[:, 2] = 0.0
         added = strength**2 * added

@@ -155,6 +155,7 @@ WRONG = [
     (("skill", "horizons"), [0.1], "`skill`"),
     (("constants", "Ix", "std"), -1.0, "`std`: is negative"),
     (("constants", "other"), 1.0, "'other' is no name"),
+    (("disturbances", "p", "smoothing"), 0.2, "`disturbances`: `smoothing` is not shorter than `time_constant`"),
     (("sample_times", 0, "sample_time"), 0.0, "`sample_time`: is not positive"),
     (("cost",), float("nan"), "`cost`"),
     (("airframe", "mass"), -1.0, "`mass` must be"),

@@ -193,11 +193,11 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
 
 @pytest.mark.parametrize("share", [1.0, 0.0])
 def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share):
-    """The dense covariance of an Ornstein-Uhlenbeck process, with a gap.
+    """The dense covariance of a smoothed Ornstein-Uhlenbeck process, with a gap.
 
     `share`: of a sample that is averaged. Without any, it is the process at instants.
     """
-    samples, strength, tau, sensor, rows = 80, 1.3, 0.3, 0.05, np.arange(80)
+    samples, strength, tau, sensor, smoothing, rows = 80, 1.3, 0.3, 0.05, 0.03, np.arange(80)
     (recording,), rng = averaged(as_recordings(flown())[0], [DT]), np.random.default_rng(2)
     force = np.full((SAMPLES, 3), np.nan)
     force[:samples, 2] = 9.81 + rng.normal(size=samples)
@@ -209,7 +209,7 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share)
     )
     values, noise = (
         np.asarray(problem.initial_guess.starts[0, 0]),
-        np.log([[1.0, 1.0, 1.0]] * 3 + [[strength, tau, sensor]]),
+        np.log([[1.0, 1.0, 1.0, 1.0]] * 3 + [[strength, tau, sensor, smoothing]]),
     )
     parameters = values[: problem.problem.unknowns.count]
     noise = LogNoise(*map(jnp.asarray, noise.T))
@@ -218,10 +218,16 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share)
     named = dict(zip(problem.unknowns.names, parameters.tolist(), strict=False))
     forcing = mean_forcing_of(problem.model, flight.inputs, jnp.asarray(parameters), rows[None])
     expected = named["thrust_gain"] * np.asarray(forcing.specific_thrust)[0] + named["az_bias"]
-    ratio, apart = DT / tau, np.abs(np.subtract.outer(rows, rows))
-    lost = 1 - np.exp(-ratio)
-    means = np.where(apart == 0, 2 * (ratio - lost), lost**2 * np.exp(-ratio * (apart - 1))) / ratio**2
-    process = strength**2 * (means if share else np.exp(-ratio * apart))
+    apart = np.abs(np.subtract.outer(rows, rows))
+
+    def correlation(time):
+        """Of an Ornstein-Uhlenbeck process, in means over samples or at instants."""
+        ratio, lost = DT / time, 1 - np.exp(-DT / time)
+        means = np.where(apart == 0, 2 * (ratio - lost), lost**2 * np.exp(-ratio * (apart - 1))) / ratio**2
+        return means if share else np.exp(-ratio * apart)
+
+    smooth = (tau * correlation(tau) - smoothing * correlation(smoothing)) / (tau - smoothing)
+    process = strength**2 * smooth
     known = np.isfinite(force[:samples, 2])
     covariance = (process + sensor**2 * np.eye(samples))[np.ix_(known, known)]
     off = (force[:samples, 2] - expected)[known]

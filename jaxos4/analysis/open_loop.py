@@ -14,7 +14,7 @@ from ..flight import RATES
 from ..models.abstract import AbstractModel
 from ..models.state import Forcing, Rates, State
 from ..shooting import ShootingProblem
-from ..shooting.gains import LogNoise, Observed, gains_of, is_rate, transition
+from ..shooting.gains import LogNoise, Moved, Observed, gains_of, transition
 from .frequency_response import modelled_acceleration
 
 Motion = TypeVar("Motion")
@@ -26,24 +26,28 @@ def open_loop(
     disturbance: Float[Array, " channels"],
     rows: Any,
     gusts: Float[Array, "steps channels 2"],
-    fading: tuple[Float[Array, " channels"], Float[Array, " channels"]],
+    moved: Moved,
+    force: Float[Array, " forces"],
 ) -> Motion:
     """The motion after each step. Nothing is measured any more, and the disturbance fades.
 
-    - `advance(motion, row, added)`: the motion after one step, to which disturbances add `added`.
-    - `disturbance`: of each channel at the start, as filters know it.
+    - `advance(motion, row, added)`: the motion after one step. Disturbances add `added` to the rates, and to the
+      specific forces in the mean over the step.
+    - `disturbance`, `force`: of each channel, and the forces besides the model's, at the start as filters know them.
     - `rows`: the forcing of each step.
     - `gusts`: what each channel and its disturbance gain in each step besides.
-    - `fading`: of a step, see `transition`.
+    - `moved`: of a step, see `transition`.
     """
-    kept, reach = fading
+    rates = disturbance.size - force.size
 
-    def step(carry: tuple[Motion, Array], row: tuple[Any, Array]) -> tuple[tuple[Motion, Array], Motion]:
-        (motion, disturbance), (forcing, gust) = carry, row
-        motion = advance(motion, forcing, reach * disturbance + gust[:, 0])
-        return (motion, kept * disturbance + gust[:, 1]), motion
+    def step(carry: tuple[Motion, Array, Array], row: tuple[Any, Array]) -> tuple[tuple[Motion, Array, Array], Motion]:
+        (motion, force, disturbance), (forcing, gust) = carry, row
+        gained = moved.reach * disturbance + gust[:, 0]
+        after = moved.driven_kept[rates:] * force + gained[rates:]
+        motion = advance(motion, forcing, jnp.concatenate([gained[:rates], (force + after) / 2]))
+        return (motion, after, moved.kept * disturbance + gust[:, 1]), motion
 
-    return jax.lax.scan(step, (begin, disturbance), (rows, gusts))[1]
+    return jax.lax.scan(step, (begin, force, disturbance), (rows, gusts))[1]
 
 
 def gyro_bias(model: AbstractModel, rates: Float[Numeric, "3"], row: Forcing, scalars: tuple) -> Float[Array, "3"]:
@@ -52,9 +56,9 @@ def gyro_bias(model: AbstractModel, rates: Float[Numeric, "3"], row: Forcing, sc
 
 
 class Filtered(NamedTuple):
-    """The rate of each channel, and its disturbance, at each sample from all measurements until then."""
+    """Each channel's rate, or force besides the model's, and its disturbance, from all measurements until a sample."""
 
-    rate: Float[Array, "samples channels"]
+    driven: Float[Array, "samples channels"]
     disturbance: Float[Array, "samples channels"]
 
 
@@ -70,20 +74,19 @@ def filtered(
     `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model.
     """
     begins = jnp.diff(stretch, prepend=-1) != 0
-    is_known, memory = ~jnp.isnan(measured), is_rate(measured.shape[1])
+    is_known, moved = ~jnp.isnan(measured), transition(noise, dt)
     gains = gains_of(Observed(measured[:, :, None], begins[:, None], begins[:, None]), noise, dt)
-    kept, reach = transition(jnp.exp(noise.time_constant), dt)
 
     def step(known: Filtered, row) -> tuple[Filtered, Filtered]:
-        y, is_known, added, begins, by_rate, by_disturbance = row
-        rate, disturbance = (jnp.where(begins, 0.0, x) for x in known)
-        error = jnp.where(is_known, y - jnp.where(memory, rate, disturbance), 0.0)
-        rate, disturbance = rate + by_rate * error, disturbance + by_disturbance * error
-        later = Filtered(memory * rate + added * dt + reach * disturbance, kept * disturbance)
-        return later, Filtered(rate, disturbance)
+        y, is_known, added, begins, *gains = row
+        known = Filtered(*(jnp.where(begins, 0.0, x) for x in known))
+        error = jnp.where(is_known, y - known.driven, 0.0)
+        driven, disturbance = (x + gain * error for x, gain in zip(known, gains, strict=True))
+        later = moved.driven_kept * driven + added * dt + moved.reach * disturbance
+        return Filtered(later, moved.kept * disturbance), Filtered(driven, disturbance)
 
     zero = jnp.zeros(measured.shape[1], dtype=float)
-    rows = measured, is_known, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]
+    rows = measured, is_known, modelled, begins, gains.driven[:, :, 0], gains.disturbance[:, :, 0]
     return jax.lax.scan(step, Filtered(zero, zero), rows)[1]
 
 
@@ -102,12 +105,12 @@ def traced(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) ->
     """
     rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
     modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
-    own = LogNoise(*(as_float(np.asarray(leaf)[: len(RATES)]) for leaf in noise))
+    own = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
     number = np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch)
     dt = problem.flight.dt
     known = eqx.filter_jit(filtered)(own, as_float(rates), as_float(modelled), number, dt)
-    _, reach = (np.asarray(x) for x in transition(jnp.exp(own.time_constant), dt))
-    later = np.asarray(known.rate) + modelled * float(dt) + reach * np.asarray(known.disturbance)
+    reach = np.asarray(transition(own, dt).reach)
+    later = np.asarray(known.driven) + modelled * float(dt) + reach * np.asarray(known.disturbance)
     innovation = np.full(rates.shape, np.nan)
     innovation[1:] = np.where(np.diff(number)[:, None] == 0, rates[1:] - later[:-1], np.nan)
     return Traced(np.asarray(known.disturbance), innovation)

@@ -58,12 +58,13 @@ class Known(NamedTuple):
     """The knowledge at each sample, or at one.
 
     - `state`: as measured, as in `PARTS`.
-    - `rates`, `disturbance`: of the filters [rad/s], [rad/s^2; m/s^2].
+    - `driven`, `disturbance`: rates, and specific forces besides the model's, of the filters, and what drives them
+      [rad/s; m/s^2], [rad/s^2; m/s^2].
     - `unsure`: the standard deviation of each offset, see `Futures`.
     """
 
     state: Float[Numeric, "... 13"]
-    rates: Float[Numeric, "... 3"]
+    driven: Float[Numeric, "... channels"]
     disturbance: Float[Numeric, "... channels"]
     unsure: Float[Numeric, "... 6"]
 
@@ -75,16 +76,16 @@ class Futures(NamedTuple):
     - `offset`: what p', q', r' [rad/s^2] and the specific force [m/s^2] have in this recording besides the model, from
       the past of each sample.
     - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
-    - `begin`, `pushed`: errors of the rates and of the disturbances at the start.
+    - `begin`, `pushed`: errors of `Known.driven` and of the disturbances at the start.
     - `off`: errors of the offsets, and what they make of the disturbances at the start, in standard deviations.
-    - `gusts`: what rate and disturbance of each channel gain in each step besides the model.
+    - `gusts`: what `Known.driven` and the disturbance of each channel gain in each step besides the model.
     """
 
     parameters: Float[Array, "futures parameters"]
     forcing: Forcing
     offset: Float[Array, "futures samples 6"]
     filtered: Bool[Array, " futures"]
-    begin: Float[Array, "futures 3"]
+    begin: Float[Array, "futures channels"]
     pushed: Float[Array, "futures channels"]
     off: Float[Array, "futures 2 6"]
     gusts: Float[Array, "futures steps channels 2"]
@@ -162,7 +163,7 @@ def _fly(
     steps = future.gusts.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    w = jnp.where(future.filtered, start.rates, w) - gyro_bias(model, w, still, scalars) + future.begin
+    w = jnp.where(future.filtered, start.driven[:3], w) - gyro_bias(model, w, still, scalars) + future.begin[:3]
     error, absorbed = start.unsure * future.off
     offset = future.offset[first] + error
     begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
@@ -179,8 +180,9 @@ def _fly(
 
     disturbance = jnp.where(future.filtered, start.disturbance, 0.0) + future.pushed
     disturbance = disturbance.at[:3].add(absorbed[:3])
-    fading = transition(jnp.exp(noise.time_constant), dt)
-    motion, _ = open_loop(advance, (begin, jnp.array(True)), disturbance, rows, future.gusts, fading)
+    force = jnp.where(future.filtered, start.driven[3:], 0.0) + future.begin[3:]
+    begin = begin, jnp.array(True)
+    motion, _ = open_loop(advance, begin, disturbance, rows, future.gusts, transition(noise, dt), force)
     return jnp.stack(jax.tree.leaves(motion), axis=1)
 
 
@@ -255,7 +257,7 @@ def known_at_samples(
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     stretch = jnp.zeros(len(rates), dtype=int) if flight.stretch is None else flight.stretch
     found = filtered(noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
-    return Known(state, found.rate[:, :3], found.disturbance, unsure), forcing, offset
+    return Known(state, found.driven, found.disturbance, unsure), forcing, offset
 
 
 def _offset_weights(
@@ -298,14 +300,13 @@ def _past(values: Array, kept: Scalar) -> Float[Array, "samples columns"]:
 def settled(noise: LogNoise, dt: Scalar, rows: int) -> tuple[Covariance, Covariance, Float[Array, " channels"]]:
     """The state of each channel's filter when its gains no longer change, after so many `rows`.
 
-    **Returns:** the covariance of rate and disturbance after a measurement; what a step adds to it; and the share of a
-    constant acceleration that the disturbance absorbs.
+    **Returns:** the covariance of a rate or force and its disturbance after a measurement; what a step adds to it; and
+    the share of a constant acceleration that the disturbance absorbs.
     """
     step = step_of(noise, dt)
-    measured, never = jnp.ones(step.variance.shape, dtype=bool), jnp.zeros(1, dtype=bool)
+    measured, never = jnp.ones(step.sensor.shape, dtype=bool), jnp.zeros(1, dtype=bool)
     p, gains = jax.lax.scan(lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=rows)
-    rate, disturbance = 1 - gains.rate[-1], gains.disturbance[-1]
-    seen = step.memory * p.cross + step.seen * p.disturbance
-    after = Covariance(p.rate * rate, p.cross * rate, p.disturbance - seen * disturbance)
-    absorbed = disturbance * dt / (disturbance * step.reach + (1 - step.kept) * gains.rate[-1])
+    driven, disturbance = gains.driven[-1], gains.disturbance[-1]
+    after = Covariance(p.driven * (1 - driven), p.cross * (1 - driven), p.disturbance - p.cross * disturbance)
+    absorbed = disturbance * dt / (disturbance * step.moved.reach + (1 - step.moved.kept) * driven)
     return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

@@ -94,7 +94,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
         if lacking := [each for each in channels if each not in file.disturbances]:
             raise InputError(f"does not say the disturbance of {lacking[0]}; run `jaxos4 estimate` again.")
         levels = [file.disturbances[each] for each in channels]
-        table = np.array([(each.strength, each.time_constant, each.sensor) for each in levels])
+        table = np.array([(each.strength, each.time_constant, each.sensor, each.smoothing or 0.0) for each in levels])
         return Vehicle(
             name,
             model,
@@ -263,7 +263,7 @@ def _fly(
     draws, chunk = tuning.draws, tuning.chunk
     parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(draws, generator)]))
     model = dataclasses.replace(vehicle.model, recordings=(0,) * (int(measured.stretch.max()) + 1))
-    state, samples, noise = measured.states.copy(), len(measured.stretch), LogNoise(*map(as_float, noise))
+    state, samples, noise = measured.states.copy(), len(measured.stretch), jax.tree.map(as_float, noise)
     if "velocity" in missing:
         reckoned = np.asarray(problem.flight.body_velocity)[:samples].T
         state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
@@ -280,7 +280,7 @@ def _fly(
     first = _pairs(after, generator.standard_normal((draws, channels, 2)))
     gusts = _pairs(added, generator.standard_normal((draws, steps, channels, 2)))
     off = generator.standard_normal((draws, 6))
-    drawn = first[:, :3, 0], first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
+    drawn = first[..., 0], first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
     surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
     futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
@@ -291,8 +291,8 @@ def _fly(
 
 
 def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:
-    """Rates and disturbances with this covariance, from independent numbers of variance 1."""
-    rate = np.sqrt(np.maximum(covariance.rate, 0.0))
-    slope = np.divide(covariance.cross, rate, out=np.zeros_like(rate), where=rate > 0)
+    """Rates or forces, and disturbances, with this covariance, from independent numbers of variance 1."""
+    driven = np.sqrt(np.maximum(covariance.driven, 0.0))
+    slope = np.divide(covariance.cross, driven, out=np.zeros_like(driven), where=driven > 0)
     own = np.sqrt(np.maximum(covariance.disturbance - slope**2, 0.0))
-    return np.stack([rate * normal[..., 0], slope * normal[..., 0] + own * normal[..., 1]], axis=-1)
+    return np.stack([driven * normal[..., 0], slope * normal[..., 0] + own * normal[..., 1]], axis=-1)

@@ -135,6 +135,7 @@ class Disturbance(msgspec.Struct, frozen=True):
     - `strength`: standard deviation, in `unit`. `time_constant`: of its correlation [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
     - `correlation`: the largest correlation of innovations up to 8 samples apart; near 0 if the noise is as modelled.
+    - `smoothing`: the time constant of the low-pass filter through which the disturbance of a specific force acts [s].
     """
 
     strength: float
@@ -142,6 +143,7 @@ class Disturbance(msgspec.Struct, frozen=True):
     time_constant: float
     sensor: float
     correlation: float
+    smoothing: float | None = None
 
 
 class SampleTime(msgspec.Struct, frozen=True):

@@ -184,16 +184,17 @@ def deviations(covariance: Float[ArrayLike, "unknowns unknowns"]) -> Float[np.nd
 
 def disturbances_of(optimum: Optimum) -> dict[str, Disturbance]:
     """The disturbance of each channel: accelerations that the model does not explain."""
-    strength, time_constant, sensor = (np.exp(leaf) for leaf in optimum.noise)
+    noise = jax.tree.map(np.exp, optimum.noise)
     products = np.asarray(optimum.parts.products).sum(axis=0)
     correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)
     largest = np.take_along_axis(correlation, np.abs(correlation).argmax(axis=1)[:, None], axis=1)[:, 0]
     return {
         name: Disturbance(
-            strength=float(strength[i]),
+            strength=float(noise.strength[i]),
             unit="rad/s^2" if i < 3 else "m/s^2",
-            time_constant=float(time_constant[i]),
-            sensor=float(sensor[i]),
+            time_constant=float(noise.time_constant[i]),
+            sensor=float(noise.sensor[i]),
+            smoothing=None if i < 3 else float(noise.smoothing[i]),
             correlation=float(largest[i]),
         )
         for i, name in enumerate(optimum.likelihood.channels)

@@ -55,26 +55,31 @@ class _Row(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """The knowledge of the filters at the beginning of a sample: rates and disturbances."""
+    """The knowledge of the filters at the beginning of a sample, by channel.
 
-    rates: Rates
+    - `driven`: the rates, then the specific forces besides the model's. `disturbance`: what drives them.
+    """
+
+    driven: tuple[Segments, ...]
     disturbance: tuple[Segments, ...]
 
 
 class _Feedback(NamedTuple):
     """The parts of a filter that depend on the noise, by channel: its `Gains`, and fields of `Step`."""
 
-    rate: tuple[Segments, ...]
-    rate_later: tuple[Segments, ...]
+    driven: tuple[Segments, ...]
+    driven_later: tuple[Segments, ...]
     disturbance_later: tuple[Segments, ...]
+    driven_seen: tuple[Segments, ...]
     seen: tuple[Segments, ...]
-    reach: tuple[Segments, ...]
     kept: tuple[Segments, ...]
+    driven_kept: tuple[Segments, ...]
+    reach: tuple[Segments, ...]
 
     @classmethod
     def of(cls, gains: Gains, step: Step) -> "_Feedback":
-        fields = gains.rate, gains.rate_later, gains.disturbance_later, step.seen, step.reach, step.kept
-        return cls(*map(tuple, fields))
+        fields = gains.driven, gains.driven_later, gains.disturbance_later, step.driven_seen, step.seen
+        return cls(*map(tuple, (*fields, *step.moved)))
 
 
 def _advance(
@@ -82,19 +87,22 @@ def _advance(
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """The estimates one sample later, and the innovations of this sample."""
     move, average, observe = functions
-    pushed = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
-    mean = average(State(known.rates), forcing, scalars).rates
-    outputs = observe(State(Rates(*(x + a for x, a in zip(mean, pushed, strict=False)))), forcing, scalars)
-    outputs = (*outputs[:RATES], *(h + a for h, a in zip(outputs[RATES:], pushed[RATES:], strict=True)))
+    seen = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
+    mean = average(State(Rates(*known.driven[:RATES])), forcing, scalars).rates
+    rates = Rates(*(x + a for x, a in zip(mean, seen, strict=False)))
+    outputs = observe(State(rates), forcing, scalars)
+    forces = zip(outputs, feedback.driven_seen, known.driven, seen, strict=True)
+    outputs = (*outputs[:RATES], *(h + share * x + a for h, share, x, a in [*forces][RATES:]))
     # What was not measured has no gain.
     errors = tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
-    rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors, strict=False))
-    following = move(State(Rates(*rates)), forcing, scalars).rates
-    later = zip(following, feedback.reach, known.disturbance, feedback.rate_later, errors, strict=False)
-    rates = Rates(*(x + a * d + gain * e for x, a, d, gain, e in later))
+    driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
+    rates = move(State(Rates(*driven[:RATES])), forcing, scalars).rates
+    driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATES:]))
+    later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, strict=True)
+    driven = tuple(x + a * d + gain * e for x, a, d, gain, e in later)
     faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, strict=True)
     disturbance = tuple(share * d + gain * e for share, d, gain, e in faded)
-    return _emptied(_Known(rates, disturbance), row.restarts_next), errors
+    return _emptied(_Known(driven, disturbance), row.restarts_next), errors
 
 
 def _emptied(known: _Known, where: Bool[Array, " segments"]) -> _Known:
@@ -206,13 +214,15 @@ def _filter(
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
     parameters, noise, feedthrough, passed = at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
-    unknowns = count + len(LogNoise._fields) + len(feedthrough)
+    levels = len(jax.tree.leaves(noise))
+    unknowns = count + levels + len(feedthrough)
     step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
     steps = step, jax.vmap(push)(basis(noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
     zero = jnp.zeros(segments, dtype=float)
     start = (zero,) * RATES if observed.known is None else observed.known
-    known = _emptied(_Known(Rates(*start), (zero,) * channels), observed.restart[0])
+    known = _Known((*start, *(zero,) * (channels - RATES)), (zero,) * channels)
+    known = _emptied(known, observed.restart[0])
     nothing = Innovations(
         cost=zero,
         feasible=jnp.ones(segments, dtype=bool),
@@ -221,7 +231,7 @@ def _filter(
         products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
     )
     no_slopes = (
-        jax.tree.map(lambda _, some=some: jnp.broadcast_to(zero, (some, segments)), known) for some in (count, 3)
+        jax.tree.map(lambda _, some=some: jnp.broadcast_to(zero, (some, segments)), known) for some in (count, levels)
     )
     carry = _Carry(
         (covariance, jax.vmap(push)(steps[1])),
@@ -272,7 +282,7 @@ def _filter_rows(
     def body(carry, rows):
         (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry
         forcing, tangents, row = rows
-        for x in known.rates:
+        for x in known.driven[:RATES]:
             feasible = feasible & (jnp.abs(x) < FASTEST)
         (covariance, gains), push = jax.linearize(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
@@ -303,7 +313,7 @@ def _filter_rows(
     (errors, *slopes), variance, variance_slopes = found
     counts = row.is_measured & counts[:, None]
     errors, slopes = errors - fed[0], jnp.concatenate([*slopes, -fed[2]], axis=2)
-    noise = slice(count, count + len(LogNoise._fields))
+    noise = slice(count, count + variance_slopes.shape[1])
     found, last = likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, fed[1], noise)
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)

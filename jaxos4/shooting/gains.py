@@ -1,12 +1,12 @@
 """The noise of filter error, its unknowns, and the gains of its Kalman filters, which depend on no parameter.
 
-A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a
-force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
+A disturbance d acts in each channel. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise. On a body rate x
+it acts as an angular acceleration [rad/s^2], x' = d. On a specific force it acts through a low-pass filter, because
+gusts and rotors answer smoothly: the force per mass [m/s^2] is x, with x' = (d - x) / smoothing.
 
-A measurement is the mean over a window of its sample (`Window`). The filter of a body rate knows the rate and the
-disturbance at the beginning of a sample. From them and from the noise within the sample follow three numbers: rate and
-disturbance at its end, and what is measured. Their joint covariance is exact, so innovations of the right model are
-white at every sample time. The filter of a specific force knows the disturbance alone.
+A measurement is the mean over a window of its sample (`Window`). A filter knows x and d at the beginning of a sample.
+From them and from the noise within the sample follow three numbers: x and d at its end, and what is measured. Their
+joint covariance is exact, so innovations of the right model are white at every sample time.
 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
@@ -32,6 +32,8 @@ RATES = CHANNELS["rates"]
 _UNKNOWN_RATE = 1e3
 # Nodes of the quadrature over each part of a sample: exact to rounding, as it is shorter than four time constants.
 _NODES = 8
+# The time constant of the low-pass filter of a force that has none [s].
+_NO_FILTER = 1e-9
 
 
 class Window(NamedTuple):
@@ -48,14 +50,17 @@ INSTANT = Window()
 class LogNoise(NamedTuple):
     """The logarithms of each channel's noise levels, in all segments or in each. Logarithms may have any sign.
 
-    - `strength`: standard deviation of the disturbance, [rad/s^2] for rates and [m/s^2] for specific force.
+    - `strength`: standard deviation of the disturbance, [rad/s^2] for rates, and of x [m/s^2] for specific force.
     - `time_constant`: of the disturbance [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
+    - `smoothing`: the time constant of the low-pass filter of a specific force [s]; of a rate it means nothing. `None`:
+      no filter, so that the disturbance itself is the force.
     """
 
     strength: Float[Numeric, "channels *segments"]
     time_constant: Float[Numeric, "channels *segments"]
     sensor: Float[Numeric, "channels *segments"]
+    smoothing: Float[Numeric, "channels *segments"] | None = None
 
 
 class Observed(NamedTuple):
@@ -76,47 +81,58 @@ class Observed(NamedTuple):
 class Gains(NamedTuple):
     """The effect of a unit of innovation, and the variance of the innovation.
 
-    - `rate`, `disturbance`: at the beginning of the sample.
-    - `rate_later`: at the end, besides `rate`. `disturbance_later`: at the end.
+    - `driven`, `disturbance`: at the beginning of the sample.
+    - `driven_later`: at the end, besides `driven`. `disturbance_later`: at the end.
     """
 
-    rate: Series
+    driven: Series
     disturbance: Series
-    rate_later: Series
+    driven_later: Series
     disturbance_later: Series
     variance: Series
 
 
 class Covariance(NamedTuple):
-    """Variance of the rate, covariance of rate and disturbance, variance of the disturbance."""
+    """Variance of x, the rate or force that is driven, its covariance with the disturbance, and that one's variance."""
 
-    rate: Channels
+    driven: Channels
     cross: Channels
     disturbance: Channels
+
+
+class Moved(NamedTuple):
+    """The disturbance and what it drives over one sample, without noise.
+
+    - `kept`, `driven_kept`: the shares of d and of x that remain. `reach`: what a unit of d adds to x.
+    """
+
+    kept: Channels
+    driven_kept: Channels
+    reach: Channels
 
 
 class Step(NamedTuple):
     """The disturbance over one sample, of each channel.
 
-    - `kept`: the share of it that remains. `reach`: what a unit of it adds to the rate; of a specific force, its mean.
-    - `seen`: what a unit of it adds to the measurement.
+    - `moved`: see there.
+    - `driven_seen`, `seen`: what a unit of x and of d adds to the measurement.
+    - `since_seen`: the share of what is measured of x that remains at the end of the sample.
     - `added`: the covariance that its noise adds at the end of the sample.
-    - `noise`: the variance that its noise adds to the measurement; `with_rate`, `with_disturbance`: the covariance with
-      the rate and the disturbance at the end.
-    - `variance`: of the disturbance. `sensor`: of the sensor's noise.
-    - `memory`: 1 for a rate; 0 for a specific force, which has no state besides its disturbance.
+    - `noise`: the variance that its noise adds to the measurement; `with_driven`, `with_disturbance`: the covariance
+      with x and d at the end.
+    - `first`: the covariance before anything is measured; rates are known. `sensor`: the variance of its noise.
     """
 
-    kept: Channels
-    reach: Channels
+    moved: Moved
+    driven_seen: Channels
     seen: Channels
+    since_seen: Channels
     added: Covariance
     noise: Channels
-    with_rate: Channels
+    with_driven: Channels
     with_disturbance: Channels
-    variance: Channels
+    first: Covariance
     sensor: Channels
-    memory: Channels
 
 
 def is_rate(channels: int) -> Bool[np.ndarray, " channels"]:
@@ -124,69 +140,100 @@ def is_rate(channels: int) -> Bool[np.ndarray, " channels"]:
     return np.arange(channels) < RATES
 
 
-def transition(time_constant: Float[Array, "channels *segments"], dt: Float[Array, "..."]) -> tuple[Array, Array]:
-    """The share of a disturbance that remains after one sample, and what a unit of it adds: see `Step`."""
-    share = dt / time_constant
-    rate = is_rate(len(time_constant)).reshape(-1, *(1,) * (time_constant.ndim - 1))
-    return jnp.exp(-share), -time_constant * jnp.expm1(-share) / jnp.where(rate, 1.0, dt)
+def _is_rate(leaf: Array) -> Array:
+    return jnp.asarray(is_rate(len(leaf)).reshape(-1, *(1,) * (leaf.ndim - 1)))
+
+
+class _Response(NamedTuple):
+    """The response of a channel to a unit of x or of d after a time [s]. `driven` is that of x to d.
+
+    The difference of the exponentials is computed as one, so that a fast filter loses no digits.
+    """
+
+    time_constant: Channels
+    smoothing: Channels
+
+    @classmethod
+    def of(cls, noise: LogNoise) -> "_Response":
+        tau = jnp.exp(noise.time_constant)
+        if noise.smoothing is None:
+            return cls(tau, jnp.full_like(tau, _NO_FILTER))
+        return cls(tau, jnp.where(_is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing)))
+
+    def fading(self, time: Array) -> Array:
+        """Of d to d."""
+        return jnp.exp(-time / self.time_constant)
+
+    def driven_fading(self, time: Array) -> Array:
+        """Of x to x."""
+        return jnp.where(_is_rate(self.smoothing), 1.0, jnp.exp(-time / self.smoothing))
+
+    def driven(self, time: Array) -> Array:
+        """Of x to d."""
+        tau = self.time_constant
+        force = tau / (tau - self.smoothing) * (self.fading(time) - jnp.exp(-time / self.smoothing))
+        return jnp.where(_is_rate(tau), -tau * jnp.expm1(-time / tau), force)
+
+    def driven_sum(self, time: Array) -> Array:
+        """Of the integral of x to d."""
+        tau, fast = self.time_constant, self.smoothing
+        slow, quick = (-x * jnp.expm1(-time / x) for x in (tau, fast))
+        return jnp.where(_is_rate(tau), tau * (time - slow), tau * (slow - quick) / (tau - fast))
+
+
+def transition(noise: LogNoise, dt: Float[Array, "..."]) -> Moved:
+    """The disturbance over one sample."""
+    response = _Response.of(noise)
+    return Moved(response.fading(dt), response.driven_fading(dt), response.driven(dt))
 
 
 def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) -> Step:
     """The step over one sample of this length. Measurements are means over `window`."""
-    strength, time_constant, sensor = (leaf.reshape(leaf.shape[0], -1) for leaf in noise)
-    variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
-    rate = jnp.broadcast_to(is_rate(strength.shape[0])[:, None], variance.shape)
+    noise = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1), noise)
+    response, variance = _Response.of(noise), jnp.exp(2 * noise.strength)
+    tau, fast = response
+    rate = _is_rate(tau)
+    # A force has the standard deviation `strength`, and its disturbance a larger one.
+    drive = jnp.where(rate, variance, variance * (tau + fast) / tau)
     begin, end = jnp.asarray(window.begin, dtype=float), jnp.asarray(window.begin + window.length, dtype=float)
     long = jnp.where(window.length > 0, window.length, 1.0)
-
-    # What a unit of the disturbance makes after a time: disturbance, rate, and the integral of the rate.
-    def faded(time: Array) -> Array:
-        return jnp.exp(-time / tau)
-
-    def turned(time: Array) -> Array:
-        return -tau * jnp.expm1(-time / tau)
-
-    def swept(time: Array) -> Array:
-        return tau * (time - turned(time))
 
     def measured(time: Array) -> Array:
         """By a unit of the disturbance at this time of the sample."""
         until_begin, until_end = jnp.maximum(begin - time, 0.0), jnp.maximum(end - time, 0.0)
-        mean = jnp.where(rate, swept(until_end) - swept(until_begin), turned(until_end) - turned(until_begin)) / long
-        instant = jnp.where(rate, turned(until_begin), faded(until_begin) * (time <= begin))
-        return jnp.where(window.length > 0, mean, instant)
-
-    def moved(time: Array) -> Array:
-        return jnp.where(rate, turned(dt - time), turned(dt - time) / dt)
+        mean = (response.driven_sum(until_end) - response.driven_sum(until_begin)) / long
+        return jnp.where(window.length > 0, mean, response.driven(until_begin))
 
     # The parts of the sample before, in and after the window, and the nodes of a quadrature in each.
     edges = jnp.stack(jnp.broadcast_arrays(jnp.zeros_like(begin), begin, end, dt))
     nodes, weights = (x.reshape(-1, *(1,) * edges.ndim) for x in np.polynomial.legendre.leggauss(_NODES))
     parts = edges[1:] - edges[:-1]
     time = (edges[:-1] + (nodes + 1) / 2 * parts).reshape(-1, 1, *edges.shape[1:] or (1,))
-    share = (weights / 2 * parts).reshape(time.shape) * 2 * variance / tau
-    x, d, m = moved(time), faded(dt - time), measured(time)
+    share = (weights / 2 * parts).reshape(time.shape) * 2 * drive / tau
+    x, d, m = response.driven(dt - time), response.fading(dt - time), measured(time)
     products = x * x, x * d, d * d, m * m, m * x, m * d
     x_x, x_d, d_d, m_m, m_x, m_d = ((share * each).sum(axis=0) for each in products)
-    kept, reach = transition(tau, dt)
+    # The mean of what remains of x over the window, and what of that mean remains at the end: finite for every filter.
+    in_window = jnp.where(window.length > 0, window.length, 0.0) / fast
+    mean = jnp.where(in_window > 0, -jnp.expm1(-in_window) / jnp.where(in_window > 0, in_window, 1.0), 1.0)
+    force = jnp.where(rate, 0.0, variance)
     return Step(
-        kept=kept,
-        reach=reach,
+        moved=transition(noise, dt),
+        driven_seen=jnp.where(rate, 1.0, response.driven_fading(begin) * mean),
         seen=measured(jnp.zeros_like(begin)),
+        since_seen=jnp.where(rate, 1.0, response.driven_fading(dt - begin) / mean),
         added=Covariance(x_x, x_d, d_d),
         noise=m_m,
-        with_rate=m_x,
+        with_driven=m_x,
         with_disturbance=m_d,
-        variance=variance,
-        sensor=jnp.exp(2 * sensor),
-        memory=rate.astype(variance.dtype),
+        first=Covariance(force, force, drive),
+        sensor=jnp.exp(2 * noise.sensor),
     )
 
 
 def first_covariance(step: Step, segments: int) -> Covariance:
     """The covariance at the beginning of a segment whose rates are known."""
-    zero = jnp.zeros((step.variance.shape[0], segments), dtype=float)
-    return Covariance(zero, zero, zero + step.variance)
+    return jax.tree.map(lambda leaf: jnp.zeros((leaf.shape[0], segments), dtype=float) + leaf, step.first)
 
 
 def next_gains(
@@ -194,34 +241,34 @@ def next_gains(
 ) -> tuple[Covariance, Gains]:
     """The covariance one sample later, and the gains of this sample, from the covariance at its beginning."""
     # After a restart the rates are unknown. XLA takes no longer than if this came before the loop.
-    first = first_covariance(step, p.rate.shape[-1])
-    first = first._replace(rate=first.rate + step.memory * _UNKNOWN_RATE**2)
-    rate, cross, disturbance = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
-    kept, seen = step.kept, step.seen
-    # Covariances with the measurement, and with `gap`: the rate at the end less the measurement. The gap does not
-    # depend on the rate at the beginning, whose variance may be huge. So no difference of large numbers is computed.
-    rate_seen = step.memory * rate + seen * cross
-    disturbance_seen = step.memory * cross + seen * disturbance
+    first = first_covariance(step, p.driven.shape[-1])
+    first = first._replace(driven=first.driven + _is_rate(first.driven) * _UNKNOWN_RATE**2)
+    driven, cross, disturbance = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
+    (kept, _, reach), seen, since = step.moved, step.seen, step.since_seen
+    # Covariances with the measurement, and with `gap`: x at the end less what remains of the measurement. The gap does
+    # not depend on x at the beginning, whose variance may be huge. So no difference of large numbers is computed.
+    driven_seen = step.driven_seen * driven + seen * cross
+    disturbance_seen = step.driven_seen * cross + seen * disturbance
     own = seen * disturbance_seen + step.noise
-    measured = step.memory * rate_seen + own
-    lead = step.reach - seen
-    gap_seen = lead * disturbance_seen + step.with_rate - step.noise
-    gap = lead**2 * disturbance + step.added.rate - 2 * step.with_rate + step.noise
+    measured = step.driven_seen * driven_seen + own
+    lead = reach - since * seen
+    gap_seen = lead * disturbance_seen + step.with_driven - since * step.noise
+    gap = lead**2 * disturbance + step.added.driven - since * (2 * step.with_driven - since * step.noise)
     later_seen = kept * disturbance_seen + step.with_disturbance
-    gap_later = kept * lead * disturbance + step.added.cross - step.with_disturbance
+    gap_later = kept * lead * disturbance + step.added.cross - since * step.with_disturbance
     later = kept**2 * disturbance + step.added.disturbance
     variance = measured + step.sensor
     weight = jnp.where(is_measured, 1 / variance, 0.0)
     share = jnp.where(is_measured, step.sensor / variance, 1.0)
     after = Covariance(
-        step.memory * (share * (measured + 2 * gap_seen) + gap - weight * gap_seen**2),
-        step.memory * (share * later_seen + gap_later - weight * gap_seen * later_seen),
+        share * since * (since * measured + 2 * gap_seen) + gap - weight * gap_seen**2,
+        share * since * later_seen + gap_later - weight * gap_seen * later_seen,
         later - weight * later_seen**2,
     )
     gains = Gains(
-        step.memory * rate_seen * weight,
+        driven_seen * weight,
         disturbance_seen * weight,
-        step.memory * (own + gap_seen) * weight,
+        (since * own + gap_seen) * weight,
         later_seen * weight,
         jnp.where(is_measured, variance, 1.0),
     )
@@ -238,9 +285,10 @@ def gains_of(observed: Observed, noise: LogNoise, dt: Scalar, window: Window = I
 
 
 def basis(noise: LogNoise) -> LogNoise:
-    """The three directions of `noise`: in each, the same logarithm of all channels changes."""
-    shape = noise.strength.shape
-    return LogNoise(*np.eye(3).reshape(3, 3, *(1 for _ in shape)) * np.ones(shape))
+    """The directions of `noise`: in each, the same logarithm of all channels changes."""
+    leaves, tree = jax.tree.flatten(noise)
+    directions = np.eye(len(leaves))
+    return tree.unflatten([np.multiply.outer(row, np.ones(noise.strength.shape)) for row in directions])
 
 
 @jax.jit  # traced once, although many ask for it
@@ -263,8 +311,13 @@ def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_con
     return LogNoise(logarithm(strength), jnp.full(strength.shape, jnp.log(time_constant)), logarithm(sensor))
 
 
+def levels(channels: int) -> int:
+    """The number of noise levels of each channel: one more if there are specific forces, see `LogNoise`."""
+    return 4 if channels > RATES else 3
+
+
 class NoiseUnknowns(NamedTuple):
-    """How the noise of each channel is looked for: the logarithms of a strength, a time constant and a sensor's noise.
+    """How the noise of each channel is looked for: the logarithms of `LogNoise`.
 
     - `precision`: of a weak prior on each logarithm, as the reciprocal of a variance.
     - `stride`: the cost is roughly quadratic in a logarithm over such a step.
@@ -272,6 +325,8 @@ class NoiseUnknowns(NamedTuple):
     - `times`: time constants of the disturbance at which searches start [s]: the likelihood has several maxima.
     - `shortest`, `longest`: of the time constants, in samples and in seconds.
     - `shortest_of_force`: of a disturbance of specific force [s]: what is faster is vibration, a noise of the sensor.
+    - `smoothing`, `longest_smoothing`: where the search of a force's low-pass filter starts, and its largest time
+      constant [s], which is shorter than that of any disturbance. The shortest is `shortest`.
     """
 
     precision: float = 1e-2
@@ -281,6 +336,8 @@ class NoiseUnknowns(NamedTuple):
     shortest: float = 0.25
     longest: float = 3.0
     shortest_of_force: float = 0.25
+    smoothing: float = 0.05
+    longest_smoothing: float = 0.2
 
     def after(
         self,
@@ -292,16 +349,20 @@ class NoiseUnknowns(NamedTuple):
         least_noise: Float[Array, " channels"],
     ) -> Unknowns:
         """The parameters, then noise and feedthroughs of each channel, in brackets from differences of measurements."""
-        first = jnp.stack(first_noise(measured, dt, self.times[0]), axis=1)
+        first = jnp.stack(first_noise(measured, dt, self.times[0])[:3], axis=1)
+        count, rate, shortest = levels(first.shape[0]), is_rate(first.shape[0]), jnp.log(self.shortest * dt)
+        smoothing = jnp.full((first.shape[0], count - first.shape[1]), np.log(self.smoothing))
+        first = jnp.concatenate([first, jnp.maximum(smoothing, shortest)], axis=1)
         lowest, highest = first - np.log(self.reach), first + np.log(self.reach)
-        shortest = jnp.where(is_rate(first.shape[0]), jnp.log(self.shortest * dt), np.log(self.shortest_of_force))
-        lowest, highest = lowest.at[:, 1].set(shortest), highest.at[:, 1].set(np.log(self.longest))
+        lowest = lowest.at[:, 1].set(jnp.where(rate, shortest, np.log(self.shortest_of_force))).at[:, 3:].set(shortest)
+        highest = highest.at[:, 1].set(np.log(self.longest)).at[:, 3:].set(np.log(self.longest_smoothing))
         lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))
-        first, lowest, highest = (
+        free = jnp.ones(first.shape, dtype=bool).at[:, 3:].set(~rate[:, None])
+        first, lowest, highest, free = (
             jnp.pad(x, ((0, 0), (0, feedthroughs)), constant_values=value)
-            for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf))
+            for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf), (free, True))
         )
-        names = tuple(each.format(name) for name in channels for each in own_names(feedthroughs))
+        names = tuple(each.format(name) for name in channels for each in own_names(count, feedthroughs))
         precision = jnp.full(first.size, self.precision)
         return Unknowns(
             names=own.names + names,
@@ -310,7 +371,7 @@ class NoiseUnknowns(NamedTuple):
             prior=PROPER_PRIOR,
             center=jnp.concatenate([own.center, first.ravel()]),
             half_width=jnp.concatenate([own.half_width, 1 / jnp.sqrt(precision)]),
-            free=jnp.concatenate([own.free, jnp.ones(first.size, dtype=bool)]),
+            free=jnp.concatenate([own.free, free.ravel()]),
             precision=jnp.concatenate([1 / jnp.square(own.usable.half_width), precision]),
             lowest=jnp.concatenate([own.lowest, lowest.ravel()]),
             highest=jnp.concatenate([own.highest, highest.ravel()]),
@@ -318,7 +379,7 @@ class NoiseUnknowns(NamedTuple):
         )
 
 
-def own_names(feedthroughs: int) -> tuple[str, ...]:
-    """The names of the unknowns of a channel, with its name to be filled in."""
-    more = tuple(f"{{}}_feedthrough_{i + 1}" for i in range(feedthroughs))
-    return ("log_{}_strength", "log_{}_time", "log_{}_sensor", *more)
+def own_names(count: int, feedthroughs: int) -> tuple[str, ...]:
+    """The names of the unknowns of a channel, with its name to be filled in. `count`: of noise levels."""
+    noise = ("log_{}_strength", "log_{}_time", "log_{}_sensor", "log_{}_smoothing")
+    return (*noise[:count], *(f"{{}}_feedthrough_{i + 1}" for i in range(feedthroughs)))

@@ -24,7 +24,7 @@ from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
 from .filters import innovate
-from .gains import INSTANT, LogNoise, NoiseUnknowns, Observed, Window, own_names
+from .gains import INSTANT, LogNoise, NoiseUnknowns, Observed, Window, levels, own_names
 from .problem import ShootingProblem
 from .scans import with_tangents
 from .segments import Segments, observe_in_segments
@@ -39,8 +39,9 @@ class InnovationsProblem(AbstractProblem):
 
     Each channel has a disturbance with a strength and a time constant, and white noise of its sensor. The logarithms of
     the three are unknowns like the parameters, and follow them: `log_p_strength`, `log_p_time`, `log_p_sensor`, then
-    those of q, r, and each specific force that the model predicts; with `input_innovations` also `p_feedthrough_1` and
-    so on. The bracket is a Gaussian prior, whose standard deviation is its half-width.
+    those of q, r, and each specific force that the model predicts; with forces also `log_az_smoothing`, the time
+    constant of the low-pass filter of its disturbance (fixed for rates, which have none), and with `input_innovations`
+    `p_feedthrough_1` and so on. The bracket is a Gaussian prior, whose standard deviation is its half-width.
 
     - `problem`: model, flight, known or free initial state, and the bracket of the parameters. Its windows and its
       sigma do not matter.
@@ -180,12 +181,16 @@ class InnovationsProblem(AbstractProblem):
 
     def noise(self, unknowns: Float[Numeric, " unknowns"]) -> LogNoise:
         """The noise levels among the unknowns."""
-        return LogNoise(*self._of_channels(unknowns)[:, :3].T)
+        return LogNoise(*self._of_channels(unknowns)[:, : self._levels].T)
 
     @property
     def _own(self) -> tuple[str, ...]:
         """The names of the unknowns of a channel."""
-        return own_names(self.input_innovations.shape[-2])
+        return own_names(self._levels, self.input_innovations.shape[-2])
+
+    @property
+    def _levels(self) -> int:
+        return levels(self.problem.columns.size)
 
     def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "channels own"]:
         return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
@@ -203,7 +208,7 @@ class InnovationsProblem(AbstractProblem):
         is_known = ~jnp.isnan(self.passed).any()
 
         def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
-            found = jnp.where(is_known, self.passed, self._of_channels(before[0])[:, 3:])
+            found = jnp.where(is_known, self.passed, self._of_channels(before[0])[:, self._levels :])
             return at(unknowns, jnp.where(is_known | (stage > 0), found, 0.0))
 
         unknowns, none = self.unknowns, jnp.zeros(number, dtype=float)
@@ -231,7 +236,8 @@ class InnovationsProblem(AbstractProblem):
 
         def at(row: WindowUnknowns, passed: Float[Array, "channels feedthroughs"]) -> LocalModel:
             values = row[0]
-            found = innovations(values[:count], self.noise(values), self._of_channels(values)[:, 3:], passed)
+            feedthrough = self._of_channels(values)[:, self._levels :]
+            found = innovations(values[:count], self.noise(values), feedthrough, passed)
             own = found.gradient.shape[1] - len(self._own)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, own)
             if places is not None:

@@ -38,7 +38,7 @@ class Innovations(NamedTuple):
 def likelihood(
     counts: Bool[Array, "time channels segments"],
     variance: Series,
-    variance_slopes: Float[Array, "time 3 channels segments"],
+    variance_slopes: Float[Array, "time levels channels segments"],
     last: Float[Array, "lags channels segments"],
     feasible: Bool[Array, " segments"],
     errors: Series,
@@ -53,7 +53,7 @@ def likelihood(
     """
     weight = jnp.where(counts, 1 / variance, 0.0)
     logarithm = jnp.where(counts, jnp.log(variance), 0.0)
-    relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, 3, segments)
+    relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, levels, segments)
     gradient = jnp.einsum("tcul,tcl->cul", slopes, weight * errors)
     squares = errors**2 + passed
     surprise = (weight > 0) * (1 - weight * squares) / 2

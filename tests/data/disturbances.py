@@ -1,36 +1,33 @@
-"""Rates driven by Ornstein-Uhlenbeck disturbances: exact moments by Van Loan (1978), and a dense joint Gaussian."""
+"""Rates and forces driven by Ornstein-Uhlenbeck disturbances: exact moments by Van Loan (1978), a dense Gaussian."""
 
 import numpy as np
 import scipy.linalg
 
 
-def piece(time, tau, *, of=None):
-    """How (integral of the disturbance, disturbance, sum) move in a time, and the covariance that noise adds.
+def piece(time, tau, smoothing=None, *, summed=False):
+    """How (rate or force, disturbance, sum) move in a time, and the covariance that noise adds.
 
-    `of`: 0 or 1: this state is summed; by default none. By Van Loan (1978), for a disturbance of unit variance.
+    `smoothing`: of a force; by default the first state is a rate, the integral of the disturbance. `summed`: whether it
+    is summed. By Van Loan (1978), for a disturbance of unit variance.
     """
-    drift, noise = np.array([[0.0, 1.0, 0.0], [0.0, -1 / tau, 0.0], [0.0, 0.0, 0.0]]), np.diag([0.0, 2 / tau, 0.0])
-    if of is not None:
-        drift[2, of] = 1.0
+    driven = (0.0, 1.0) if smoothing is None else (-1 / smoothing, 1 / smoothing)
+    drift, noise = np.array([[*driven, 0.0], [0.0, -1 / tau, 0.0], [0.0, 0.0, 0.0]]), np.diag([0.0, 2 / tau, 0.0])
+    drift[2, 0] = float(summed)
     whole = scipy.linalg.expm(np.block([[-drift, noise], [np.zeros((3, 3)), drift.T]]) * time)
     moved = whole[3:, 3:].T
     return moved, moved @ whole[:3, 3:]
 
 
-def sample(dt, tau, begin, length, measured):
-    """The same over one sample, with the measurement instead of the sum.
-
-    `measured`: 0: the integral of the disturbance, as a rate. 1: the disturbance, as a specific force. The mean over
-    the window is measured, or the value at its beginning.
-    """
-    window = piece(length, tau, of=measured) if length else (np.eye(3), np.zeros((3, 3)))
+def sample(dt, tau, begin, length, smoothing=None):
+    """The same over one sample, with the measurement instead of the sum: the mean over the window, or an instant."""
+    window = piece(length, tau, smoothing, summed=True) if length else (np.eye(3), np.zeros((3, 3)))
     if length:
         window = [np.diag([1, 1, 1 / length]) @ window[0], np.diag([1, 1, 1 / length]) @ window[1]]
         window[1] = window[1] @ np.diag([1, 1, 1 / length])
     else:
-        window[0][2, measured] = 1.0
+        window[0][2, 0] = 1.0
     total, added = np.eye(3), np.zeros((3, 3))
-    for moved, noise in (piece(begin, tau), window, piece(dt - begin - length, tau)):
+    for moved, noise in (piece(begin, tau, smoothing), window, piece(dt - begin - length, tau, smoothing)):
         total, added = moved @ total, moved @ added @ moved.T + noise
     return total, added
 
