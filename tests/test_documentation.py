@@ -16,13 +16,11 @@ from helpers import COMMAND, CRAZYFLIE, documented_class, how_we_compile, standa
 from jaxtyping import Array, Float, TypeCheckError, jaxtyped
 from synthetic_identification import identified_flight, identified_vehicle
 from typechecker import check
-from typer.main import get_command
 
 import jaxos4
 from experiments.pictures.run import floors_picture
 from jaxos4._registry import Registry
 from jaxos4.airframe import airframe_table
-from jaxos4.cli import app
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.noise import NOISES
 from jaxos4.study import load_study
@@ -137,17 +135,6 @@ def test_the_keys_of_airframe_and_result_files_are_in_their_tables():
     assert (from_flights, of_vehicles) == (os4 - vehicle, vehicle - os4)
 
 
-def test_documented_commands_have_their_options():
-    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "experiments" / "README.md"]
-    text = "\n".join(page.read_text(encoding="utf-8").replace("\\\n", " ") for page in pages)
-    commands = re.findall(r"^jaxos4 ([a-z]+)\b(.*)$|`jaxos4 ([a-z]+)\b([^`\n]*)`", text, flags=re.MULTILINE)
-    offered = get_command(app).commands.items()
-    known = {name: {option for each in command.params for option in each.opts} for name, command in offered}
-    used = {(a or c, option) for a, b, c, d in commands for option in re.findall(r"--[a-z-]+", b + d)}
-    assert len(used) > 30
-    assert {(name, option) for name, option in used if option not in known[name] | {"--help"}} == set()
-
-
 def test_inner_functions_are_checked_at_each_call():
     def differences(values, annotation):
         @jaxtyped(typechecker=check)
@@ -220,7 +207,6 @@ import json, jax
 jax.config.update("jax_enable_x64", True)
 import jaxos4, lab
 from jaxos4.airframe import airframe_table
-from jaxos4.cli import app
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.models import default_terms
 used = [name for name in ("gauss_newton", "friction", "mylog") if hasattr(lab, name)]

@@ -264,6 +264,10 @@ def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tm
     assert err.count("not to be trusted") == err.count("the fit predicts") == 1
     text = (tmp_path / "vehicle.py").read_text(encoding="utf-8")
     assert all(words in text for words in ("# NOT TO BE TRUSTED: no_skill: ", f"\n# {first}\n", '"mass": 0.027,'))
+    # A reservation is no refusal.
+    write(vehicle_result(doubts=[doubt | {"result": "successful"}]))
+    code, _, err = run("export", "found.json", "--to", "rotorpy", "--out", "vehicle.py")
+    assert (code, err.splitlines()[0]) == (0, "use with care: yaw is not predicted; fly more yaw")
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,8 @@ class Evaluation(NamedTuple):
         """J^T W^2 J in the parameters, which all windows share; free initial states are eliminated."""
         information, count = self.information, self.parameters.size
         cross, own = information[:, count:, :count], information[:, count:, count:]
-        return (information[:, :count, :count] - np.swapaxes(cross, 1, 2) @ inverse(own) @ cross).sum(axis=0)
+        left = (information[:, :count, :count] - np.swapaxes(cross, 1, 2) @ inverse(own) @ cross).sum(axis=0)
+        return (left + left.T) / 2  # rounding makes the inverse asymmetric, and solvers read one half of a matrix
 
     @property
     def covariance(self) -> Spread:

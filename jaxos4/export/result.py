@@ -34,7 +34,8 @@ class Identified(NamedTuple):
     - `airframe`: the constants that were not estimated.
     - `values`: all parameters by name, estimated or fixed.
     - `drawn`, `covariance`: the names of the parameters that are uncertain, and their covariance.
-    - `doubts`: why the estimate cannot be trusted, and what to do; one line each. Empty if the result code says it all.
+    - `doubts`: why the estimate cannot be trusted, or only with care, and what to do; one line each. Empty if the
+      result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.
     - `inertia_z`: the moment of inertia Iz [kg m^2] that the user gave in the place of the estimate.
     """

@@ -61,7 +61,7 @@ def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
     ]
     if found.is_vehicle:
         rows += [
-            row(f"centre of mass {each.axis}", "mm", 1e3 * each.value, 1e3 * each.std, CENTER, "if rotors are alike")
+            row(f"{CENTER} {each.axis}", "mm", 1e3 * each.value, 1e3 * each.std, CENTER, "if rotors are alike")
             for each in centers_of_mass(found)
         ]
         rows.sort(key=lambda each: _ORDER.index(each.judged) if each.judged in _ORDER else -1)

@@ -12,7 +12,10 @@ from .uncertainty import PRIOR_NOTE
 from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Doubt, Quantity
 
 # Notes about a parameter that are reservations, and how they read there.
-_READ = {"came out negative": "came out negative, which is impossible", "outside its bracket": "is outside its bracket"}
+_READ = {
+    "came out negative": "came out negative, which is impossible",
+    "outside its bracket": "is outside its bracket; check the airframe, or give a wider `bracket`",
+}
 _BELOW_ONE = ("alpha1", "alpha4", "alpha7")
 
 

@@ -254,8 +254,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why the estimate cannot be trusted, and what to do; one line each."""
-        return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
+        """Why the estimate cannot be trusted, or only with care, and what to do; one line each."""
+        said = "use with care: " if self.successful else "not to be trusted because "
+        return tuple(f"{said}{doubt}" for doubt in self.doubts)
 
     @property
     def motor_clock(self) -> str:

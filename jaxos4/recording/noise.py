@@ -95,7 +95,7 @@ def without_noise(
     return smooth, float(np.sqrt(noise.mean() / 2)), share
 
 
-def _power(signals: Sequence[Float[np.ndarray, "samples 4"]], dt: float, settings: SpeedNoise) -> Changes | None:
+def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float, settings: SpeedNoise) -> Changes | None:
     """The mean power of the changes from sample to sample, by frequency; that of white changes is their variance."""
     length = 2 * (max(round(settings.seconds / dt), settings.fewest) // 2)
     weight, spectra = np.hanning(length + 1)[:-1, None], []

@@ -1,0 +1,126 @@
+"""Every command of the documentation: its parser accepts it, and those in blocks run, page by page."""
+
+import re
+import shlex
+import shutil
+import tomllib
+
+import pytest
+import typer
+from helpers import ROOT
+from small_experiments import load
+from typer.main import get_command
+
+from experiments.__main__ import scripts
+from experiments.sample_times.run import VEHICLE as CINERAT
+from jaxos4.airframe import airframe_table
+from jaxos4.cli import app
+from jaxos4.estimators import ESTIMATORS
+
+COMMANDS = get_command(app).commands
+COMMAND = rf"(?:^|`)(jaxos4 (?:{'|'.join(COMMANDS)})\b[^`\n]*|python -m experiments \w[^`\n]*)"
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+    for pattern in ("[!C]*.md", "CONTRIBUTING.md", "experiments/*.md", "docs/**/*.md")
+    for path in sorted(ROOT.glob(pattern))
+}
+EXAMPLES = {r"NAME(?=.*study\.toml|\.plot)": "frontier", "NAME": "coverage"}  # of an experiment
+# Pages whose commands run, in one folder: those of a later page use the files of an earlier one.
+STORIES = {
+    "study": ("docs/index.md",),
+    "drone": ("docs/drone.md", "docs/logs.md", "docs/method/filter_error.md", "docs/into_your_simulator.md"),
+    "real": ("README.md",),
+}
+# Other commands in blocks, and why they do not run here.
+ELSEWHERE = {
+    r"python |jaxos4 (compare$|study|report results)": "hours: smaller ones in test_study*.py, test_experiments*.py",
+    r".* (design|--speeds|--references) ": "minutes: test_design.py designs and flies shorter inputs",
+    r".* (train|--network) ": "half a minute for a network: test_cli.py trains smaller ones",
+    r".* flight\.(bag|log|ulg) |.* --columns ": "logs of other programs: test_logs_*.py",
+    r".*(gauss-newton|friction)\b": "what a reader adds: test_documentation.py",
+}
+EXIT_CODES = {"--estimator output-error": 2}  # which the page shows; else 0
+SHORTER = r"(?<=--duration )[36]0"  # seconds of a flight: a shorter one is fitted sooner
+
+
+def commands(text: str) -> list[str]:
+    """The commands of a text, each once, without comments."""
+    lines = re.findall(COMMAND, text.replace("\\\n", " ").replace(" && ", "\n"), flags=re.MULTILINE)
+    return list(dict.fromkeys(" ".join(line.split("#")[0].split()) for line in lines))
+
+
+def blocks(text: str, language: str = "") -> list[str]:
+    """The blocks of a page in this language."""
+    every = re.findall(r"^```(\w*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+    return [block for name, block in every if name == language]
+
+
+def in_blocks(page: str) -> list[str]:
+    return commands("\n".join(blocks(PAGES[page])))
+
+
+def parser(line: str):
+    """The parser of a command, and its arguments."""
+    program, *words = shlex.split(line.removeprefix("python -m "))
+    if program == "jaxos4":
+        return COMMANDS[words[0]], words[1:]
+    assert words[0] in (*scripts(), "render")
+    script = typer.Typer()
+    script.command()(load(*words[0].split(".")).main if words[0] != "render" else lambda: None)
+    return get_command(script), words[1:]
+
+
+def test_every_command_is_accepted_by_its_parser(monkeypatch):
+    monkeypatch.setitem(ESTIMATORS.data, "gauss-newton", None)  # which a page adds
+    every = {line for text in PAGES.values() for line in commands(text)}
+    assert len(every) > 100
+    for line in sorted(every):
+        for name, example in EXAMPLES.items():
+            line = re.sub(name, example, line)
+        command, arguments = parser(line)
+        try:
+            command.make_context(line, arguments)
+        except typer.BadParameter as error:
+            if type(error).__name__ != "MissingParameter":  # a text may name a command with a single option
+                raise
+
+
+def test_every_command_in_a_block_runs_here_or_elsewhere():
+    told = {line for pages in STORIES.values() for page in pages for line in in_blocks(page)}
+    others = {line for page in PAGES for line in in_blocks(page)} - told
+    assert {line for line in others if not any(re.match(pattern, line) for pattern in ELSEWHERE)} == set()
+
+
+def filled_in(airframe: str, vehicle: dict) -> str:
+    """An airframe that `inspect` began, with what the reader weighs and measures."""
+    for name in ("mass", "rotor_positions"):
+        airframe = re.sub(rf"^# {name} = .*$", f"{name} = {vehicle[name]}", airframe, flags=re.MULTILINE)
+    return airframe
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
+@pytest.mark.parametrize("story", STORIES)
+def test_the_commands_of_pages_run(story, run, tmp_path, request):
+    complete, (own,) = blocks(PAGES["docs/index.md"], "toml"), blocks(PAGES["docs/drone.md"], "toml")[-1:]
+    (tmp_path / "vehicle.toml").write_text(own)
+    mine, vehicle = tmp_path / "mine.toml", tomllib.loads(own)
+    if story == "study":
+        mine.write_text(*complete)
+    if story == "real":
+        log, vehicle = request.getfixturevalue("shared_flights") / "cinerat/cinerat_281.csv", airframe_table(CINERAT)
+        shutil.copy(log, tmp_path / "mylog.bbl")
+    every = dict.fromkeys(line for page in STORIES[story] for line in in_blocks(page))
+    said = ""
+    # A page shows what comes of a simulated flight before it says how to simulate one.
+    for line in sorted(every, key=lambda line: "simulate --closed-loop" not in line):
+        if any(re.match(pattern, line) for pattern in ELSEWHERE):
+            continue
+        code, out, err = run(*shlex.split(re.sub(SHORTER, "15", line))[1:])
+        assert code == next((code for option, code in EXIT_CODES.items() if option in line), 0), (line, err)
+        said += " ".join(out.split())
+        if "--airframe-out" in line:
+            mine.write_text(filled_in(mine.read_text(), vehicle))
+    if story == "real":  # its verdicts are those that the page shows
+        (verdicts,) = re.findall(r"^identified:.*?(?=^quantity)", PAGES["README.md"], flags=re.DOTALL | re.MULTILINE)
+        assert " ".join(verdicts.split()) in said
