@@ -33,10 +33,11 @@ from jaxos4.analysis.inertia import CenterOfMass
 from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
 from jaxos4.identification.verdict import Verdict
 from jaxos4.report import print_identification, write_flight_page
-from jaxos4.report.identification_page import frequency_responses, inertias_by_sample_time, vehicle, verdict
+from jaxos4.report.identification_figures import frequency_responses, inertias_by_sample_time, vehicle
+from jaxos4.report.identification_page import verdict
+from jaxos4.report.identification_signals import identified_signals, prediction_band
 from jaxos4.report.style import drawing, styles, svg
 from jaxos4.report.text import MISSING, Listing, plain
-from jaxos4.report.timeline import identified_signals, prediction_band
 
 EVIL = "</script><script>alert(1)</script>"
 

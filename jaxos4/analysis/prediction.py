@@ -35,6 +35,12 @@ class Predictions(NamedTuple):
     predicted: Float[np.ndarray, "starts horizons 3"]
     measured: Float[np.ndarray, "starts horizons 3"]
 
+    @property
+    def breaks(self) -> Int[np.ndarray, " breaks"]:
+        """The places of starts before which a line breaks, because another stretch begins."""
+        steps = np.diff(self.start)
+        return np.flatnonzero(steps > 1.5 * (np.median(steps) if steps.size else 1.0)) + 1
+
     def thinned(self, most: int) -> "Predictions":
         """At most `most` starts, evenly chosen, with rates to 1e-4 rad/s. What is not finite is NaN."""
         every = max(-(-self.start.size // most), 1)
