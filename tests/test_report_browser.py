@@ -221,6 +221,30 @@ def test_signals_zoom_together_and_stay_so(opened):
     assert page.evaluate(drawn) == before
 
 
+def test_one_start_is_chosen_and_drawn_as_a_trajectory(opened):
+    page = opened("vehicle", 390)
+    slider, said = page.locator("#start"), page.locator("#start + output")
+    assert not slider.is_visible()
+    page.locator("#view").select_option(label="from one start")
+    assert slider.is_visible()
+    drawn = "() => document.querySelectorAll('#timeline canvas')[1].toDataURL()"  # the residual
+    before, first = page.evaluate(drawn), said.text_content()
+    slider.focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+    assert float(said.text_content()[:-2]) == pytest.approx(float(first[:-2]) + 0.57, abs=0.02)
+    assert slider.get_attribute("aria-valuetext") == said.text_content()
+    assert page.evaluate(drawn) != before
+    assert overlapping(page.evaluate(TEXTS)) == []
+    assert page.evaluate("document.scrollingElement.scrollWidth") <= 390
+    box = slider.bounding_box()
+    assert box["height"] >= 24
+    page.mouse.click(box["x"] + box["width"] - 3, box["y"] + box["height"] / 2)
+    assert slider.input_value() == slider.get_attribute("max") == "39"
+    page.locator("#view").select_option(label="0.5 s ahead")
+    assert not slider.is_visible()
+
+
 def test_a_range_of_a_log_is_ready_to_copy_and_a_finger_moves_it(opened):
     page = opened("log", 390)
     before = page.locator("#range").text_content()

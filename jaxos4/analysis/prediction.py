@@ -41,6 +41,11 @@ class Predictions(NamedTuple):
         steps = np.diff(self.start)
         return np.flatnonzero(steps > 1.5 * (np.median(steps) if steps.size else 1.0)) + 1
 
+    def at(self, places: slice) -> "Predictions":
+        """The predictions at some of the horizons."""
+        rates = (each[:, places] for each in (self.predicted, self.measured))
+        return Predictions(self.start, self.horizons[places], self.initial, *rates)
+
     def thinned(self, most: int) -> "Predictions":
         """At most `most` starts, evenly chosen, with rates to 1e-4 rad/s. What is not finite is NaN."""
         every = max(-(-self.start.size // most), 1)
@@ -90,6 +95,12 @@ def predictions(
     predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
     measured = rates[start[:, None] + ahead]
     return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead - 1], measured)
+
+
+def trajectory_horizons(dt: float, longest: float = max(HORIZONS), *, every: float = 0.02) -> tuple[float, ...]:
+    """Horizons `every` so many seconds, in whole samples, which draw a trajectory up to the `longest`."""
+    step = max(round(every / dt), 1) * dt
+    return tuple(step * np.arange(1, int(longest / step + 1e-6) + 1))
 
 
 def starts(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..analysis.prediction import Predictions, decisive_horizon
 from ..analysis.traces import Traces
@@ -25,12 +25,13 @@ Times = Float[np.ndarray, " samples"]
 def identified_signals(found: Identification, look: Style) -> str:
     """The signals of a result's page, as JSON; empty if the result has none.
 
-    A vehicle has a view for each horizon of its predictions, an OS4 one for each group of channels.
+    A vehicle has a view for each horizon of its predictions, and one of trajectories. An OS4 has one for each group of
+    channels.
     """
     traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
     if traces is None:
         return ""
-    validate, shown, shaded = found.provenance.validate or "", 0, []
+    validate, shown, shaded, before = found.provenance.validate or "", 0, [], None
     axis = _axis(traces, ahead)
     time, known = axis.place(traces.time, traces.log), np.asarray(np.isfinite(traces.measured).any(axis=1))
     if traces.predicted.shape[1]:
@@ -40,14 +41,19 @@ def identified_signals(found: Identification, look: Style) -> str:
             if group[0] < traces.predicted.shape[1]
         ]
     elif ahead is not None:
-        views = [_horizon(traces, ahead, i, axis, known, look) for i in range(ahead.horizons.size)]
+        views = [_horizon(traces, ahead, i, axis, look) for i in range(ahead.horizons.size)]
+        if (paths := found.trajectories) is not None:
+            views.append(_trajectories(traces, ahead, paths, axis, look))
         shown = decisive_horizon(ahead.horizons, np.isfinite(ahead.measured).any(axis=(0, 2)))
         shaded = spans(time, known)
+        # Of the samples that were held out, the first is kept, as missing: the line breaks there.
+        kept = known | np.diff(known, prepend=False)
+        before = View("", time[kept], [_panel(i, traces.measured[kept, i], None, look) for i in range(3)])
     else:
         views = [View("rates", time, [_panel(i, traces.measured[:, i], None, look) for i in range(3)])]
     names = [printable(Path(name).name) for name in (*found.logs, validate)]
     common = View("", time, _common(traces))
-    return signals(axis, [common] * bool(common.panels), views, shown=shown, shaded=shaded, names=names)
+    return signals(axis, [common] * bool(common.panels), views, before=before, shown=shown, shaded=shaded, names=names)
 
 
 def _axis(traces: Traces, ahead: Predictions | None) -> Axis:
@@ -78,23 +84,31 @@ def _common(traces: Traces) -> list[Panel]:
     return [*panels, Panel("gusts [rad/s²]", gusts)] if gusts else panels
 
 
-def _horizon(
-    traces: Traces, ahead: Predictions, place: int, axis: Axis, fitted: Bool[np.ndarray, " samples"], look: Style
-) -> View:
-    """The predictions so far ahead, between the measurements that were fitted."""
-    horizon, half = float(ahead.horizons[place]), prediction_band(ahead)[place]
-    # A line breaks where measurements are held out, of which the first one is kept as missing, and between predictions
-    # that are not of one stretch.
-    kept, breaks = fitted | np.diff(fitted, prepend=False), ahead.breaks
+def _horizon(traces: Traces, ahead: Predictions, place: int, axis: Axis, look: Style) -> View:
+    """The predictions so far ahead. The line breaks between predictions that are not of one stretch."""
+    horizon, half, breaks = float(ahead.horizons[place]), prediction_band(ahead)[place], ahead.breaks
     start = axis.place(traces.start_time + horizon, traces.start_log)
     start = np.insert(start, breaks, (start[breaks - 1] + start[breaks]) / 2)
-    both = (np.insert(each[:, place], breaks, np.nan, axis=0) for each in (ahead.measured, ahead.predicted))
-    nothing = np.full((np.count_nonzero(kept), 3), np.nan)
-    before = np.where(fitted[kept, None], traces.measured[kept, :3], np.nan), nothing
-    time = np.concatenate([axis.place(traces.time[kept], traces.log[kept]), start])
-    measured, predicted = (np.concatenate(each) for each in zip(before, both, strict=True))
+    measured, predicted = (np.insert(x[:, place], breaks, np.nan, axis=0) for x in (ahead.measured, ahead.predicted))
     panels = [_panel(i, measured[:, i], predicted[:, i], look, float(half[i])) for i in range(3)]
-    return View(f"{horizon:.3g} s ahead", time, panels)
+    return View(f"{horizon:.3g} s ahead", start, panels)
+
+
+def _trajectories(traces: Traces, ahead: Predictions, paths: Predictions, axis: Axis, look: Style) -> View:
+    """The predictions from each start, of which one is chosen, beside all that was measured meanwhile."""
+    place = np.searchsorted(ahead.start, paths.start)
+    begin, log = traces.start_time[place], traces.start_log[place]
+    # A trajectory that ends before the next one begins is followed by a sample without values.
+    horizons = np.concatenate([[0.0], paths.horizons, [paths.horizons[-1] + 1e-4]])
+    kept = np.ones((place.size, horizons.size), bool)
+    kept[:-1, -1] = (np.diff(begin) > horizons[-1]) | (np.diff(log) != 0)
+    start = np.broadcast_to(np.arange(place.size)[:, None], kept.shape)[kept]
+    measured, predicted = (
+        np.concatenate([paths.initial[:, None], each, np.full((place.size, 1, 3), np.nan)], axis=1)[kept]
+        for each in (paths.measured, paths.predicted)
+    )
+    panels = [_panel(i, measured[:, i], predicted[:, i], look) for i in range(3)]
+    return View("from one start", axis.place((begin[:, None] + horizons)[kept], log[start]), panels, start)
 
 
 def prediction_band(ahead: Predictions) -> Float[np.ndarray, "horizons 3"]:

@@ -36,11 +36,16 @@ class Panel(NamedTuple):
 
 
 class View(NamedTuple):
-    """Panels of the same samples. `time`: of each sample on the axis [s], see `Axis.place`."""
+    """Panels of the same samples.
+
+    - `time`: of each sample on the axis [s], see `Axis.place`.
+    - `start`: of a prediction from many starts, the number of that of each sample. Those from a chosen one are drawn.
+    """
 
     name: str
     time: Float[np.ndarray, " samples"]
     panels: Sequence[Panel]
+    start: Int[np.ndarray, " samples"] | None = None
 
 
 class Axis(NamedTuple):
@@ -113,6 +118,7 @@ def signals(
     common: Sequence[View],
     views: Sequence[View] = (),
     *,
+    before: View | None = None,
     shown: int = 0,
     shaded: Sequence[tuple[float, float]] = (),
     names: Sequence[str] = (),
@@ -120,6 +126,7 @@ def signals(
     """The data that `timeline.js` draws, as JSON.
 
     - `common`: views below the chosen one of `views`. `shown`: the number of the first that is chosen.
+    - `before`: earlier samples of the first lines of all `views`.
     - `shaded`: from when to when the background is grey, on the axis. `names`: of the logs, if there are several.
     """
     several = np.ptp(axis.log) > 0
@@ -128,6 +135,7 @@ def signals(
         {
             "pieces": pieces,
             "shaded": [[round(x, 4) for x in each] for each in shaded],
+            "before": None if before is None else _view(before),
             "views": [_view(each) for each in views],
             "common": [_view(each) for each in common],
             "shown": shown,
@@ -141,6 +149,7 @@ def _view(view: View) -> dict[str, Any]:
     return {
         "name": view.name,
         "time": base64.b64encode(view.time[order].astype("<f4").tobytes()).decode(),
+        "start": None if view.start is None else base64.b64encode(view.start[order].astype("<i2").tobytes()).decode(),
         "panels": [
             {
                 "title": panel.title,
