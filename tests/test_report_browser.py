@@ -92,6 +92,8 @@ def addresses(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     study = synthetic_study(flights=12, estimators=tuple(ESTIMATORS), scales=(0.1, 1.0))
     files = {"study": write_report(study, folder)[0]}
+    (folder / "one").mkdir()
+    files["one flight"] = write_report(study.isel(flight=[0], estimator=slice(4)), folder / "one")[0]
     for name, found in {
         "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
         "without predictions": identified_vehicle(predictions=None),
@@ -146,7 +148,7 @@ def opened(browser, addresses):
 
 
 @pytest.mark.parametrize("width", [390, 768, 1280])
-@pytest.mark.parametrize("name", ["study", "vehicle", "os4", "log", "comparison", *DESIGNS])
+@pytest.mark.parametrize("name", ["study", "one flight", "vehicle", "os4", "log", "comparison", *DESIGNS])
 def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
     page = opened(name, width)
     page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true; })")
