@@ -124,8 +124,11 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
         if max(traces.log.max(), traces.start_log.max(initial=0)) > len(found.logs):  # one more: that of `validate`
             yield "`traces`: is of a log that has no name"
     if (paths := found.trajectories) is not None:
-        if found.predictions is None or not np.isin(paths.start, found.predictions.start).all():
+        ahead = found.predictions
+        if ahead is None or not np.isin(paths.start, ahead.start).all():
             yield "`trajectories`: has starts that are not among those of the predictions"
+        elif (np.diff(paths.horizons) <= 0).any() or paths.horizons[-1] > 1.001 * ahead.horizons.max():
+            yield "`trajectories`: horizons must increase, up to those of the predictions"
     if (skill := found.skill) is not None:
         table = [each for rate in (skill.p, skill.q, skill.r) for each in msgspec.structs.astuple(rate)]
         if any(len(column) != len(skill.horizons) for column in table):

@@ -247,6 +247,17 @@ def test_one_start_is_chosen_and_drawn_as_a_trajectory(opened):
     assert not slider.is_visible()
 
 
+def test_without_scripts_the_page_reads_and_has_no_dead_buttons(browser, addresses):
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(addresses["vehicle"])
+    assert page.locator("noscript").is_visible()
+    assert page.locator("#quantities-table").is_visible()
+    assert page.locator(".tools").count() == 1
+    assert not page.locator(".tools, #start").first.is_visible()
+    context.close()
+
+
 def test_a_range_of_a_log_is_ready_to_copy_and_a_finger_moves_it(opened):
     page = opened("log", 390)
     before = page.locator("#range").text_content()

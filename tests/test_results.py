@@ -147,6 +147,8 @@ WRONG = [
     (("predictions", "measured", 0), [], "`predictions.measured`"),
     (("trajectories", "start", 1), 6, "`trajectories`: has starts that are not among those of the predictions"),
     (("predictions",), None, "`trajectories`: has starts"),
+    (("trajectories", "horizons", 24), 9e9, "`trajectories`: horizons must increase"),
+    (("trajectories", "horizons", 3), 0.01, "`trajectories`: horizons must increase"),
     (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
     (("response", "roll", "phase"), [1.0], "`response.roll.phase`: has another shape"),
     (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),

@@ -212,6 +212,7 @@
   document.getElementById("copy")?.addEventListener("click", () => navigator.clipboard?.writeText(range.textContent));
   list?.replaceChildren(...given.views.map(({ name }, i) => new Option(name, i, i === given.shown, i === given.shown)));
   if (list) list.parentElement.hidden = given.views.length < 2;
+  box.parentElement.querySelector(".tools").hidden = false;
   list?.addEventListener("change", reach);
   slider?.addEventListener("input", reach);
   document.addEventListener("theme", draw);
