@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from helpers import CRAZYFLIE
 from sign_flights import flown
-from synthetic_identification import SAMPLE_TIMES, behind_an_estimate, identified_flight, identified_vehicle
+from synthetic_identification import (
+    SAMPLE_TIMES,
+    behind_an_estimate,
+    identified_flight,
+    identified_vehicle,
+    synthetic_traces,
+)
 from synthetic_study import ESTIMATORS, synthetic_study
 
 from jaxos4 import PublishedOS4, compare_results
@@ -101,6 +107,11 @@ def addresses(tmp_path_factory):
     }.items():
         files[name] = folder / f"{name}.html"
         write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")
+    files["two logs"] = folder / "two.html"
+    log, time = np.repeat([0, 1], 100), 0.02 * np.arange(200)
+    traces = synthetic_traces(time, log, np.ones((200, 3)))
+    of_two = {"predictions": None, "traces": traces, "provenance": {"flights": ["first.csv", "other.csv"]}}
+    write_flight_page(files["two logs"], identified_vehicle(**of_two))
     files["log"] = folder / "log.html"
     flight = flown(CRAZYFLIE, 0)
     write_log_page(files["log"], flight, CRAZYFLIE)
@@ -221,6 +232,27 @@ def test_signals_zoom_together_and_stay_so(opened):
     page.get_by_role("button", name="All").click()
     page.wait_for_function(changed, arg=zoomed[0])
     assert page.evaluate(drawn) == before
+
+
+def test_only_logs_in_sight_have_their_names(opened):
+    """The second of two logs is in sight: the name of the first is not drawn over its own."""
+    page = opened("two logs")
+    page.evaluate("""() => {
+        const draw = CanvasRenderingContext2D.prototype.fillText;
+        window.drawn = [];
+        CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+            window.drawn.push(text);
+            return draw.call(this, text, ...place);
+        };
+    }""")
+    names = "() => window.drawn.splice(0).filter((text) => text.endsWith('.csv'))"
+    for clicks, shown in ((["Zoom in"] * 2 + ["Later"] * 3, {"other.csv"}), (["All"], {"first.csv", "other.csv"})):
+        for name in clicks:
+            page.wait_for_timeout(200)
+            page.evaluate(names)
+            page.get_by_role("button", name=name).click()
+        page.wait_for_timeout(200)
+        assert set(page.evaluate(names)) == shown
 
 
 def test_one_start_is_chosen_and_drawn_as_a_trajectory(opened):

@@ -99,8 +99,8 @@ def predictions(
 
 def trajectory_horizons(dt: float, longest: float = max(HORIZONS), *, every: float = 0.02) -> tuple[float, ...]:
     """Horizons `every` so many seconds, in whole samples, which draw a trajectory up to the `longest`."""
-    step = max(round(every / dt), 1) * dt
-    return tuple(step * np.arange(1, int(longest / step + 1e-6) + 1))
+    step = max(round(every / dt), 1)
+    return tuple(dt * np.arange(step, round(longest / dt) + 1, step))
 
 
 def starts(

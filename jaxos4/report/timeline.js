@@ -59,6 +59,7 @@
   // Grey where a part is not used or not fitted; a line where another part or log begins, with its name above.
   function background(plot) {
     const { ctx, bbox } = plot, x = (at) => plot.valToPos(at, "x", true);
+    const low = plot.scales.x.min, first = pieceAt(low)[3]; // of the logs that began before, one has a name
     ctx.save();
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
@@ -70,7 +71,7 @@
     pieces.forEach(([at, , , name], i) => {
       const isNew = i === 0 || name !== pieces[i - 1][3];
       if (i) ctx.fillRect(x(at) - devicePixelRatio, bbox.top, (isNew ? 2 : 1) * devicePixelRatio, bbox.height);
-      if (name && isNew && plot === plots[0]) {
+      if (name && isNew && plot === plots[0] && (at >= low || name === first)) {
         ctx.fillText(name, Math.max(x(at), bbox.left) + 4 * devicePixelRatio, bbox.top + 12 * devicePixelRatio);
       }
     });
