@@ -100,7 +100,7 @@ def predictions(
 def trajectory_horizons(dt: float, longest: float = max(HORIZONS), *, every: float = 0.02) -> tuple[float, ...]:
     """Horizons `every` so many seconds, in whole samples, which draw a trajectory up to the `longest`."""
     step = max(round(every / dt), 1)
-    return tuple(dt * np.arange(step, round(longest / dt) + 1, step))
+    return tuple(dt * np.arange(step, max(round(longest / dt), 1) + 1, step))
 
 
 def starts(
