@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, get_type_hints
 
 import msgspec
@@ -37,6 +38,7 @@ _File = msgspec.defstruct(
         ("constants", dict[str, Constant | float | bool]),
         ("airframe", dict[str, Any] | None),
         ("predictions", dict[str, Any] | None, None),
+        ("trajectories", dict[str, Any] | None, None),
         ("response", dict[str, dict[str, Any]] | None, None),
         ("traces", dict[str, Any] | None, None),
         ("correlations", dict[str, Any] | None, None),
@@ -68,7 +70,8 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
             "rigid_body": RigidBody(constants, tests.pop("consistency_p", None), tests.pop("rigid_body", None)),
             "is_vehicle": fields["model"] == "flight",
         }
-        checked = {"predictions": _predictions, "response": _response, "traces": _traces, "correlations": _correlations}
+        checked = {"response": _response, "traces": _traces, "correlations": _correlations}
+        checked |= {name: partial(_predictions, place=name) for name in ("predictions", "trajectories")}
         fields |= {name: check(fields[name]) for name, check in checked.items() if fields[name] is not None}
         found = Identification(**fields)
         if problem := next(_problems(found, tests), None):
@@ -123,6 +126,12 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
             yield "`traces`: has not one time for each start of the predictions"
         if max(traces.log.max(), traces.start_log.max(initial=0)) > len(found.logs):  # one more: that of `validate`
             yield "`traces`: is of a log that has no name"
+    if (paths := found.trajectories) is not None:
+        ahead = found.predictions
+        if ahead is None or not np.isin(paths.start, ahead.start).all():
+            yield "`trajectories`: has starts that are not among those of the predictions"
+        elif (np.diff(paths.horizons) <= 0).any() or paths.horizons[-1] > 1.001 * ahead.horizons.max():
+            yield "`trajectories`: horizons must increase, up to those of the predictions"
     if (skill := found.skill) is not None:
         table = [each for rate in (skill.p, skill.q, skill.r) for each in msgspec.structs.astuple(rate)]
         if any(len(column) != len(skill.horizons) for column in table):
@@ -170,12 +179,12 @@ def _correlations(table: dict[str, Any]) -> Correlations:
     return Correlations(**arrays)
 
 
-def _predictions(table: dict[str, Any]) -> Predictions:
-    arrays = _arrays(Predictions, table, "predictions")
+def _predictions(table: dict[str, Any], place: str) -> Predictions:
+    arrays = _arrays(Predictions, table, place)
     start, horizons = arrays["start"], arrays["horizons"]
     usable = start.size and (start >= 0).all() and (start < 1 << 40).all() and (np.diff(start) >= 1).all()
     if not (usable and horizons.size and (horizons > 0).all() and (start % 1 == 0).all()):
-        raise InputError(f"`predictions`: starts must increase, and horizons be positive; {_AGAIN}")
+        raise InputError(f"`{place}`: starts must increase, and horizons be positive; {_AGAIN}")
     return Predictions(**arrays | {"start": start.astype(int)})
 
 

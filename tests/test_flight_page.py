@@ -33,10 +33,11 @@ from jaxos4.analysis.inertia import CenterOfMass
 from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
 from jaxos4.identification.verdict import Verdict
 from jaxos4.report import print_identification, write_flight_page
-from jaxos4.report.identification_page import frequency_responses, inertias_by_sample_time, vehicle, verdict
+from jaxos4.report.identification_figures import frequency_responses, inertias_by_sample_time, vehicle
+from jaxos4.report.identification_page import verdict
+from jaxos4.report.identification_signals import identified_signals, prediction_band
 from jaxos4.report.style import drawing, styles, svg
 from jaxos4.report.text import MISSING, Listing, plain
-from jaxos4.report.timeline import identified_signals, prediction_band
 
 EVIL = "</script><script>alert(1)</script>"
 
@@ -88,7 +89,8 @@ def test_the_signals_are_the_predictions_with_a_band_of_95_percent():
     found = identified_vehicle(traces=unfitted)
     predicted, look = found.predictions, styles(["ibss"])["ibss"]
     drawn = json.loads(identified_signals(found, look))
-    assert [view["name"] for view in drawn["views"]] == ["0.1 s ahead", "0.248 s ahead", "0.5 s ahead"]
+    named = ["0.1 s ahead", "0.248 s ahead", "0.5 s ahead", "from one start"]
+    assert [view["name"] for view in drawn["views"]] == named
     assert drawn["shown"] == 1
     # Nothing was measured so far ahead.
     measured = np.where(np.arange(3)[:, None] > 0, np.nan, predicted.measured)
@@ -123,8 +125,34 @@ def test_fitted_and_held_out_parts_are_on_one_axis_of_all_logs():
     assert drawn["shaded"] == [pytest.approx([-0.01, later + 0.99])]
     assert [panel["title"] for panel in drawn["common"][0]["panels"]] == ["inputs [rad/s]", "gusts [rad/s²]"]
     shown = np.frombuffer(base64.b64decode(drawn["views"][0]["time"]), "<f4")
-    values, _ = unpacked(drawn["views"][0]["panels"][0]["lines"][1])
-    np.testing.assert_allclose(shown[np.isfinite(values)], later + 1 + 0.02 * np.arange(20) + 0.2, atol=1e-4)
+    np.testing.assert_allclose(shown, later + 1 + 0.02 * np.arange(20) + 0.2, atol=1e-4)
+    fitted, earlier = (np.frombuffer(base64.b64decode(drawn["before"]["time"]), "<f4"), drawn["before"]["panels"][0])
+    values, _ = unpacked(earlier["lines"][0])
+    assert (fitted.size, np.isfinite(values).sum(), np.isnan(values).argmax()) == (151, 150, 150)
+
+
+def test_the_trajectory_from_each_start_is_on_the_page():
+    """The measured line breaks only where no trajectory is near; each sample knows its start."""
+    found = identified_vehicle()
+    paths, traces = found.trajectories, found.traces
+    drawn = json.loads(identified_signals(found, styles(["ibss"])["ibss"]))["views"][-1]
+    start = np.frombuffer(base64.b64decode(drawn["start"]), "<i2")
+    time = np.frombuffer(base64.b64decode(drawn["time"]), "<f4")
+    assert (np.diff(time) >= 0).all()
+    assert start.max() + 1 == paths.start.size == 40
+    begin = traces.start_time[np.isin(found.predictions.start, paths.start)]
+    for i, panel in enumerate(drawn["panels"]):
+        measured, predicted = (unpacked(line)[0] for line in panel["lines"])
+        breaks = np.isnan(measured)
+        assert np.count_nonzero(breaks) == 2  # between the stretches, and at the end
+        assert panel["residual"]
+        for k in (0, 17, 39):
+            own = (start == k) & ~breaks
+            np.testing.assert_allclose(time[own] - time[own][0], np.append(0, paths.horizons), atol=1e-4)
+            assert time[own][0] - time[start == 0][0] == pytest.approx(begin[k] - begin[0], abs=1e-4)
+            expected = np.append(paths.initial[k, i], paths.predicted[k, :, i])
+            np.testing.assert_allclose(predicted[own], expected, atol=1e-3)
+            np.testing.assert_allclose(measured[own][1:], paths.measured[k, :, i], atol=1e-3)
 
 
 def test_what_stands_behind_an_estimate_is_drawn(tmp_path):

@@ -120,7 +120,7 @@ COMMON = (
     *("constants", "airframe", "verdicts", "doubts"),
 )
 SETTINGS = ("airframe", "sample_time", "notes", "version", "jax", "device", "precision")
-ARRAYS = ("traces", "correlations", "predictions", "response")
+ARRAYS = ("traces", "correlations", "predictions", "trajectories", "response")
 # The keys of the JSON, of its provenance, and of a parameter, by the kind of identification.
 KEYS = {
     "flight": (
@@ -216,6 +216,12 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     found = jaxos4.identify(recordings, constants, settings=settings)
     assert_same_as_written(found, tmp_path / "found.json")
     assert found.predictions.horizons.tolist() == found.skill.horizons
+    same, own = np.isin(found.predictions.start, found.trajectories.start), found.trajectories
+    assert 20 <= own.start.size == same.sum() <= 40
+    (near,) = np.flatnonzero(np.isclose(own.horizons, found.predictions.horizons[0]))
+    np.testing.assert_array_equal(own.predicted[:, near], found.predictions.predicted[same, 0])
+    np.testing.assert_allclose(np.diff(own.horizons), own.horizons[0])
+    assert own.horizons[-1] == pytest.approx(0.5, abs=own.horizons[0])
 
 
 def test_a_search_that_fails_keeps_what_the_log_shows():

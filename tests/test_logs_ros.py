@@ -267,7 +267,7 @@ def test_a_small_file_does_not_fill_the_memory(kind, tmp_path):
     name, content = (f"{name}.zstd", zstd.compress(content)) if again else (name, content)
     (tmp_path / name).write_bytes(content)
     tracemalloc.start()
-    with pytest.raises(InputError, match="holds a compressed part of more than 268,435,456 bytes"):
+    with pytest.raises(InputError, match="holds a part of more than 268,435,456 bytes"):
         check_sizes(tmp_path) if again else read_log(tmp_path / name)
     assert tracemalloc.get_traced_memory()[1] < 30 << 20
     tracemalloc.stop()
@@ -291,6 +291,35 @@ def test_a_file_that_is_compressed_as_a_whole_may_be_larger(tmp_path):
     check_sizes(tmp_path, limits=Limits(file=6 << 20))
     with pytest.raises(InputError, match="6,291,455"):
         check_sizes(tmp_path, limits=Limits(file=(6 << 20) - 1))
+
+
+def record(kind, content):
+    return struct.pack("<BQ", kind, len(content)) + content
+
+
+def test_an_mcap_that_is_compressed_as_a_whole_is_decompressed_once(tmp_path, monkeypatch):
+    """Records that a reader holds in memory are bounded, whether they are compressed again or not."""
+    made = []
+    for name in ("ZstdFile", "ZstdDecompressor"):
+        usual = getattr(zstd, name)
+        monkeypatch.setattr(zstd, name, lambda *given, usual=usual: made.append(usual) or usual(*given))
+    limits = Limits(part=1 << 20, file=8 << 20)
+    chunk = struct.pack("<QQQIIQ", 0, 1, 1 << 19, 0, 0, 1 << 19) + bytes(1 << 19)
+    parts = {"chunks": 3 * record(6, chunk), "a large attachment": record(9, bytes(4 << 20)) + record(6, chunk)}
+    for name, content in parts.items():
+        (tmp_path / "flight.mcap.zstd").write_bytes(zstd.compress(b"\x89MCAP0\r\n" + content))
+        made.clear()
+        check_sizes(tmp_path, limits=limits)
+        assert len(made) == 1, name
+    large = {"chunk": record(6, chunk[:40] + bytes(2 << 20)), "message": record(6, chunk) + record(5, bytes(2 << 20))}
+    for content in large.values():
+        (tmp_path / "flight.mcap.zstd").write_bytes(zstd.compress(b"\x89MCAP0\r\n" + content))
+        with pytest.raises(InputError, match="holds a part of more than 1,048,576 bytes"):
+            check_sizes(tmp_path, limits=limits)
+    for content in (record(9, bytes(9 << 20)), struct.pack("<BQ", 9, (1 << 64) - 1) + bytes(9 << 20)):
+        (tmp_path / "flight.mcap.zstd").write_bytes(zstd.compress(b"\x89MCAP0\r\n" + content))
+        with pytest.raises(InputError, match="has more than 8,388,608 bytes when it is decompressed"):
+            check_sizes(tmp_path, limits=limits)
 
 
 @pytest.mark.parametrize("kind", KINDS)

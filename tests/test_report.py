@@ -22,7 +22,7 @@ from jaxos4.estimators import ESTIMATORS as REGISTRY
 from jaxos4.report import error_table, study_page, write_report
 from jaxos4.report.study_tables import scenarios
 from jaxos4.report.style import drawing, log_axis, styles
-from jaxos4.report.text import percent, plain
+from jaxos4.report.text import MISSING, percent, plain
 from jaxos4.study import metrics, read_results
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
@@ -139,6 +139,34 @@ def test_trouble_is_named(report):
         *(f"[{UNITS[place]}]" for place in (0, 1, 6)),
     ):
         assert said in shown, said
+
+
+def test_a_study_of_one_flight_shows_the_answer_and_no_statistics(tmp_path):
+    study = few(flights=1, scales=(0.0, 1.0), estimators=("ibss", "svsf"), spoiled=False)
+    code = metrics.codes(study)["max_sweeps"]
+    for name, none in {"result": code, "estimate": np.nan, "half_width": np.nan}.items():
+        study[name].loc[{"scale": 0.0, "estimator": "svsf"}] = none
+    page, *figures = write_report(study, tmp_path)
+    text = page.read_text(encoding="utf-8")
+    stands_alone(text)
+    assert [path.name for path in figures] == ["intervals.svg"]
+    assert set(tables(text)) == {"estimates-1", "results-1"}
+    shown, cells = words(text), tables(text)["estimates-1"]
+    assert "Each scenario has one flight: there are answers, but no statistics." in shown
+    assert "svsf at noise x 0: max sweeps." in shown
+    one = study.isel({name: 0 for name in SCENARIO} | {"flight": 0, "scale": 1})
+    half = one["half_width"].sel(level=0.95).values
+    held = int((abs(one["estimate"] - one["truth"]).values <= half).sum())
+    assert f"ibss at noise x 1: successful, {held} of 3 intervals hold the truth." in shown
+    for k, name in enumerate(study["parameter"].values):
+        row = {heading: cells["noise x 1, ibss", name, heading][0] for heading in ("truth", "estimate", "interval")}
+        value = float(one["estimate"][k])
+        ends = f"{plain(value - half[k], 4)} to {plain(value + half[k], 4)}"
+        assert row == {"truth": plain(float(one["truth"][k]), 4), "estimate": plain(value, 4), "interval": ends}
+        assert cells["noise x 0, svsf", name, "estimate"][0] == MISSING
+        assert cells["noise x 0, svsf", name, "interval"][0] == MISSING
+    single = study.isel(scale=[1], estimator=[0])
+    assert '<p class="verdict">ibss at noise x 1: successful, ' in write_report(single, tmp_path)[0].read_text()
 
 
 def test_the_terminal_has_the_same_errors_in_80_columns():

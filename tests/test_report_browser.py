@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from helpers import CRAZYFLIE
 from sign_flights import flown
-from synthetic_identification import SAMPLE_TIMES, behind_an_estimate, identified_flight, identified_vehicle
+from synthetic_identification import (
+    SAMPLE_TIMES,
+    behind_an_estimate,
+    identified_flight,
+    identified_vehicle,
+    synthetic_traces,
+)
 from synthetic_study import ESTIMATORS, synthetic_study
 
 from jaxos4 import PublishedOS4, compare_results
@@ -92,6 +98,8 @@ def addresses(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     study = synthetic_study(flights=12, estimators=tuple(ESTIMATORS), scales=(0.1, 1.0))
     files = {"study": write_report(study, folder)[0]}
+    (folder / "one").mkdir()
+    files["one flight"] = write_report(study.isel(flight=[0], estimator=slice(4)), folder / "one")[0]
     for name, found in {
         "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
         "without predictions": identified_vehicle(predictions=None),
@@ -99,6 +107,11 @@ def addresses(tmp_path_factory):
     }.items():
         files[name] = folder / f"{name}.html"
         write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")
+    files["two logs"] = folder / "two.html"
+    log, time = np.repeat([0, 1], 100), 0.02 * np.arange(200)
+    traces = synthetic_traces(time, log, np.ones((200, 3)))
+    of_two = {"predictions": None, "traces": traces, "provenance": {"flights": ["first.csv", "other.csv"]}}
+    write_flight_page(files["two logs"], identified_vehicle(**of_two))
     files["log"] = folder / "log.html"
     flight = flown(CRAZYFLIE, 0)
     write_log_page(files["log"], flight, CRAZYFLIE)
@@ -146,7 +159,7 @@ def opened(browser, addresses):
 
 
 @pytest.mark.parametrize("width", [390, 768, 1280])
-@pytest.mark.parametrize("name", ["study", "vehicle", "os4", "log", "comparison", *DESIGNS])
+@pytest.mark.parametrize("name", ["study", "one flight", "vehicle", "os4", "log", "comparison", *DESIGNS])
 def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
     page = opened(name, width)
     page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true; })")
@@ -219,6 +232,62 @@ def test_signals_zoom_together_and_stay_so(opened):
     page.get_by_role("button", name="All").click()
     page.wait_for_function(changed, arg=zoomed[0])
     assert page.evaluate(drawn) == before
+
+
+def test_only_logs_in_sight_have_their_names(opened):
+    """The second of two logs is in sight: the name of the first is not drawn over its own."""
+    page = opened("two logs")
+    page.evaluate("""() => {
+        const draw = CanvasRenderingContext2D.prototype.fillText;
+        window.drawn = [];
+        CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+            window.drawn.push(text);
+            return draw.call(this, text, ...place);
+        };
+    }""")
+    names = "() => window.drawn.splice(0).filter((text) => text.endsWith('.csv'))"
+    for clicks, shown in ((["Zoom in"] * 2 + ["Later"] * 3, {"other.csv"}), (["All"], {"first.csv", "other.csv"})):
+        for name in clicks:
+            page.wait_for_timeout(200)
+            page.evaluate(names)
+            page.get_by_role("button", name=name).click()
+        page.wait_for_timeout(200)
+        assert set(page.evaluate(names)) == shown
+
+
+def test_one_start_is_chosen_and_drawn_as_a_trajectory(opened):
+    page = opened("vehicle", 390)
+    slider, said = page.locator("#start"), page.locator("#start + output")
+    assert not slider.is_visible()
+    page.locator("#view").select_option(label="from one start")
+    assert slider.is_visible()
+    drawn = "() => document.querySelectorAll('#timeline canvas')[1].toDataURL()"  # the residual
+    before, first = page.evaluate(drawn), said.text_content()
+    slider.focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+    assert float(said.text_content()[:-2]) == pytest.approx(float(first[:-2]) + 0.57, abs=0.02)
+    assert slider.get_attribute("aria-valuetext") == said.text_content()
+    assert page.evaluate(drawn) != before
+    assert overlapping(page.evaluate(TEXTS)) == []
+    assert page.evaluate("document.scrollingElement.scrollWidth") <= 390
+    box = slider.bounding_box()
+    assert box["height"] >= 24
+    page.mouse.click(box["x"] + box["width"] - 3, box["y"] + box["height"] / 2)
+    assert slider.input_value() == slider.get_attribute("max") == "39"
+    page.locator("#view").select_option(label="0.5 s ahead")
+    assert not slider.is_visible()
+
+
+def test_without_scripts_the_page_reads_and_has_no_dead_buttons(browser, addresses):
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(addresses["vehicle"])
+    assert page.locator("noscript").is_visible()
+    assert page.locator("#quantities-table").is_visible()
+    assert page.locator(".tools").count() == 1
+    assert not page.locator(".tools, #start").first.is_visible()
+    context.close()
 
 
 def test_a_range_of_a_log_is_ready_to_copy_and_a_finger_moves_it(opened):

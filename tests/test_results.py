@@ -21,6 +21,7 @@ from synthetic_identification import (
     identified_vehicle,
     synthetic_predictions,
     synthetic_traces,
+    synthetic_trajectories,
     vehicle_traces,
 )
 
@@ -89,7 +90,7 @@ def test_a_file_of_an_older_version_has_a_page_without_the_figures_that_it_lacks
     table = {
         name: each
         for name, each in found.to_dict().items()
-        if name not in ("traces", "correlations", "predictions", "response", "verdicts")
+        if name not in ("traces", "correlations", "predictions", "trajectories", "response", "verdicts")
     }
     (tmp_path / "old.json").write_text(json.dumps(table))
     old = jaxos4.read_result(tmp_path / "old.json")
@@ -103,7 +104,9 @@ def test_predictions_in_a_file_are_few(tmp_path):
     np.testing.assert_array_equal(many.start, synthetic_predictions(4000).start[::4])
     np.testing.assert_allclose(many.predicted, synthetic_predictions(4000).predicted[::4], atol=5.1e-5)
     many = synthetic_predictions(4000).thinned(1200)
-    found = identified_vehicle(predictions=many, traces=vehicle_traces(many.start))
+    some = synthetic_trajectories(4000)
+    some = some._replace(**{name: getattr(some, name)[:40] for name in ("start", "initial", "predicted", "measured")})
+    found = identified_vehicle(predictions=many, trajectories=some, traces=vehicle_traces(many.start))
     written(found, tmp_path / "found.json")
     assert (tmp_path / "found.json").stat().st_size < 5e5
     write_flight_page(tmp_path / "found.html", found)
@@ -142,6 +145,10 @@ WRONG = [
     (("predictions", "start", 0), -1, "`predictions`: starts must increase"),
     (("predictions", "horizons", 0), -1.0, "`predictions`"),
     (("predictions", "measured", 0), [], "`predictions.measured`"),
+    (("trajectories", "start", 1), 6, "`trajectories`: has starts that are not among those of the predictions"),
+    (("predictions",), None, "`trajectories`: has starts"),
+    (("trajectories", "horizons", 24), 9e9, "`trajectories`: horizons must increase"),
+    (("trajectories", "horizons", 3), 0.01, "`trajectories`: horizons must increase"),
     (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
     (("response", "roll", "phase"), [1.0], "`response.roll.phase`: has another shape"),
     (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),

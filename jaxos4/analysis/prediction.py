@@ -35,6 +35,17 @@ class Predictions(NamedTuple):
     predicted: Float[np.ndarray, "starts horizons 3"]
     measured: Float[np.ndarray, "starts horizons 3"]
 
+    @property
+    def breaks(self) -> Int[np.ndarray, " breaks"]:
+        """The places of starts before which a line breaks, because another stretch begins."""
+        steps = np.diff(self.start)
+        return np.flatnonzero(steps > 1.5 * (np.median(steps) if steps.size else 1.0)) + 1
+
+    def at(self, places: slice) -> "Predictions":
+        """The predictions at some of the horizons."""
+        rates = (each[:, places] for each in (self.predicted, self.measured))
+        return Predictions(self.start, self.horizons[places], self.initial, *rates)
+
     def thinned(self, most: int) -> "Predictions":
         """At most `most` starts, evenly chosen, with rates to 1e-4 rad/s. What is not finite is NaN."""
         every = max(-(-self.start.size // most), 1)
@@ -84,6 +95,12 @@ def predictions(
     predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
     measured = rates[start[:, None] + ahead]
     return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead - 1], measured)
+
+
+def trajectory_horizons(dt: float, longest: float = max(HORIZONS), *, every: float = 0.02) -> tuple[float, ...]:
+    """Horizons `every` so many seconds, in whole samples, which draw a trajectory up to the `longest`."""
+    step = max(round(every / dt), 1)
+    return tuple(dt * np.arange(step, max(round(longest / dt), 1) + 1, step))
 
 
 def starts(

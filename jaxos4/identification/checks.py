@@ -48,7 +48,7 @@ from .uncertainty import PROFILE
 from .verdict import CONTRADICTED, RIGID_BODY, Doubt, Move, Quantity, Verdict, outcome, verdict_of
 
 # Predictions that a result keeps: those of four minutes, 200 kB of a page.
-_MOST_STARTS = 1200
+_MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
 _OF_YAW = ("alpha7", "alpha8")
 _NOT_LOWEST = Doubt(
     "max_sweeps",
@@ -73,6 +73,7 @@ class Checked(NamedTuple):
     validation: Validation | None = None
     skill: PredictionSkill | None = None
     predictions: Predictions | None = None
+    trajectories: Predictions | None = None
     response: FrequencyResponse | None = None
     traces: Traces | None = None
     correlations: Correlations | None = None
@@ -124,10 +125,10 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
     if not answer.answered or optimum is None:
         return Checked({}, search, doubts=tuple(doubts_of_log(data.findings)))
     table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
-    predicted = skill = None
+    predicted = paths = skill = None
     if data.held_out is not None:
         progress("predicting what was not fitted")
-        predicted, skill = predict_held_out(data, answer, optimum.noise, data.held_out)
+        predicted, paths, skill = predict_held_out(data, answer, optimum.noise, data.held_out)
     still = () if predicted is None else _still_axes(answer, predicted)
     notes = (
         f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`",
@@ -155,7 +156,7 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
         doubts.insert(0, msgspec.structs.replace(_NOT_LOWEST, moves=dict.fromkeys(quantities)))
     doubts += _doubts_of_search(search, quantities)
     verdicts = verdicts_of(quantities, doubts)
-    predicted = None if predicted is None else predicted.thinned(_MOST_STARTS)
+    predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(data, answer, optimum, predicted)
     return Checked(
         parameters=table,
@@ -166,6 +167,7 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
         notes=notes,
         skill=skill,
         predictions=predicted,
+        trajectories=None if paths is None else paths.thinned(_MOST_TRAJECTORIES),
         traces=traces,
         correlations=correlations,
         response=response,

@@ -12,7 +12,7 @@ from .._custom_types import Numeric, as_float
 from ..analysis.diagnostics import Correlations, residual_correlations, residual_diagnostics
 from ..analysis.evaluation import evaluate
 from ..analysis.open_loop import Traced, traced
-from ..analysis.prediction import Predictions, Skill, predictions, skill
+from ..analysis.prediction import HORIZONS, Predictions, predictions, skill, trajectory_horizons
 from ..analysis.traces import Traces, position_of
 from ..estimate import fit_start
 from ..estimators import EquationError
@@ -31,15 +31,17 @@ REGRESSION = EquationError(memory=0.9)
 
 def predict_held_out(
     data: Data, answer: Answer, noise: LogNoise, held_out: HeldOut
-) -> tuple[Predictions, PredictionSkill]:
+) -> tuple[Predictions, Predictions, PredictionSkill]:
     """Predict the rates of measurements that were not fitted, by the answer and by a regression with the same terms.
 
     The answer, with the `noise` of its filters, predicts the disturbance too, from the measurements before each start.
+
+    **Returns:** its predictions at `HORIZONS`; those between start and end, as trajectories; and the skill.
     """
     problem, names = held_out.problem, answer.problem.unknowns.names
     values = np.asarray(answer.estimate.parameters)[: len(names)]
 
-    def scored(values: np.ndarray, noise: LogNoise | None) -> tuple[Predictions, Skill]:
+    def predicted_by(values: np.ndarray, noise: LogNoise | None, horizons: tuple[float, ...] = HORIZONS) -> Predictions:
         parameters = values
         if held_out.recording is not None:  # the mean of those of which each fitted recording has its own
             shared = np.array([without_recording(name) for name in names])
@@ -47,17 +49,17 @@ def predict_held_out(
         known = None
         if noise is not None:
             known = _traced(data, _together(data, held_out), parameters, noise).disturbance
-        predicted = predictions(problem, as_float(parameters), disturbance=known, noise=noise)
-        return predicted, skill(predicted)
+        return predictions(problem, as_float(parameters), horizons=horizons, disturbance=known, noise=noise)
 
-    predicted, own = scored(values, noise)
-    fixed = [name in answer.fixed for name in names]
-    _, regressed = scored(_regressed(answer.problem, data.room, values, fixed), None)
+    every = predicted_by(values, noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
+    predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
+    own, fixed = skill(predicted), [name in answer.fixed for name in names]
+    regressed = skill(predicted_by(_regressed(answer.problem, data.room, values, fixed), None))
     tables = (own.skill, own.std, own.rmse, own.persistence, regressed.skill)
     rates = {
         rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
     }
-    return predicted, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
+    return predicted, trajectories, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
 
 
 def _together(data: Data, held_out: HeldOut) -> ShootingProblem:

@@ -121,6 +121,7 @@ def describe(
         sample_times=sample_times if len(sample_times) > 1 else (),
         skill=checked.skill,
         predictions=checked.predictions,
+        trajectories=checked.trajectories,
         response=checked.response,
         traces=checked.traces,
         correlations=checked.correlations,

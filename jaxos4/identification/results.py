@@ -204,7 +204,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
-    - `predictions`: the predictions themselves, at most 1,200 starts.
+    - `predictions`: the predictions themselves, at most 1,200 starts. `trajectories`: the same every 20 ms, at most 40.
     - `response`: the frequency response with the fitted data. `None` without an answer.
     """
 
@@ -233,6 +233,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     sample_times: tuple[SampleTime, ...] = ()
     skill: PredictionSkill | None = None
     predictions: Predictions | None = None
+    trajectories: Predictions | None = None
     response: FrequencyResponse | None = None
     traces: Traces | None = None
     correlations: Correlations | None = None
@@ -322,8 +323,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return dataset(*parts, sample_time=step, **about)
 
 
-ARRAYS = ("traces", "correlations", "predictions", "response")
-"""Fields that are arrays by name; the last two of a vehicle only."""
+ARRAYS = ("traces", "correlations", "predictions", "trajectories", "response")
+"""Fields that are arrays by name; those after the second of a vehicle only."""
 APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", *ARRAYS}
 """Fields that a file holds in another form, or not at all."""
 _OF_FLIGHTS = {"fit", "validation"}  # and those of a vehicle: written of this kind only

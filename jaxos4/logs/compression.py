@@ -1,14 +1,14 @@
 """Compressed parts of a bag, measured before they are decompressed: a small file must not fill memory or disk."""
 
 import bz2
-import itertools
 import re
 import struct
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path as FilePath
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, NoReturn
 
+from ..errors import InputError
 from .table import Path, opened, refuse
 
 
@@ -25,7 +25,7 @@ class Limits(NamedTuple):
 
 LIMITS = Limits()
 _STEP = 1 << 20  # bytes that are decompressed at a time
-_MCAP, _CHUNK_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, b"\x05"
+_MCAP, _CHUNK_OF_MCAP, _ATTACHMENT_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, 9, b"\x05"
 
 
 def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
@@ -35,49 +35,60 @@ def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
         with opened(each, "rb") as file:
             begin = file.read(8)
             if begin.startswith(_MCAP):
-                check_parts(path, _mcap_parts(file), limits=limits)
+                check_parts(path, _mcap_parts(path, file, limits, end=1 << 62), limits=limits)
             elif begin == b"#ROSBAG ":
                 file.readline()
-                check_parts(path, _ros1_parts(file), limits=limits)
-            elif each.suffix == ".zstd":
-                pieces = itertools.chain([begin], iter(lambda file=file: file.read(_STEP), b""))
-                if _exceeds("zstd", pieces, limits.file):
-                    what = f"has more than {limits.file:,} bytes when it is decompressed"
-                    refuse(each, f"{what}; record it again in several files (--max-bag-size)")
-                check_parts(path, _parts_inside(each), limits=limits)
+                check_parts(path, _ros1_parts(path, file, limits), limits=limits)
+            else:
+                file.seek(0)
+                _check_whole(each, file, limits)
+
+
+def _check_whole(path: FilePath, packed: IO[bytes], limits: Limits) -> None:
+    """The same for a file that may be compressed as a whole. It is decompressed once, a part at a time."""
+    end = limits.file + 1
+    try:
+        with _zstd().ZstdFile(packed) as file:
+            if file.read(8).startswith(_MCAP):
+                check_parts(path, _mcap_parts(path, file, limits, end=end), limits=limits)
+            too_large = file.seek(end) == end
+    except InputError:
+        raise
+    except Exception:  # noqa: BLE001 - of a damaged file, a decompressor raises any
+        return
+    if too_large:
+        what = f"has more than {limits.file:,} bytes when it is decompressed"
+        refuse(path, f"{what}; record it again in several files (--max-bag-size)")
 
 
 def check_parts(path: Path, parts: Iterable[tuple[str, bytes]], *, limits: Limits = LIMITS) -> None:
     """The same for parts, each the name of its compression and its content."""
-    if any(_exceeds(kind, [content], limits.part) for kind, content in parts):
-        what = f"holds a compressed part of more than {limits.part:,} bytes"
-        refuse(path, f"{what}; record it again in parts of a few megabytes")
+    if any(_exceeds(kind, content, limits.part) for kind, content in parts):
+        _refuse_part(path, limits)
 
 
-def _mcap_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
-    """The compression and the content of each chunk of a file that is open behind its first eight bytes."""
-    while len(head := file.read(9)) == 9:
+def _refuse_part(path: Path, limits: Limits) -> NoReturn:
+    refuse(path, f"holds a part of more than {limits.part:,} bytes; record it again in parts of a few megabytes")
+
+
+def _mcap_parts(path: Path, file: IO[bytes], limits: Limits, *, end: int) -> Iterator[tuple[str, bytes]]:
+    """The compression and the content of each chunk of a file that is open behind its first eight bytes.
+
+    A reader holds each record in memory, except attachments. `end`: nothing is looked at from this byte on.
+    """
+    while file.tell() < end and len(head := file.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
+        if kind != _ATTACHMENT_OF_MCAP and length > limits.part:
+            _refuse_part(path, limits)
         if kind != _CHUNK_OF_MCAP:
-            file.seek(min(length, 1 << 62), 1)
+            file.seek(min(file.tell() + length, end))
             continue
-        chunk = file.read(min(length, 1 << 29))
-        file.seek(min(length, 1 << 62) - len(chunk), 1)
+        chunk = file.read(length)
         (size,) = struct.unpack_from("<I", chunk.ljust(32), 28)
         yield chunk[32 : 32 + size].decode(errors="replace"), chunk[40 + size :]
 
 
-def _parts_inside(path: FilePath) -> Iterator[tuple[str, bytes]]:
-    """The same of an MCAP file that is compressed as a whole."""
-    with _zstd().ZstdFile(path) as file:
-        try:
-            if file.read(8).startswith(_MCAP):
-                yield from _mcap_parts(file)
-        except Exception:  # noqa: BLE001 - of a damaged file, a decompressor raises any
-            return
-
-
-def _ros1_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
+def _ros1_parts(path: Path, file: IO[bytes], limits: Limits) -> Iterator[tuple[str, bytes]]:
     """The same of a bag of ROS 1, behind its first line."""
     while len(head := file.read(4)) == 4:
         header = file.read(struct.unpack("<I", head)[0])
@@ -85,25 +96,26 @@ def _ros1_parts(file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
         if b"op=" + _CHUNK_OF_ROS1 not in header:
             file.seek(length, 1)
             continue
+        if length > limits.part:
+            _refuse_part(path, limits)
         kind = re.search(rb"compression=(none|bz2|lz4)", header)
         yield "" if kind is None else kind[1].decode(), file.read(length)
 
 
-def _exceeds(kind: str, pieces: Iterable[bytes], largest: int) -> bool:
-    """Whether the pieces of one compressed content make more than so many bytes."""
+def _exceeds(kind: str, content: bytes, largest: int) -> bool:
+    """Whether a compressed content makes more than so many bytes."""
     made = _decompressor(kind)
     if made is None:
         return False
     length, decompressor = 0, made()
     try:
-        for content in pieces:
-            while content or not decompressor.needs_input:
-                length += len(decompressor.decompress(content, _STEP))
-                content = b""
-                if length > largest:
-                    return True
-                if decompressor.eof:
-                    content, decompressor = decompressor.unused_data or b"", made()
+        while content or not decompressor.needs_input:
+            length += len(decompressor.decompress(content, _STEP))
+            content = b""
+            if length > largest:
+                return True
+            if decompressor.eof:
+                content, decompressor = decompressor.unused_data or b"", made()
     except Exception:  # noqa: BLE001 - of a damaged part, a decompressor raises any
         return False
     return False

@@ -1,25 +1,28 @@
-"""Figures of what stands behind an estimate, for its page; and of the estimate, for notebooks: `found.plot`."""
+"""The figures of an identification's page."""
 
 import itertools
-from typing import Any, NamedTuple
+import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator, MultipleLocator
 
+from ..airframe import Airframe
 from ..analysis.diagnostics import Correlations
-from ..analysis.frequency_response import HIGHEST, AxisResponse
-from ..analysis.prediction import decisive_horizon
+from ..analysis.frequency_response import HIGHEST, AxisResponse, FrequencyResponse
+from ..analysis.inertia import CenterOfMass
 from ..analysis.traces import Traces
-from ..errors import InputError
 from ..flight import STATE_NAMES
-from ..identification.physical import physical_quantities
-from ..identification.results import Identification
+from ..identification.results import Constant, Identification, SampleTime
 from ..models.state import CASCADE_ORDER
-from .style import BOUND_DASHES, FAINT, INK, Style, grid, label, log_axis, style, styles
+from ..results import NINETY_FIVE
+from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, grid, label, style, ticks_at
 
 
 def priors(found: Identification, look: Style) -> Figure | None:
@@ -161,13 +164,6 @@ GAINS = (0.2, 5.0)
 """The gains that a figure of the response shows."""
 
 INERTIAS: tuple[str, ...] = ("Ix", "Iy", "Iz")
-_RATES = ("p", "q", "r")
-
-
-def gaps(start: Int[np.ndarray, " starts"]) -> tuple[Int[np.ndarray, " gaps"], float]:
-    """The places before which a line breaks, because another stretch begins; and the usual step between starts."""
-    usual = float(np.median(np.diff(start))) if start.size > 1 else 1.0
-    return np.flatnonzero(np.diff(start) > 1.5 * usual) + 1, usual
 
 
 def gain_band(one: AxisResponse) -> Float[np.ndarray, "2 frequencies"]:
@@ -192,77 +188,85 @@ def draw_response(
     panel.axhline(model, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
 
 
-class Plots(NamedTuple):
-    """Figures of an identification. Each method draws on `ax`, or a new one, and returns it, or raises `InputError`."""
-
-    found: Identification
-
-    def rates(self, rate: str = "p", *, horizon: float | None = None, ax: Axes | None = None) -> Axes:
-        """A measured body rate, and what was predicted at the nearest `horizon` [s] before, by default 0.25 s.
-
-        Data that were not fitted. `rate`: `"p"`, `"q"` or `"r"`.
-        """
-        if (ahead := self.found.predictions) is None:
-            raise InputError(
-                "the result has no predictions of data that were not fitted; give `holdout` or `validate`."
-            )
-        column = _place("rate", rate, _RATES)
-        known = np.isfinite(ahead.measured).any(axis=(0, 2))
-        far = None if horizon is None else np.abs(ahead.horizons - horizon)
-        nearest = decisive_horizon(ahead.horizons, known) if far is None else int(far.argmin())
-        time = ahead.start * self.found.provenance.sample_time + ahead.horizons[nearest]
-        columns = np.stack([time, ahead.measured[:, nearest, column], ahead.predicted[:, nearest, column]])
-        time, measured, predicted = np.insert(columns, gaps(ahead.start)[0], np.nan, axis=1)
-        ax = _axes(ax)
-        ax.plot(time, measured, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1], label="measured")
-        label = f"predicted {ahead.horizons[nearest]:.3g} s ahead"
-        ax.plot(time, predicted, color=self._color, linewidth=1.2, label=label)
-        ax.set(xlabel="time [s]", ylabel=f"{rate} [rad/s]")
-        ax.legend()
-        return ax
-
-    def inertias(self, *, ax: Axes | None = None) -> Axes:
-        """The moments of inertia with 95 % intervals, and those of the airframe's file (crosses)."""
-        rows = [row for row in physical_quantities(self.found) if row.name in INERTIAS]
-        if not rows:
-            raise InputError("the result has no moments of inertia.")
-        ax, given = _axes(ax), dict(zip(INERTIAS, np.asarray(self.found.airframe.inertia), strict=True))
-        for place, row in enumerate(rows):
-            ax.plot([place, place], row.ci95, color=self._color if row.trusted else FAINT)
-            ax.plot(place, row.value, "o", color=self._color if row.trusted else FAINT)
-            ax.plot(place, given[row.name], "x", color=INK)
-        ax.set_xticks(range(len(rows)), [row.name for row in rows])
-        ax.set(ylabel="kg m²", xlim=(-0.5, len(rows) - 0.5))
-        return ax
-
-    def response(self, axis: str = "roll", *, ax: Axes | None = None) -> Axes:
-        """The gain of the measured over the modelled angular acceleration, with its 95 % band where it is clear.
-
-        `axis`: `"roll"`, `"pitch"` or `"yaw"`. Dashed: the model.
-        """
-        if (response := self.found.response) is None:
-            raise InputError("the result has no frequency response: it is of an OS4, has no answer, or is older.")
-        one, ax = response[_place("axis", axis, response._fields)], _axes(ax)
-        draw_response(ax, one, one.gain, gain_band(one), 1.0, self._color)
-        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, HIGHEST), ylim=GAINS)
-        for which in ("x", "y"):
-            log_axis(ax, which)
-        return ax
-
-    @property
-    def _color(self) -> str:
-        return styles([self.found.estimator])[self.found.estimator].color
+def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:
+    """The vehicle as it was identified: left from above, front up, right its moments of inertia with 95 % intervals."""
+    figure, (above, bars) = grid(2, columns=2, height=3.4)
+    positions = 1e3 * np.asarray(airframe.rotor_positions, dtype=float)
+    (x, y), distances = positions.T, np.linalg.norm(positions[:, None] - positions, axis=2)
+    radius = 0.42 * distances[distances > 0].min()
+    for i, spin in enumerate(np.asarray(airframe.rotor_spins)):
+        end = 1 - 0.25 * radius / max(math.hypot(x[i], y[i]), radius)  # leaves room for the number
+        above.plot([0, -end * y[i]], [0, end * x[i]], color=FAINT, linewidth=3, zorder=1)
+        above.add_patch(Circle((-y[i], x[i]), radius, facecolor=PAPER, edgecolor=INK, linewidth=1.1))
+        turn = np.radians(np.linspace(200, 200 + 280 * spin, 60))
+        arc = 0.72 * radius * np.stack([np.cos(turn), np.sin(turn)], axis=1) + [-y[i], x[i]]
+        above.plot(*arc.T, color=look.color, linewidth=1.2)
+        above.annotate("", arc[-1], arc[-6], arrowprops={"arrowstyle": "-|>", "color": look.color, "shrinkA": 0})
+        above.text(-y[i], x[i], f"{i + 1}", ha="center", va="center", fontsize=10, fontweight="bold")
+    place = {each.axis: (1e3 * each.value, 1e3 * NINETY_FIVE * each.std) for each in center}
+    (cx, ex), (cy, ey) = (place.get(axis, (0.0, 0.0)) for axis in "xy")
+    above.errorbar(-cy, cx, xerr=ey or None, yerr=ex or None, color=INK, marker="P", markersize=6, capsize=2, zorder=4)
+    above.margins(0.08)
+    above.set_aspect("equal", adjustable="datalim")
+    above.set_title("from above [mm], front up")
+    for row, (name, given) in enumerate(zip(INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
+        bars.plot([given, given], [row - 0.36, row + 0.36], color=INK, linewidth=1.4, linestyle=BOUND_DASHES[2])
+        if name not in constants:
+            bars.text(0, row, "  not identified", va="center")
+            continue
+        value, half = constants[name].estimate, NINETY_FIVE * constants[name].std
+        bars.barh(row, value, height=0.5, color=look.color, alpha=0.35)
+        bars.errorbar(value, row, xerr=half, color=look.color, capsize=4, marker=look.marker)
+    bars.set_yticks(range(3), INERTIAS)
+    bars.tick_params(axis="y", length=0, pad=8)
+    bars.set_ylim(2.6, -0.6)
+    bars.set_xlim(left=0)
+    bars.grid(axis="y", visible=False)
+    bars.set_title("moments of inertia [kg m²], 95 %")
+    return figure
 
 
-def _place(argument: str, value: str, names: tuple[str, ...]) -> int:
-    if value not in names:
-        raise InputError(f"`{argument}`: must be one of {', '.join(names)}, got {value!r}.")
-    return names.index(value)
+def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
+    """Gain, phase and coherence of each axis with 95 % bands, faint where they are not clear; dashed: the model."""
+    figure, panels = grid(9, columns=3, height=1.9)
+    top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
+    for row, (name, axis) in enumerate(found._asdict().items()):
+        gain, phase, coherence = panels[3 * row : 3 * row + 3]
+        degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
+        draw_response(gain, axis, axis.gain, gain_band(axis), 1.0, look.color)
+        draw_response(phase, axis, degrees, np.array([degrees - spread, degrees + spread]), 0.0, look.color)
+        coherence.plot(axis.frequency, axis.coherence, color=look.color)
+        gain.set_yscale("log")
+        gain.set_ylim(GAINS)
+        ticks_at(gain.yaxis, (0.2, 0.5, 1, 2, 5))
+        phase.set_ylim(-180, 180)
+        phase.yaxis.set_major_locator(MultipleLocator(90))
+        coherence.set_ylim(0, 1.03)
+        for panel, title in ((gain, "gain"), (phase, "phase [degrees]"), (coherence, "coherence")):
+            panel.set_title(f"{name}: {title}")
+            panel.set_xscale("log")
+            panel.set_xlim(1.0, top)
+            ticks_at(panel.xaxis, (1, 2, 5, 10, 20, 40))
+    label(figure, x="frequency [Hz]")
+    return figure
 
 
-def _axes(ax: Axes | None) -> Axes:
-    if ax is not None:
-        return ax
-    from matplotlib import pyplot  # chooses how figures are shown
-
-    return pyplot.subplots()[1]
+def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: Style) -> Figure:
+    """Ix, Iy, Iz at each sample time with 95 % intervals. Lines: the `chosen` one [s], and its moments of inertia."""
+    figure, panels = grid(3, columns=3, height=2.4)
+    ticks = [1e3 * each.sample_time for each in answers]
+    for panel, name in zip(panels, INERTIAS, strict=True):
+        rows = {each.sample_time: each.constants[name] for each in answers if name in each.constants}
+        for sample_time, row in rows.items():
+            if math.isclose(sample_time, chosen):
+                panel.axhline(row.estimate, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[2])
+        times, values = [1e3 * sample_time for sample_time in rows], [row.estimate for row in rows.values()]
+        errors = [NINETY_FIVE * row.std for row in rows.values()]
+        panel.errorbar(times, values, yerr=errors, markersize=4, capsize=3, **look.line)
+        panel.axvline(1e3 * chosen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
+        panel.set_title(f"{name} [kg m²]" if rows else f"{name}: not identified")
+        panel.set_xscale("log")
+        panel.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
+        ticks_at(panel.xaxis, ticks)
+    label(figure, x="sample time [ms]")
+    return figure

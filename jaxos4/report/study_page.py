@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from .._files import check_writable, write_file
 from ..study import metrics
-from . import study_tables
+from . import one_flight, study_tables
 from .html import Drawing, draw as draw_panels, render, swatch
 from .study_tables import best_estimators, bounds, error_unit, names, positive_scales, scenarios
 from .style import BOUND_DASHES, INK, Style, drawing, estimator_gid, grid, label, legend, log_axis, scale_axis, styles
@@ -30,11 +30,16 @@ def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
     every, drawings, sections = list(scenarios(dataset)), [], []
+    of_one = one_flight.is_of_one(dataset)
+    figures = {"intervals": one_flight.intervals} if of_one else SCENARIO_FIGURES
     for number, title, data in every:
-        shown = SCENARIO_FIGURES if number <= MOST_DRAWN else {}
+        shown = figures if number <= MOST_DRAWN else {}
         drawings.append(draw(shown, data, f"-{number}" if len(every) > 1 else ""))
         found = {"number": number, "label": title, "figures": drawings[-1], "best": best_estimators(data)}
         found |= {"tables": study_tables.scenario_tables(data), "trouble": study_tables.troubled_flights(data)}
+        if of_one:
+            found |= {"outcomes": one_flight.outcomes(data), "best": {}}
+            found["tables"]["estimates"] = one_flight.estimates(data)
         sections.append(found)
     estimators, attributes = names(dataset, "estimator"), {name: str(x) for name, x in dataset.attrs.items()}
     missing, cells = study_tables.cells_not_run(dataset)
@@ -48,6 +53,7 @@ def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
         bounds=list(bounds(dataset))[: len(BOUND_DASHES)],
         swatches=[swatch(look) for look in styles(estimators).values()],
         sections=sections,
+        of_one=of_one,
         level=f"{100 * study_tables.shown_level(dataset):g} %",
         failed=study_tables.failed_cells(dataset),
         missing=missing,

@@ -5,6 +5,7 @@
   if (!box) return;
   const given = JSON.parse(box.dataset.signals), { pieces, shaded } = given;
   const list = document.getElementById("view"), range = document.getElementById("range");
+  const slider = document.getElementById("start");
   const last = pieces[pieces.length - 1], whole = [pieces[0][0], last[0] + last[2] - last[1]];
   let shown = whole, plots = [];
 
@@ -12,6 +13,7 @@
   const times = (text) => Array.from(new Float32Array(bytes(text)));
   const values = ([middle, step, text]) =>
     Array.from(new Int16Array(bytes(text)), (level) => (level === -32768 ? null : middle + step * level));
+  const integers = (text) => Array.from(new Int16Array(bytes(text)));
   const text = (value) => (value == null ? "–" : String(Number(value.toPrecision(4))));
   // Labels have as many decimals as the distance of the ticks.
   function labels(places, step) {
@@ -57,6 +59,7 @@
   // Grey where a part is not used or not fitted; a line where another part or log begins, with its name above.
   function background(plot) {
     const { ctx, bbox } = plot, x = (at) => plot.valToPos(at, "x", true);
+    const low = plot.scales.x.min, first = pieceAt(low)[3]; // of the logs that began before, one has a name
     ctx.save();
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
@@ -68,7 +71,7 @@
     pieces.forEach(([at, , , name], i) => {
       const isNew = i === 0 || name !== pieces[i - 1][3];
       if (i) ctx.fillRect(x(at) - devicePixelRatio, bbox.top, (isNew ? 2 : 1) * devicePixelRatio, bbox.height);
-      if (name && isNew && plot === plots[0]) {
+      if (name && isNew && plot === plots[0] && (at >= low || name === first)) {
         ctx.fillText(name, Math.max(x(at), bbox.left) + 4 * devicePixelRatio, bbox.top + 12 * devicePixelRatio);
       }
     });
@@ -86,6 +89,7 @@
       width: line.color ? 1.6 : 1,
       dash: line.dash,
       points: { show: false },
+      spanGaps: line.joined ?? false,
     }));
     const bands = [];
     if (half) {
@@ -114,20 +118,59 @@
     plots.push(new uPlot(options, [time, ...y], box));
   }
 
+  // Of the predictions from many starts, only those from the chosen one are drawn.
+  function chosen(line, start) {
+    const found = values(line.values), number = Number(slider?.value);
+    if (!start || line.color == null) return { ...line, values: found };
+    return { ...line, values: found.map((value, i) => (start[i] === number ? value : null)), joined: true };
+  }
+
+  // Times and lines of each panel of a view, with the earlier samples that all views have.
+  function merged(view) {
+    const before = given.common.includes(view) ? null : given.before, head = before ? times(before.time) : [];
+    const start = view.start && integers(view.start), all = [...head, ...times(view.time)];
+    const order = all.map((_, i) => i).sort((i, j) => all[i] - all[j]);
+    const panels = view.panels.map((panel, k) => ({
+      ...panel,
+      lines: panel.lines.map((each, j) => {
+        const line = chosen(each, start);
+        const earlier = before && j === 0 ? values(before.panels[k].lines[0].values) : head.map(() => null);
+        const both = [...earlier, ...line.values];
+        return { ...line, values: order.map((i) => both[i]) };
+      }),
+    }));
+    return { time: order.map((i) => all[i]), panels };
+  }
+
+  // A start was chosen: what follows it is shown.
+  function reach() {
+    const view = given.views[list.selectedIndex], several = view.start != null;
+    slider.parentElement.hidden = !several;
+    if (several) {
+      const start = integers(view.start), number = Number(slider.value);
+      const at = times(view.time).filter((_, i) => start[i] === number);
+      const low = at[0], high = at[at.length - 1], length = 4 * (high - low), middle = (low + high) / 2;
+      slider.max = Math.max(...start);
+      slider.setAttribute("aria-valuetext", slider.nextElementSibling.textContent = `${own(low).toFixed(2)} s`);
+      const isNear = shown[0] < low && high < shown[1] && shown[1] - shown[0] < 2 * length;
+      if (!isNear) shown = [middle - length / 2, middle + length / 2];
+    }
+    draw();
+  }
+
   function draw() {
     plots.forEach((each) => each.destroy());
     plots = [];
     const views = given.views.length ? [given.views[list.selectedIndex], ...given.common] : given.common;
     for (const view of views) {
-      const time = times(view.time);
-      for (const panel of view.panels) {
-        const lines = panel.lines.map((line) => ({ ...line, values: values(line.values) }));
-        plot(panel.title, 160, time, lines, panel.half);
-        if (panel.residual) {
+      const { time, panels } = merged(view);
+      for (const { title, lines, half, residual } of panels) {
+        plot(title, 160, time, lines, half);
+        if (residual) {
           const [first, other] = [lines[0].values, lines[lines.length - 1].values];
           const left = first.map((value, i) => (value == null || other[i] == null ? null : value - other[i]));
-          const color = lines[lines.length - 1].color;
-          plot("residual", 95, time, [{ label: "measured - predicted", values: left, color, dash: [] }], 0);
+          const { color, joined } = lines[lines.length - 1];
+          plot("residual", 95, time, [{ label: "measured - predicted", values: left, color, joined, dash: [] }], 0);
         }
       }
     }
@@ -170,7 +213,9 @@
   document.getElementById("copy")?.addEventListener("click", () => navigator.clipboard?.writeText(range.textContent));
   list?.replaceChildren(...given.views.map(({ name }, i) => new Option(name, i, i === given.shown, i === given.shown)));
   if (list) list.parentElement.hidden = given.views.length < 2;
-  list?.addEventListener("change", draw);
+  box.parentElement.querySelector(".tools").hidden = false;
+  list?.addEventListener("change", reach);
+  slider?.addEventListener("input", reach);
   document.addEventListener("theme", draw);
   addEventListener("resize", () => {
     for (const each of plots) each.setSize({ width: box.clientWidth, height: each.height });

@@ -1,22 +1,14 @@
-"""Signals on one time axis without gaps, which `timeline.js` draws on a page and zooms together; those of a result."""
+"""Signals on one time axis without gaps, which `timeline.js` draws on a page and zooms together."""
 
 import base64
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..analysis.prediction import Predictions, decisive_horizon
-from ..analysis.traces import Traces
-from ..errors import printable
-from ..flight import STATE_NAMES, STATE_UNITS
-from ..identification.results import Identification
-from ..models.state import CASCADE_ORDER
-from .identification_figures import gaps
-from .style import BOUND_DASHES, Style, style
+from .style import Style
 
 _LEVELS = 65_000  # of a packed number, which takes two bytes
 
@@ -44,11 +36,16 @@ class Panel(NamedTuple):
 
 
 class View(NamedTuple):
-    """Panels of the same samples. `time`: of each sample on the axis [s], see `Axis.place`."""
+    """Panels of the same samples.
+
+    - `time`: of each sample on the axis [s], see `Axis.place`.
+    - `start`: of a prediction from many starts, the number of that of each sample. Those from a chosen one are drawn.
+    """
 
     name: str
     time: Float[np.ndarray, " samples"]
     panels: Sequence[Panel]
+    start: Int[np.ndarray, " samples"] | None = None
 
 
 class Axis(NamedTuple):
@@ -121,6 +118,7 @@ def signals(
     common: Sequence[View],
     views: Sequence[View] = (),
     *,
+    before: View | None = None,
     shown: int = 0,
     shaded: Sequence[tuple[float, float]] = (),
     names: Sequence[str] = (),
@@ -128,6 +126,7 @@ def signals(
     """The data that `timeline.js` draws, as JSON.
 
     - `common`: views below the chosen one of `views`. `shown`: the number of the first that is chosen.
+    - `before`: earlier samples of the first lines of all `views`.
     - `shaded`: from when to when the background is grey, on the axis. `names`: of the logs, if there are several.
     """
     several = np.ptp(axis.log) > 0
@@ -136,6 +135,7 @@ def signals(
         {
             "pieces": pieces,
             "shaded": [[round(x, 4) for x in each] for each in shaded],
+            "before": None if before is None else _view(before),
             "views": [_view(each) for each in views],
             "common": [_view(each) for each in common],
             "shown": shown,
@@ -149,6 +149,7 @@ def _view(view: View) -> dict[str, Any]:
     return {
         "name": view.name,
         "time": base64.b64encode(view.time[order].astype("<f4").tobytes()).decode(),
+        "start": None if view.start is None else base64.b64encode(view.start[order].astype("<i2").tobytes()).decode(),
         "panels": [
             {
                 "title": panel.title,
@@ -176,92 +177,3 @@ def _packed(values: Float[np.ndarray, " samples"]) -> list[Any]:
     step = (high - low) / _LEVELS or 1.0
     levels = np.where(finite, np.rint((np.where(finite, values, low) - low) / step) - _LEVELS // 2, -(1 << 15))
     return [low + step * (_LEVELS // 2), step, base64.b64encode(levels.astype("<i2").tobytes()).decode()]
-
-
-BAND = 0.95
-"""The share of the errors that the band of the predictions holds."""
-# Channels of an OS4 that are shown together, in cascade order.
-_GROUPS = {"rates": (0, 1, 2), "attitude": (3, 4, 5), "position": (6, 8, 10), "velocity": (7, 9, 11)}
-
-Times = Float[np.ndarray, " samples"]
-
-
-def identified_signals(found: Identification, look: Style) -> str:
-    """The signals of a result's page, as JSON; empty if the result has none.
-
-    A vehicle has a view for each horizon of its predictions, an OS4 one for each group of channels.
-    """
-    traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
-    if traces is None:
-        return ""
-    validate, shown, shaded = found.provenance.validate or "", 0, []
-    axis = _axis(traces, ahead)
-    time, known = axis.place(traces.time, traces.log), np.asarray(np.isfinite(traces.measured).any(axis=1))
-    if traces.predicted.shape[1]:
-        views = [
-            View(name, time, [_panel(i, traces.measured[:, i], traces.predicted[:, i], look) for i in group])
-            for name, group in _GROUPS.items()
-            if group[0] < traces.predicted.shape[1]
-        ]
-    elif ahead is not None:
-        views = [_horizon(traces, ahead, i, axis, known, look) for i in range(ahead.horizons.size)]
-        shown = decisive_horizon(ahead.horizons, np.isfinite(ahead.measured).any(axis=(0, 2)))
-        shaded = spans(time, known)
-    else:
-        views = [View("rates", time, [_panel(i, traces.measured[:, i], None, look) for i in range(3)])]
-    names = [printable(Path(name).name) for name in (*found.logs, validate)]
-    common = View("", time, _common(traces))
-    return signals(axis, [common] * bool(common.panels), views, shown=shown, shaded=shaded, names=names)
-
-
-def _axis(traces: Traces, ahead: Predictions | None) -> Axis:
-    """The axis of all logs, with the moments that are predicted."""
-    starts, longest = traces.start_time, 0.0 if ahead is None else float(ahead.horizons.max())
-    time = np.concatenate([traces.time, starts, starts + longest])
-    log = np.concatenate([traces.log, traces.start_log, traces.start_log])
-    order = np.lexsort([time, log])
-    return Axis.of(time[order], log[order])
-
-
-def _panel(channel: int, measured: Times, predicted: Times | None, look: Style, half: float = 0.0) -> Panel:
-    """Measured and predicted values of a channel, counted in cascade order, and the residual below."""
-    column = CASCADE_ORDER[channel]
-    lines = [Line("measured", measured)] + ([] if predicted is None else [Line("predicted", predicted, look)])
-    return Panel(f"{STATE_NAMES[column]} [{STATE_UNITS[column]}]", lines, half, residual=predicted is not None)
-
-
-def _common(traces: Traces) -> list[Panel]:
-    """The inputs, and the disturbances of a vehicle."""
-    panels = []
-    if np.isfinite(traces.rotors).any():
-        rotors = [Line(f"rotor {i + 1}", column, style(i)) for i, column in enumerate(traces.rotors.T)]
-        panels.append(Panel("inputs [rad/s]", rotors))
-    gusts = [
-        Line(name, each, style(i)) for i, (name, each) in enumerate(zip("pqr", traces.disturbance.T, strict=False))
-    ]
-    return [*panels, Panel("gusts [rad/s²]", gusts)] if gusts else panels
-
-
-def _horizon(
-    traces: Traces, ahead: Predictions, place: int, axis: Axis, fitted: Bool[np.ndarray, " samples"], look: Style
-) -> View:
-    """The predictions so far ahead, between the measurements that were fitted."""
-    horizon, half = float(ahead.horizons[place]), prediction_band(ahead)[place]
-    # A line breaks where measurements are held out, of which the first one is kept as missing, and between predictions
-    # that are not of one stretch.
-    kept, breaks = fitted | np.diff(fitted, prepend=False), gaps(ahead.start)[0]
-    start = axis.place(traces.start_time + horizon, traces.start_log)
-    start = np.insert(start, breaks, (start[breaks - 1] + start[breaks]) / 2)
-    both = (np.insert(each[:, place], breaks, np.nan, axis=0) for each in (ahead.measured, ahead.predicted))
-    nothing = np.full((np.count_nonzero(kept), 3), np.nan)
-    before = np.where(fitted[kept, None], traces.measured[kept, :3], np.nan), nothing
-    time = np.concatenate([axis.place(traces.time[kept], traces.log[kept]), start])
-    measured, predicted = (np.concatenate(each) for each in zip(before, both, strict=True))
-    panels = [_panel(i, measured[:, i], predicted[:, i], look, float(half[i])) for i in range(3)]
-    return View(f"{horizon:.3g} s ahead", time, panels)
-
-
-def prediction_band(ahead: Predictions) -> Float[np.ndarray, "horizons 3"]:
-    """Half the width of the band that holds 95 % of the errors, by horizon and rate [rad/s]."""
-    errors = np.abs(ahead.predicted - ahead.measured)
-    return np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), BAND, axis=0)

@@ -70,6 +70,8 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         "fitted_seconds": 32.0,
         "notes": ["t is not uniform"],
     }
+    if "predictions" in changes:
+        changes = {"trajectories": None} | changes
     given = {
         "model": "flight",
         "is_vehicle": True,
@@ -80,6 +82,7 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         "noise": {"p": 0.41},
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
         "predictions": synthetic_predictions(),
+        "trajectories": synthetic_trajectories(),
         "traces": vehicle_traces(),
         "response": synthetic_response(),
         "provenance": Provenance(**VERSIONS | settings | (provenance or {})),
@@ -100,11 +103,16 @@ def synthetic_response() -> FrequencyResponse:
     return FrequencyResponse(axis(1.25, 1.0), axis(0.5, 0.9), axis(1.0, 0.03))
 
 
-def synthetic_predictions(starts=160) -> Predictions:
+def synthetic_trajectories(starts=160) -> Predictions:
+    """Every fourth of `synthetic_predictions` with these starts, each 20 ms."""
+    return synthetic_predictions(starts, 0.02 * np.arange(1, 26)).thinned(starts // 4)
+
+
+def synthetic_predictions(starts=160, horizons=(0.1, 0.248, 0.5)) -> Predictions:
     """Predictions in two stretches. One measurement is missing."""
     start = 5 + 12 * np.arange(starts)
     start[starts // 2 :] += 300
-    horizons = np.array([0.1, 0.248, 0.5])
+    horizons = np.array(horizons)
     time = 0.004 * start[:, None, None] + horizons[:, None] + 0.7 * np.arange(3)
     measured = np.sin(3 * time)
     measured[3, 1, 0] = np.nan

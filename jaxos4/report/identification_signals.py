@@ -1,0 +1,117 @@
+"""The signals of an identification on the time axis of its page."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..analysis.prediction import Predictions, decisive_horizon
+from ..analysis.traces import Traces
+from ..errors import printable
+from ..flight import STATE_NAMES, STATE_UNITS
+from ..identification.results import Identification
+from ..models.state import CASCADE_ORDER
+from .style import BOUND_DASHES, Style, style
+from .timeline import Axis, Line, Panel, View, signals, spans
+
+BAND = 0.95
+"""The share of the errors that the band of the predictions holds."""
+# Channels of an OS4 that are shown together, in cascade order.
+_GROUPS = {"rates": (0, 1, 2), "attitude": (3, 4, 5), "position": (6, 8, 10), "velocity": (7, 9, 11)}
+
+Times = Float[np.ndarray, " samples"]
+
+
+def identified_signals(found: Identification, look: Style) -> str:
+    """The signals of a result's page, as JSON; empty if the result has none.
+
+    A vehicle has a view for each horizon of its predictions, and one of trajectories. An OS4 has one for each group of
+    channels.
+    """
+    traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
+    if traces is None:
+        return ""
+    validate, shown, shaded, before = found.provenance.validate or "", 0, [], None
+    axis = _axis(traces, ahead)
+    time, known = axis.place(traces.time, traces.log), np.asarray(np.isfinite(traces.measured).any(axis=1))
+    if traces.predicted.shape[1]:
+        views = [
+            View(name, time, [_panel(i, traces.measured[:, i], traces.predicted[:, i], look) for i in group])
+            for name, group in _GROUPS.items()
+            if group[0] < traces.predicted.shape[1]
+        ]
+    elif ahead is not None:
+        views = [_horizon(traces, ahead, i, axis, look) for i in range(ahead.horizons.size)]
+        if (paths := found.trajectories) is not None:
+            views.append(_trajectories(traces, ahead, paths, axis, look))
+        shown = decisive_horizon(ahead.horizons, np.isfinite(ahead.measured).any(axis=(0, 2)))
+        shaded = spans(time, known)
+        # Of the samples that were held out, the first is kept, as missing: the line breaks there.
+        kept = known | np.diff(known, prepend=False)
+        before = View("", time[kept], [_panel(i, traces.measured[kept, i], None, look) for i in range(3)])
+    else:
+        views = [View("rates", time, [_panel(i, traces.measured[:, i], None, look) for i in range(3)])]
+    names = [printable(Path(name).name) for name in (*found.logs, validate)]
+    common = View("", time, _common(traces))
+    return signals(axis, [common] * bool(common.panels), views, before=before, shown=shown, shaded=shaded, names=names)
+
+
+def _axis(traces: Traces, ahead: Predictions | None) -> Axis:
+    """The axis of all logs, with the moments that are predicted."""
+    starts, longest = traces.start_time, 0.0 if ahead is None else float(ahead.horizons.max())
+    time = np.concatenate([traces.time, starts, starts + longest])
+    log = np.concatenate([traces.log, traces.start_log, traces.start_log])
+    order = np.lexsort([time, log])
+    return Axis.of(time[order], log[order])
+
+
+def _panel(channel: int, measured: Times, predicted: Times | None, look: Style, half: float = 0.0) -> Panel:
+    """Measured and predicted values of a channel, counted in cascade order, and the residual below."""
+    column = CASCADE_ORDER[channel]
+    lines = [Line("measured", measured)] + ([] if predicted is None else [Line("predicted", predicted, look)])
+    return Panel(f"{STATE_NAMES[column]} [{STATE_UNITS[column]}]", lines, half, residual=predicted is not None)
+
+
+def _common(traces: Traces) -> list[Panel]:
+    """The inputs, and the disturbances of a vehicle."""
+    panels = []
+    if np.isfinite(traces.rotors).any():
+        rotors = [Line(f"rotor {i + 1}", column, style(i)) for i, column in enumerate(traces.rotors.T)]
+        panels.append(Panel("inputs [rad/s]", rotors))
+    gusts = [
+        Line(name, each, style(i)) for i, (name, each) in enumerate(zip("pqr", traces.disturbance.T, strict=False))
+    ]
+    return [*panels, Panel("gusts [rad/s²]", gusts)] if gusts else panels
+
+
+def _horizon(traces: Traces, ahead: Predictions, place: int, axis: Axis, look: Style) -> View:
+    """The predictions so far ahead. The line breaks between predictions that are not of one stretch."""
+    horizon, half, breaks = float(ahead.horizons[place]), prediction_band(ahead)[place], ahead.breaks
+    start = axis.place(traces.start_time + horizon, traces.start_log)
+    start = np.insert(start, breaks, (start[breaks - 1] + start[breaks]) / 2)
+    measured, predicted = (np.insert(x[:, place], breaks, np.nan, axis=0) for x in (ahead.measured, ahead.predicted))
+    panels = [_panel(i, measured[:, i], predicted[:, i], look, float(half[i])) for i in range(3)]
+    return View(f"{horizon:.3g} s ahead", start, panels)
+
+
+def _trajectories(traces: Traces, ahead: Predictions, paths: Predictions, axis: Axis, look: Style) -> View:
+    """The predictions from each start, of which one is chosen, beside all that was measured meanwhile."""
+    place = np.searchsorted(ahead.start, paths.start)
+    begin, log = traces.start_time[place], traces.start_log[place]
+    # A trajectory that ends before the next one begins is followed by a sample without values.
+    horizons = np.concatenate([[0.0], paths.horizons, [paths.horizons[-1] + 1e-4]])
+    kept = np.ones((place.size, horizons.size), bool)
+    kept[:-1, -1] = (np.diff(begin) > horizons[-1]) | (np.diff(log) != 0)
+    start = np.broadcast_to(np.arange(place.size)[:, None], kept.shape)[kept]
+    measured, predicted = (
+        np.concatenate([paths.initial[:, None], each, np.full((place.size, 1, 3), np.nan)], axis=1)[kept]
+        for each in (paths.measured, paths.predicted)
+    )
+    panels = [_panel(i, measured[:, i], predicted[:, i], look) for i in range(3)]
+    return View("from one start", axis.place((begin[:, None] + horizons)[kept], log[start]), panels, start)
+
+
+def prediction_band(ahead: Predictions) -> Float[np.ndarray, "horizons 3"]:
+    """Half the width of the band that holds 95 % of the errors, by horizon and rate [rad/s]."""
+    errors = np.abs(ahead.predicted - ahead.measured)
+    return np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), BAND, axis=0)
