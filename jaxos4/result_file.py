@@ -111,9 +111,11 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
             yield "`covariance`: a correlation exceeds 1"
     if not all(each > 0 for each in (found.provenance.sample_time, *(x.sample_time for x in found.sample_times))):
         yield "`sample_time`: is not positive"
-    levels = found.disturbances.values()
-    if not all(each.smoothing is None or 0 < each.smoothing < each.time_constant for each in levels):
-        yield "`disturbances`: `smoothing` is not shorter than `time_constant`"
+    for name, each in found.disturbances.items():
+        if each.time_constant <= 0 or min(each.strength, each.sensor) < 0:
+            yield f"`disturbances.{name}`: a time constant is not positive, or a standard deviation is negative"
+        if each.smoothing is not None and (name in "pqr" or not 0 < each.smoothing < each.time_constant):
+            yield f"`disturbances.{name}`: `smoothing` is of a rate, or not between 0 and `time_constant`"
     constants = [found.rigid_body.constants, *(each.constants for each in found.sample_times)]
     deviations = [row.std for table in constants for row in table.values()]
     if any(std is not None and std < 0 for std in (*deviations, *(row.std for row in found.parameters.values()))):

@@ -156,7 +156,7 @@ def test_a_log_that_holds_every_run_of_the_controller_has_no_feedthrough():
     assert not np.asarray(own.likelihood.input_innovations).any()
     assert np.asarray(longer.likelihood.input_innovations).any()
     assert np.asarray(slower.likelihood.input_innovations).any()
-    assert float(slower.flight.flight.averaging_time) == 0.0
+    assert float(slower.problem.flight.averaging_time) == 0.0
     assert own.likelihood.input_innovations.shape == longer.likelihood.input_innovations.shape  # they share a program
 
 

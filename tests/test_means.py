@@ -177,10 +177,10 @@ def answers(logged="speeds", **settings):
     fits = jaxos4.VehicleSettings(terms=terms, holdout=0.0)
     found = []
     for data in prepare_vehicle(as_recordings(flight), CINERAT, fits).data:
-        if round(1e3 * float(data.flight.flight.dt)) in (8, 32):
+        if round(1e3 * float(data.problem.flight.dt)) in (8, 32):
             answer = jaxos4.FilterError(tolerance=1e-3)(data.likelihood)
             values = zip(answer.parameters.tolist(), answer.std.tolist(), strict=True)
-            found.append(dict(zip(data.flight.model.parameter_names, values, strict=False)))
+            found.append(dict(zip(data.problem.model.parameter_names, values, strict=False)))
     assert len(found) == 2
     return found
 

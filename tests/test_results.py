@@ -35,7 +35,10 @@ FULL = {
     "sample_times": SAMPLE_TIMES,
     "covariance": [[1.0, 0.0], [0.0, 4.0]],
     "widened": {"alpha3": 1.7},
-    "disturbances": {"p": Disturbance(1.2, "rad/s^2", 0.1, 0.02, 0.01)},
+    "disturbances": {
+        "p": Disturbance(1.2, "rad/s^2", 0.1, 0.02, 0.01),
+        "az": Disturbance(0.3, "m/s^2", 0.3, 0.1, 0.01, smoothing=0.05),
+    },
     "correlations": behind_an_estimate()["correlations"],
 }
 
@@ -162,7 +165,10 @@ WRONG = [
     (("skill", "horizons"), [0.1], "`skill`"),
     (("constants", "Ix", "std"), -1.0, "`std`: is negative"),
     (("constants", "other"), 1.0, "'other' is no name"),
-    (("disturbances", "p", "smoothing"), 0.2, "`disturbances`: `smoothing` is not shorter than `time_constant`"),
+    (("disturbances", "p", "smoothing"), 0.05, "`disturbances.p`: `smoothing` is of a rate"),
+    (("disturbances", "az", "smoothing"), 0.3, "`disturbances.az`: `smoothing` is of a rate, or not between 0"),
+    (("disturbances", "az", "time_constant"), 0.0, "`disturbances.az`: a time constant is not positive"),
+    (("disturbances", "az", "sensor"), -0.1, "`disturbances.az`: a time constant is not positive, or a standard"),
     (("sample_times", 0, "sample_time"), 0.0, "`sample_time`: is not positive"),
     (("cost",), float("nan"), "`cost`"),
     (("airframe", "mass"), -1.0, "`mass` must be"),

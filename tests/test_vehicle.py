@@ -215,7 +215,7 @@ def test_the_factor_of_the_jackknife_multiplies_that_of_the_profile():
     place = answer.problem.unknowns.names.index("alpha8")
     uneven = eqx.tree_at(lambda e: e.parts.gradient, answer.optimum.estimate, replace_fn=lambda x: 4 * x)
     optimum = answer.optimum._replace(estimate=uneven)
-    one, both = (corrected(optimum, data.flight, data.clock.log, factors) for factors in ({}, {"alpha8": 1.3}))
+    one, both = (corrected(optimum, data, factors) for factors in ({}, {"alpha8": 1.3}))
     assert one.widened != {}
     np.testing.assert_allclose(both.estimate.std[place], 1.3 * one.estimate.std[place])
     others = np.arange(one.estimate.std.size) != place

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import vehicle
+from jaxos4.identification import uncertainty
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
 from jaxos4.identification.sample_time import moved, sample_time_of, search_sample_times, shortest
-from jaxos4.identification.uncertainty import Profile, at_lowest, corrected
+from jaxos4.identification.uncertainty import Profile, corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
@@ -117,7 +117,7 @@ def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
 
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
-    monkeypatch.setattr(vehicle, "at_lowest", functools.partial(at_lowest, rules=Profile(well_known=0.0)))
+    monkeypatch.setattr(uncertainty, "PROFILE", Profile(well_known=0.0))
     with compiled_programs() as programs:
         found = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))
     np.testing.assert_allclose([each.sample_time for each in found.sample_times], [0.004, 0.008, 0.016, 0.032])
@@ -171,7 +171,7 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     data = data_of(flown(), 2 * DT)
     (optimum,) = search_sample_times([data], SOLVER)
-    answer = corrected(optimum, data.flight, data.clock.log)
+    answer = corrected(optimum, data)
     assert set(sample_time_of(answer).constants) == {"Ix", "Iy", "Iz"}
     place = answer.problem.model.parameter_names.index("thrust_gain")
     unknown = np.asarray(answer.estimate.covariance).copy()
@@ -312,7 +312,7 @@ def test_shifted_clocks_give_the_same_inertias():
         data = data_of(dataclasses.replace(flight, omega=np.asarray(flight.omega)[rows]), DT)
         answer = SOLVER(data.likelihood)
         values = zip(answer.parameters.tolist(), answer.std.tolist(), strict=True)
-        found[shift] = dict(zip(data.flight.model.parameter_names, values, strict=False))
+        found[shift] = dict(zip(data.problem.model.parameter_names, values, strict=False))
     for shift in (-5, 5):
         for name in ("alpha3", "alpha6"):
             (value, std), (own, _) = found[shift][name], found[0][name]

@@ -150,7 +150,7 @@ def fitted():
     case = prepare_vehicle([flight], OS4, settings)
     data = case.data[0]
     optimum = search(jaxos4.FilterError(tolerance=1e-3), data.likelihood)
-    return case, Solution(data, corrected(optimum, data.flight, data.clock.log))
+    return case, Solution(data, corrected(optimum, data))
 
 
 def test_a_parameter_at_another_value_moves_the_others(fitted):

@@ -31,8 +31,8 @@ def open_loop(
 ) -> Motion:
     """The motion after each step. Nothing is measured any more, and the disturbance fades.
 
-    - `advance(motion, row, added)`: the motion after one step. Disturbances add `added` to the rates, and to the
-      specific forces in the mean over the step.
+    - `advance(motion, row, added)`: the motion after one step. `added`: what disturbances add to each rate over the
+      step, and the mean of each specific force that they add.
     - `disturbance`, `force`: of each channel, and the forces besides the model's, at the start as filters know them.
     - `rows`: the forcing of each step.
     - `gusts`: what each channel and its disturbance gain in each step besides.

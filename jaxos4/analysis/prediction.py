@@ -90,9 +90,9 @@ def predictions(
     start, initial = starts(flight, horizons)
     rate_problem = dataclasses.replace(problem, channels="rates", windows=1, initial_state=None, length=None)
     pushed = np.zeros(rates.shape) if disturbance is None else disturbance
-    fading = as_float(np.zeros(3) if noise is None else np.asarray(noise.time_constant)[:3])
+    levels = LogNoise(*np.zeros((3, 3))) if noise is None else jax.tree.map(lambda leaf: np.asarray(leaf)[:3], noise)
     begin = start, initial, pushed[start]
-    predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
+    predicted = np.asarray(_predict(rate_problem, parameters, *begin, levels, int(ahead.max())))
     measured = rates[start[:, None] + ahead]
     return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead - 1], measured)
 
@@ -136,11 +136,12 @@ def _predict(
     start: Int[Numeric, " starts"],
     initial: Float[Numeric, "starts 3"],
     disturbance: Float[Numeric, "starts 3"],
-    log_time: Float[Array, "3"],
+    noise: LogNoise,
     steps: int,
 ) -> Float[Array, "starts steps 3"]:
     model, scalars, forcing = problem.model, tuple(parameters), problem.forcing(parameters)
-    moved, calm = transition(LogNoise(log_time, log_time, log_time), problem.flight.dt), jnp.zeros((steps, 3, 2))
+    fading = transition(jax.tree.map(as_float, noise), problem.flight.dt)
+    calm = jnp.zeros((steps, 3, 2))
 
     def fly(first: Int[Array, ""], measured: Array, disturbance: Array) -> Float[Array, "steps 3"]:
         rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
@@ -155,7 +156,7 @@ def _predict(
 
         driving = jax.tree.map(lambda leaf: leaf[:-1], rows)
         start = Rates(*(measured - gyro_bias(model, measured, begin, scalars)))
-        return jax.vmap(observed)(open_loop(advance, start, disturbance, driving, calm, moved, jnp.zeros(0)), later)
+        return jax.vmap(observed)(open_loop(advance, start, disturbance, driving, calm, fading, jnp.zeros(0)), later)
 
     return jax.vmap(fly)(jnp.asarray(start), jnp.asarray(initial), jnp.asarray(disturbance))
 

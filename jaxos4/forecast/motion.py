@@ -58,8 +58,8 @@ class Known(NamedTuple):
     """The knowledge at each sample, or at one.
 
     - `state`: as measured, as in `PARTS`.
-    - `driven`, `disturbance`: rates, and specific forces besides the model's, of the filters, and what drives them
-      [rad/s; m/s^2], [rad/s^2; m/s^2].
+    - `driven`: the filters' rates and unexplained specific forces [rad/s; m/s^2]. `disturbance`: what drives these
+      [rad/s^2; m/s^2].
     - `unsure`: the standard deviation of each offset, see `Futures`.
     """
 
@@ -277,7 +277,10 @@ def _offset_weights(
     channels = np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
     strength, time_constant = (jnp.full(6, x) for x in (tuning.push, tuning.push_time))
     strength = strength.at[channels].set(jnp.exp(noise.strength))
-    time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant))
+    smoothing = (
+        0.0 if noise.smoothing is None else jnp.where(np.arange(noise.strength.size) < 3, 0.0, jnp.exp(noise.smoothing))
+    )
+    time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant) + smoothing)
     is_known, prior = ~jnp.isnan(accelerations), jnp.square(prior)
     total, squares = _past(is_known, kept), _past(is_known, kept**2)
     count = jnp.maximum(total, 1.0)

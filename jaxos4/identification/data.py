@@ -43,7 +43,7 @@ class Data(Generic[L]):
     """Flights as they are fitted, the measurements that test the answer, and what is known of both.
 
     - `likelihood`: with its bracket; that of a vehicle is padded.
-    - `flight`: the flight and its model.
+    - `problem`: the flight and its model.
     - `clock`: of each sample of a vehicle's logs; empty for an OS4.
     - `provenance`: data, settings and versions. `seconds`: how long the fitted measurements of a vehicle last [s].
     - `held_out`: what is not fitted, if there is anything.
@@ -51,7 +51,7 @@ class Data(Generic[L]):
     """
 
     likelihood: L
-    flight: ShootingProblem
+    problem: ShootingProblem
     clock: Clock
     provenance: Provenance
     seconds: float = 0.0

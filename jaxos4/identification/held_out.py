@@ -66,7 +66,7 @@ def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
     """The problem with all measurements: those that were fitted, and those that were held out of the same flight."""
     if held_out.recording is not None:
         return held_out.problem
-    own, others = np.asarray(held_out.problem.flight.states), np.asarray(data.flight.flight.states)
+    own, others = np.asarray(held_out.problem.flight.states), np.asarray(data.problem.flight.states)
     both = as_float(np.where(np.isnan(own), others, own))
     return eqx.tree_at(lambda p: p.flight.states, held_out.problem, both)
 

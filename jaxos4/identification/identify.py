@@ -94,35 +94,24 @@ def describe(
     """Everything about an answer, in the fields that pages and files show. `seconds`: the time that it took [s]."""
     (data, answer, sample_times), free = solution, solution.answer.free
     covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
-    sigma = np.asarray(answer.problem.sigma)
+    sigma, fields = np.asarray(answer.problem.sigma), checked._asdict()
+    notes = fields.pop("notes")
     return Identification(
         estimator=case.name,
         model=case.model,
-        result=checked.result,
         rollouts=answer.rollouts,
         cost=finite_or_none(answer.estimate.cost),
         seconds=seconds,
-        parameters=checked.parameters,
-        rigid_body=checked.rigid_body,
-        verdicts=checked.verdicts,
-        doubts=checked.doubts,
-        provenance=msgspec.structs.replace(data.provenance, notes=[*data.provenance.notes, *checked.notes]),
+        provenance=msgspec.structs.replace(data.provenance, notes=[*data.provenance.notes, *notes]),
         covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
         airframe=answer.problem.model.airframe,
         estimate=answer.estimate,
         problem=answer.problem,
         is_vehicle=case.is_vehicle,
-        fit=checked.fit,
-        validation=checked.validation,
         held=answer.fixed,
         noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in answer.problem.columns},
         disturbances=answer.disturbances,
         widened=answer.widened,
         sample_times=sample_times if len(sample_times) > 1 else (),
-        skill=checked.skill,
-        predictions=checked.predictions,
-        trajectories=checked.trajectories,
-        response=checked.response,
-        traces=checked.traces,
-        correlations=checked.correlations,
+        **fields,
     )

@@ -184,13 +184,7 @@ def _has_own_channels(kind: type[AbstractEstimator]) -> bool:
     return kind.looks_at != "all" and not kind.needs_network
 
 
-def fit_flight(
-    estimator: AbstractEstimator,
-    problem: ShootingProblem,
-    *,
-    progress: Progress = silent,
-    rules: NoiseLevels = NOISE_LEVELS,
-) -> Answer:
+def fit_flight(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> Answer:
     """Estimate the parameters and the noise levels of one flight.
 
     The noise levels follow from the residuals, and the fit is repeated with them. The covariance of an estimator that
@@ -204,14 +198,14 @@ def fit_flight(
         return jax.block_until_ready(estimator(shared))
 
     estimates = [search(problem, 0)]
-    for number in range(1, rules.passes + 2):
+    for number in range(1, NOISE_LEVELS.passes + 2):
         last, before = estimates[-1], np.asarray(problem.sigma)
         if not has_answer(last):
             break
         problem = problem.reweighted(evaluate(problem, last.parameters, last.initial_state).errors)
-        settled = (np.abs(np.asarray(problem.sigma) / before - 1) < rules.settled).all()
+        settled = (np.abs(np.asarray(problem.sigma) / before - 1) < NOISE_LEVELS.settled).all()
         failed = estimator.shoots and bool(last.result != RESULTS.successful)
-        is_last = settled or failed or number > rules.passes
+        is_last = settled or failed or number > NOISE_LEVELS.passes
         if not is_last or not estimator.shoots:
             estimates.append(search(problem, number))
         if is_last:

@@ -132,7 +132,7 @@ class RateSkill(msgspec.Struct, frozen=True):
 class Disturbance(msgspec.Struct, frozen=True):
     """The disturbance of a channel: all that acts on it besides the model.
 
-    - `strength`: standard deviation, in `unit`. `time_constant`: of its correlation [s].
+    - `strength`: standard deviation, in `unit`. `time_constant`: of the Ornstein-Uhlenbeck process [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
     - `correlation`: the largest correlation of innovations up to 8 samples apart; near 0 if the noise is as modelled.
     - `smoothing`: the time constant of the low-pass filter through which the disturbance of a specific force acts [s].
@@ -144,6 +144,11 @@ class Disturbance(msgspec.Struct, frozen=True):
     sensor: float
     correlation: float
     smoothing: float | None = None
+
+    @property
+    def correlation_time(self) -> float:
+        """The integral of the autocorrelation over positive lags [s]."""
+        return self.time_constant + (self.smoothing or 0.0)
 
 
 class SampleTime(msgspec.Struct, frozen=True):

@@ -57,44 +57,42 @@ def search_sample_times(
     """
     optimum, optima = None, []
     for data in reversed(several):
-        progress(f"fitting samples of {1e3 * float(data.flight.flight.dt):.3g} ms")
+        progress(f"fitting samples of {1e3 * float(data.problem.flight.dt):.3g} ms")
         start = None if optimum is None else start_of(data.likelihood, optimum.first)
         optimum = search(estimator, data.likelihood, start=start)
         optima.insert(0, optimum)
     return optima
 
 
-def start_of(
-    likelihood: InnovationsProblem, found: Estimate, rule: SampleTimeRule = RULE
-) -> Float[np.ndarray, " unknowns"] | None:
+def start_of(likelihood: InnovationsProblem, found: Estimate) -> Float[np.ndarray, " unknowns"] | None:
     """The start of a search, by the estimate for longer samples; `None` if that is no minimum."""
     own, start = likelihood.problem.unknowns, np.asarray(found.parameters)
     off = np.abs(start[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
     # Near a limit, the answer may be another minimum.
-    is_minimum = str(result_names(found.result)) == "successful" and (off < rule.near * REACH).all()
+    is_minimum = str(result_names(found.result)) == "successful" and (off < RULE.near * REACH).all()
     return start if is_minimum else None
 
 
-def shortest(rows: Sequence[SampleTime], rule: SampleTimeRule = RULE) -> int:
+def shortest(rows: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `rows`: the shortest sample time first."""
     answered = [i for i, row in enumerate(rows) if row.constants] or [0]
-    limits = [rule.white + rule.chance / math.sqrt(max(row.samples, 1)) for row in rows]
+    limits = [RULE.white + RULE.chance / math.sqrt(max(row.samples, 1)) for row in rows]
     clean = [i for i in answered if abs(rows[i].correlation) <= limits[i]] or answered[-1:]
-    steady = (i for i in clean[:-1] if not moved(rows[i], rows[i + 1], rule) and not _vague(rows[i], rows[i + 1], rule))
+    steady = (i for i in clean[:-1] if not moved(rows[i], rows[i + 1]) and not _vague(rows[i], rows[i + 1]))
     return next(steady, clean[0])
 
 
-def _vague(row: SampleTime, other: SampleTime, rule: SampleTimeRule) -> bool:
+def _vague(row: SampleTime, other: SampleTime) -> bool:
     """Whether another sample time knows Ix or Iy clearly better."""
     both = [name for name in ("Ix", "Iy") if name in row.constants and name in other.constants]
-    return any(row.constants[name].std > rule.wider * other.constants[name].std for name in both)
+    return any(row.constants[name].std > RULE.wider * other.constants[name].std for name in both)
 
 
-def moved(row: SampleTime, other: SampleTime, rule: SampleTimeRule = RULE) -> list[str]:
+def moved(row: SampleTime, other: SampleTime) -> list[str]:
     """The moments of inertia that another sample time contradicts."""
 
     def differs(one: Constant, two: Constant) -> bool:
-        return abs(one.estimate - two.estimate) > rule.agree * max(one.std, two.std) + rule.discrete * one.estimate
+        return abs(one.estimate - two.estimate) > RULE.agree * max(one.std, two.std) + RULE.discrete * one.estimate
 
     both = [name for name in row.constants if name in other.constants]
     return [name for name in both if differs(row.constants[name], other.constants[name])]

@@ -119,7 +119,6 @@ def search(
     *,
     start: Float[np.ndarray, " unknowns"] | None = None,
     progress: Progress = silent,
-    rules: Pretests = PRETESTS,
 ) -> Optimum:
     """The optimum without the parameters that came out negative, or near their plain values.
 
@@ -134,14 +133,16 @@ def search(
         spent += int(first.rollouts)
     optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
     optimum = optimum._replace(likelihood=likelihood.passing(optimum.parts.passed))
-    optimum = _without_negative(estimator, optimum, progress, rules)
-    return _at_plain_values(estimator, optimum, progress, rules)
+    optimum = _without_negative(estimator, optimum, progress)
+    return _at_plain_values(estimator, optimum, progress)
 
 
-def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress, rules: Pretests) -> Optimum:
+def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
     """The parameters that are negative, though physics forbids it, fixed at 0."""
     negative = {
-        row.name: (value, std) for row, value, std in _rows(before) if row.nonnegative and value < -rules.negative * std
+        row.name: (value, std)
+        for row, value, std in _rows(before)
+        if row.nonnegative and value < -PRETESTS.negative * std
     }
     if not negative:
         return before
@@ -153,18 +154,18 @@ def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: P
     return after._replace(negative=negative, freed=freed)
 
 
-def _at_plain_values(estimator: AbstractEstimator, before: Optimum, progress: Progress, rules: Pretests) -> Optimum:
+def _at_plain_values(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
     """The parameters near their plain values fixed there, unless that clearly raises the cost."""
     plain = {
         row.name: row.plain
         for row, value, std in _rows(before)
-        if row.plain is not None and std > 0 and abs(value - row.plain) < rules.near * std
+        if row.plain is not None and std > 0 and abs(value - row.plain) < PRETESTS.near * std
     }
     if not plain:
         return before
     progress("fitting again without what the flights hardly show")
     after = before.restricted(estimator, plain)
-    if has_answer(after.estimate) and after.cost - before.cost < rules.rise:
+    if has_answer(after.estimate) and after.cost - before.cost < PRETESTS.rise:
         return after._replace(plain=tuple(plain))
     return before._replace(rollouts=after.rollouts)
 

@@ -24,7 +24,7 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
 from ..results import NINETY_FIVE
-from ..shooting import InnovationsProblem, ShootingProblem
+from ..shooting import InnovationsProblem
 from .answers import INVERSE, Answer
 from .data import Data, Progress, silent
 from .results import FixedParameter, has_answer
@@ -69,26 +69,18 @@ class Profile(NamedTuple):
 JACKKNIFE, PROFILE = Jackknife(), Profile()
 
 
-def corrected(
-    optimum: Optimum,
-    flight: ShootingProblem,
-    recording: Int[np.ndarray, " samples"],
-    profile: Mapping[str, float] = {},
-) -> Answer:
+def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping[str, float] = {}) -> Answer:
     """The answer of a search: its intervals corrected, and without the parameters that are not identifiable.
 
     A parameter about which the flights say less than the bracket is not estimated.
 
-    **Arguments:**
-
-    - `flight`: the flight and its model. `recording`: the number of the recording of each sample.
-    - `profile`: the factors of the profile, by parameter.
+    `profile`: the factors of the profile, by parameter.
     """
     names, units, values = optimum.whole.names, optimum.whole.units, optimum.values
     notes, jackknife, longer = dict.fromkeys(optimum.plain, _PLAIN_NOTE), np.ones(values.size), np.ones(values.size)
     if has_answer(optimum.estimate):
         free = np.flatnonzero(~np.isin(names, [*optimum.plain, *optimum.negative]))
-        jackknife[free] = _widening(optimum, free, recording)
+        jackknife[free] = _widening(optimum, free, data.clock.log)
         longer[: len(names)] = [profile.get(name, 1.0) for name in names]
         std = (jackknife * longer)[: len(names)] * optimum.std
         known = np.asarray(is_identifiable(std, np.asarray(optimum.whole.half_width), GAUSSIAN_PRIOR))
@@ -98,11 +90,11 @@ def corrected(
         return {name: float(x) for name, x in zip(names, factor, strict=False) if x > 1 and name not in notes}
 
     covariance = as_float(optimum.covariance * np.outer(jackknife * longer, jackknife * longer))
-    sigma = np.array(flight.sigma)
-    sigma[flight.columns] = np.exp(optimum.noise.sensor)
+    sigma = np.array(data.problem.sigma)
+    sigma[data.problem.columns] = np.exp(optimum.noise.sensor)
     sigma = as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0))
     return Answer(
-        problem=eqx.tree_at(lambda p: p.sigma, flight, sigma),
+        problem=eqx.tree_at(lambda p: p.sigma, data.problem, sigma),
         estimate=eqx.tree_at(lambda e: e.covariance, optimum.estimate, covariance),
         bound=optimum.std,
         rollouts=optimum.rollouts,
@@ -120,27 +112,26 @@ def at_lowest(
     estimator: AbstractEstimator,
     *,
     progress: Progress = silent,
-    rules: Profile = PROFILE,
 ) -> Answer:
     """The answer at the lowest minimum that was found, its intervals corrected by the profile too.
 
     A search that did not converge has no profile.
     """
-    for left in reversed(range(rules.minima)):
-        answer, factors, lower = corrected(optimum, data.flight, data.clock.log), {}, None
+    for left in reversed(range(PROFILE.minima)):
+        answer, factors, lower = corrected(optimum, data), {}, None
         if not optimum.converged:
             return answer
-        poor = optimum.std > rules.well_known * np.abs(optimum.values[: optimum.whole.count])
+        poor = optimum.std > PROFILE.well_known * np.abs(optimum.values[: optimum.whole.count])
         for place in sorted({*INVERSE.values()} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
-            reach, end = upper_end(optimum, place, rules)
+            reach, end = upper_end(optimum, place)
             optimum = optimum._replace(rollouts=end.rollouts)
-            if end.converged and optimum.cost - end.cost > rules.lower:
+            if end.converged and optimum.cost - end.cost > PROFILE.lower:
                 lower = end.values
                 break
             factors[optimum.whole.names[place]] = max(reach / NINETY_FIVE, 1.0)
         if lower is None:
-            return corrected(optimum, data.flight, data.clock.log, factors)
+            return corrected(optimum, data, factors)
         if not left:
             break
         progress("fitting again where the cost is lower")
@@ -151,10 +142,10 @@ def at_lowest(
         optimum = optimum._replace(rollouts=rollouts)
         if not is_lower:
             break
-    return corrected(optimum._replace(is_lowest=False), data.flight, data.clock.log)
+    return corrected(optimum._replace(is_lowest=False), data)
 
 
-def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> tuple[float, Optimum]:
+def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
     """The end of the interval of one parameter by its profile likelihood.
 
     If no fit at an end succeeds, the end is that of the covariance. If a later fit fails, the end is extrapolated from
@@ -162,21 +153,21 @@ def upper_end(optimum: Optimum, place: int, rules: Profile = PROFILE) -> tuple[f
 
     **Returns:** the end in standard deviations above the optimum, and the last fit at an end.
     """
-    solver, covariance = FilterError(tolerance=rules.tolerance), np.asarray(optimum.estimate.covariance)
+    solver, covariance = FilterError(tolerance=PROFILE.tolerance), np.asarray(optimum.estimate.covariance)
     # How the minimum moves with this parameter, in steps of its standard deviation.
     along = covariance[:, place] / np.sqrt(covariance[place, place])
     unknowns, at, root, reach, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
-    for _ in range(rules.fits):
+    for _ in range(PROFILE.fits):
         unknowns, before, at = unknowns + (reach - at) * along, at, reach
         fixed = {optimum.whole.names[place]: float(unknowns[place])}
         other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
         rise, unknowns, last = other.cost - optimum.cost, other.values, root
-        if not other.converged or rise < -rules.lower:
+        if not other.converged or rise < -PROFILE.lower:
             break
         root = np.sqrt(max(2 * rise, 0.0))
-        reach = at + (NINETY_FIVE - root) / max((root - last) / (at - before), rules.slope)
+        reach = at + (NINETY_FIVE - root) / max((root - last) / (at - before), PROFILE.slope)
         reach = float(np.clip(reach, at / 2, 2 * at))
-        if abs(root - NINETY_FIVE) < rules.close:
+        if abs(root - NINETY_FIVE) < PROFILE.close:
             break
     return reach, other
 
@@ -198,12 +189,10 @@ def _widening(
     return np.max([np.ones(free.size), *ways], axis=0)
 
 
-def parts_of(
-    lanes: int, recording: Int[np.ndarray, " lanes"], rules: Jackknife = JACKKNIFE
-) -> list[Int[np.ndarray, " lanes"]]:
+def parts_of(lanes: int, recording: Int[np.ndarray, " lanes"]) -> list[Int[np.ndarray, " lanes"]]:
     """The ways to divide lanes into parts: into blocks of neighbours, and into recordings if there are enough."""
-    ways = [np.arange(lanes) * min(lanes, rules.most) // lanes, recording]
-    return [way for way in ways if np.unique(way).size >= rules.fewest]
+    ways = [np.arange(lanes) * min(lanes, JACKKNIFE.most) // lanes, recording]
+    return [way for way in ways if np.unique(way).size >= JACKKNIFE.fewest]
 
 
 def disagreement(
@@ -211,7 +200,6 @@ def disagreement(
     information: Float[np.ndarray, "lanes unknowns unknowns"],
     prior: Float[np.ndarray, "unknowns unknowns"],
     part: Int[np.ndarray, " lanes"],
-    rules: Jackknife = JACKKNIFE,
 ) -> Float[np.ndarray, " unknowns"]:
     """By how much parts disagree: the jackknife's standard error over the likelihood's; at least 1.
 
@@ -244,4 +232,4 @@ def disagreement(
     likelihood = np.diagonal(np.linalg.inv(whole / np.outer(scale, scale))) / scale**2
     ratio = variance / likelihood
     freedom = numbers.size - 1
-    return np.sqrt(np.where(ratio > chdtri(freedom, rules.chance) / freedom, np.maximum(ratio, 1.0), 1.0))
+    return np.sqrt(np.where(ratio > chdtri(freedom, JACKKNIFE.chance) / freedom, np.maximum(ratio, 1.0), 1.0))

@@ -84,7 +84,7 @@ class VehicleCase:
         solver, is_default = FilterError(tolerance=LIKELIHOODS.tolerance), self.estimator == DEFAULT
         compared = self.data if is_default or len(self.data) > 1 else ()
         optima = search_sample_times(compared, solver, progress=progress)
-        answers = [corrected(x, data.flight, data.clock.log) for x, data in zip(optima, compared, strict=True)]
+        answers = [corrected(x, data) for x, data in zip(optima, compared, strict=True)]
         rows = [sample_time_of(answer) for answer in answers]
         place = shortest(rows) if self.choose and rows else 0
         data = self.data[place]
@@ -136,7 +136,7 @@ def prepare_vehicle(
     prepared = prepare(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
-    # All sample times share one program, with room for the shortest.
+    # All sample times share one program, with room for the shortest, the finest.
     data = [
         _data(recordings, airframe, settings, each, prepared[0], bracket=bracket, validate=validate)
         for each in prepared
@@ -149,7 +149,7 @@ def _data(
     airframe: Airframe,
     settings: VehicleSettings,
     prepared: Prepared,
-    room: Prepared,
+    finest: Prepared,
     *,
     bracket: Intervals,
     validate: Recording | None,
@@ -183,8 +183,8 @@ def _data(
         **versions(shooting),
     )
     return Data(
-        likelihood=_innovations(shooting, prepared, room),
-        flight=shooting,
+        likelihood=_innovations(shooting, prepared, finest),
+        problem=shooting,
         provenance=provenance,
         seconds=prepared.seconds[0],
         held_out=held_out,
@@ -203,7 +203,7 @@ def with_estimator(
     if not ESTIMATORS[estimator].needs_network:
         return data, make_estimator(estimator)
     progress("training a network for these flights")
-    begin, seen = time.perf_counter(), liveliest(data.flight)
+    begin, seen = time.perf_counter(), liveliest(data.problem)
     name, method = str((data.provenance.flights or ["flight"])[0]), IBSS()
     try:
         method = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)
@@ -222,15 +222,15 @@ def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingPro
     )
 
 
-def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) -> InnovationsProblem:
-    """The likelihood of a vehicle, in a program for all flights that are not longer than `room`."""
+def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared) -> InnovationsProblem:
+    """The likelihood of a vehicle, in a program for all flights that are not longer than the `finest`."""
     recordings = max(prepared.recordings) + 1
     # Segments are as many for all sample times, and last a while at the longest.
-    seconds = float(room.fitted.dt) * room.fitted.time.shape[0]
+    seconds = float(finest.fitted.dt) * finest.fitted.time.shape[0]
     most = LIKELIHOODS.segments * max(recordings // LIKELIHOODS.recordings, 1)
     segments = int(np.clip(seconds / LIKELIHOODS.seconds, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
-    capacity = capacity_of(room.fitted.time.shape[0])
+    capacity = capacity_of(finest.fitted.time.shape[0])
     padded, inputs = with_room(shooting, capacity), _input_innovations(shooting, capacity)
     return InnovationsProblem(padded, segments=segments, least_noise=least_noise, input_innovations=inputs)
 

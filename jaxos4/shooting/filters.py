@@ -123,6 +123,27 @@ class _Carry(NamedTuple):
     sums: Innovations
 
 
+class _Segmented(NamedTuple):
+    """A flight in segments, see `innovate`."""
+
+    observed: Observed
+    inputs: Float[Array, "time feedthroughs channels segments"]
+    forcing: Forcing
+    forcing_tangents: Forcing | None
+    rows: Count | int
+    dt: Scalar
+    window: Window
+
+
+class _At(NamedTuple):
+    """The unknowns at which a flight is filtered, see `innovate`."""
+
+    parameters: Float[Array, "parameters *segments"]
+    noise: LogNoise
+    feedthrough: tuple[Float[Array, " channels *segments"], ...]
+    passed: tuple[Float[Array, " channels *segments"], ...]
+
+
 def innovate(
     functions: Functions,
     observed: Observed,
@@ -153,17 +174,15 @@ def innovate(
       parameters at the positions `forcing_parameters`.
     - `window`: what a measurement averages.
     """
-    flight, at = (
-        (observed, input_innovations, forcing, forcing_tangents, rows, dt, window),
-        (parameters, noise, feedthrough, passed),
-    )
+    flight = _Segmented(observed, input_innovations, forcing, forcing_tangents, rows, dt, window)
+    at = _At(parameters, noise, feedthrough, passed)
     return with_batch(_innovate, _innovate_lanes, functions, forcing_parameters, flight, at)
 
 
 def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
     """The innovations of a batch, whose lanes become segments: each lane's segments stand next to each other."""
     (moving, _, flight, at), (fixed, positions, fixed_flight, fixed_at) = many, shared
-    segments = eqx.combine(flight, fixed_flight)[0].measured.shape[-1]
+    segments = eqx.combine(flight, fixed_flight).observed.measured.shape[-1]
 
     def lanes_before_last(one: Any, same: Any) -> Any:
         one = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2), one)
@@ -181,7 +200,9 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         same = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else jnp.repeat(leaf[:, None], segments, 1), same)
         return lanes_before_last(one, same)
 
-    *series, rows, dt, window = flight
+    def of_each_segment(one: Any, same: Any) -> Any:
+        return eqx.combine(jax.tree.map(repeated, one), same)
+
     own = jax.tree.map(repeated, moving)
 
     def each(which: int) -> Callable:
@@ -190,26 +211,23 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
 
         return function
 
-    rows = fixed_flight[4] if rows is None else rows.max()  # in the rows of other lanes, nothing counts
-    dt, window = (
-        eqx.combine(jax.tree.map(repeated, one), same) for one, same in zip((dt, window), fixed_flight[5:], strict=True)
-    )
-    flight = *lanes_before_last(tuple(series), tuple(fixed_flight[:4])), rows, dt, window
+    rows = fixed_flight.rows if flight.rows is None else flight.rows.max()  # in the rows of other lanes, nothing counts
+    observed, inputs, forcing, tangents = lanes_before_last(flight[:4], fixed_flight[:4])
+    dt, window = (of_each_segment(*pair) for pair in zip(flight[5:], fixed_flight[5:], strict=True))
+    flight = _Segmented(observed, inputs, forcing, tangents, rows, dt, window)
     functions = each(0), each(1), each(2)
     found = _filter(functions, positions, flight, in_each_segment(at, fixed_at))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
 
 
-def _innovate(functions: Functions, positions: tuple[int, ...], flight: tuple, at: Any) -> Innovations:
+def _innovate(functions: Functions, positions: tuple[int, ...], flight: _Segmented, at: _At) -> Innovations:
     """The innovations of one flight."""
-    own = None if at[0].ndim == 1 else 0
+    own = None if at.parameters.ndim == 1 else 0
     move, average, observe = (jax.vmap(function, in_axes=(0, 0, own)) for function in functions)
     return _filter((move, average, observe), positions, flight, at)
 
 
-def _filter(
-    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise, tuple, tuple]
-) -> Innovations:
+def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: _Segmented, at: _At) -> Innovations:
     """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
     parameters, noise, feedthrough, passed = at

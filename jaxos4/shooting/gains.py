@@ -30,7 +30,7 @@ RATES = CHANNELS["rates"]
 """The number of body rates, which come first among the channels."""
 # Standard deviation of the rates before the first measurement of a segment [rad/s]: as good as unknown.
 _UNKNOWN_RATE = 1e3
-# Nodes of the quadrature over each part of a sample: exact to rounding, as it is shorter than four time constants.
+# Nodes of the quadrature over each part of a sample: exact to nine digits, as it is shorter than four time constants.
 _NODES = 8
 # The time constant of the low-pass filter of a force that has none [s].
 _NO_FILTER = 1e-9
@@ -93,7 +93,7 @@ class Gains(NamedTuple):
 
 
 class Covariance(NamedTuple):
-    """Variance of x, the rate or force that is driven, its covariance with the disturbance, and that one's variance."""
+    """Variance of x, covariance of x and d, and variance of d."""
 
     driven: Channels
     cross: Channels
@@ -101,7 +101,7 @@ class Covariance(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """The disturbance and what it drives over one sample, without noise.
+    """d and x over one sample, without noise.
 
     - `kept`, `driven_kept`: the shares of d and of x that remain. `reach`: what a unit of d adds to x.
     """
@@ -116,7 +116,7 @@ class Step(NamedTuple):
 
     - `moved`: see there.
     - `driven_seen`, `seen`: what a unit of x and of d adds to the measurement.
-    - `since_seen`: the share of what is measured of x that remains at the end of the sample.
+    - `since_seen`: x at the end of the sample, for each unit of x in the measurement.
     - `added`: the covariance that its noise adds at the end of the sample.
     - `noise`: the variance that its noise adds to the measurement; `with_driven`, `with_disturbance`: the covariance
       with x and d at the end.
@@ -145,10 +145,7 @@ def _is_rate(leaf: Array) -> Array:
 
 
 class _Response(NamedTuple):
-    """The response of a channel to a unit of x or of d after a time [s]. `driven` is that of x to d.
-
-    The difference of the exponentials is computed as one, so that a fast filter loses no digits.
-    """
+    """The response of a channel to a unit of x or of d after a time [s]. `driven` is that of x to d."""
 
     time_constant: Channels
     smoothing: Channels
@@ -349,6 +346,11 @@ class NoiseUnknowns(NamedTuple):
         least_noise: Float[Array, " channels"],
     ) -> Unknowns:
         """The parameters, then noise and feedthroughs of each channel, in brackets from differences of measurements."""
+        if self.longest_smoothing >= self.shortest_of_force:
+            raise ValueError(
+                f"`longest_smoothing` must be shorter than `shortest_of_force`, {self.shortest_of_force} s, "
+                f"got {self.longest_smoothing} s."
+            )
         first = jnp.stack(first_noise(measured, dt, self.times[0])[:3], axis=1)
         count, rate, shortest = levels(first.shape[0]), is_rate(first.shape[0]), jnp.log(self.shortest * dt)
         smoothing = jnp.full((first.shape[0], count - first.shape[1]), np.log(self.smoothing))

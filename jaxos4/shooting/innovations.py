@@ -238,8 +238,8 @@ class InnovationsProblem(AbstractProblem):
             values = row[0]
             feedthrough = self._of_channels(values)[:, self._levels :]
             found = innovations(values[:count], self.noise(values), feedthrough, passed)
-            own = found.gradient.shape[1] - len(self._own)
-            gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, own)
+            shared = found.gradient.shape[1] - len(self._own)
+            gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, shared)
             if places is not None:
                 gradient, information = placed(gradient, information, places, free.size)
             off = values - unknowns.center

@@ -266,8 +266,17 @@ class ShootingProblem(AbstractProblem):
             model = parts[0](*data) if len(parts) == 1 else jax.lax.switch(place[stage], parts, *data)
             return model.restricted(searched[stage])
 
-        off, last, counts = self.initial_guess.off, number - 1, plan.measurements
-        return Stages(self.unknowns, off, number, 0, last, local_model, searched, counts, plan.smallest_step)
+        return Stages(
+            unknowns=self.unknowns,
+            off=self.initial_guess.off,
+            number=number,
+            first=0,
+            whole=number - 1,
+            local_model=local_model,
+            searched=searched,
+            measurements=plan.measurements,
+            smallest_step=plan.smallest_step,
+        )
 
     def _model_of_part(
         self, part: "ShootingProblem", rows: Rows, parameters: Array, own: Array, length: Length
