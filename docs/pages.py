@@ -22,6 +22,7 @@ PAGES = {
 PLACES = {}
 EQUATION = LatexToMathML(annotation=True)
 OBJECT = re.compile(r"^::: jaxos4\.((?:\w+\.)*)(\w+)$", flags=re.MULTILINE)
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 COMMAND = re.compile(r"(jaxos4|python3?|pip|bash|source|export|\.venv/\S+)\b| +\S")
 
 
@@ -72,12 +73,16 @@ def on_env(env, config, files):
 
 
 def on_post_page(output, page, config):
-    """Links each name of the package in a text to the API reference; a function only if `jaxos4.` is before it."""
+    """Keeps options on one line, and links names to the API reference; a function only if `jaxos4.` is before it."""
 
     def linked(code):
         place = PLACES.get(code[2]) if code[1] or code[2][0].isupper() else None
         return f'<a href="{get_relative_url(place, page.url)}">{code[0]}</a>' if place else code[0]
 
+    def unbroken(code):
+        return OPTION.sub(r'<span class="option">\g<0></span>', code[0])
+
+    output = re.sub(r"<code>.*?</code>", unbroken, output, flags=re.DOTALL)
     return re.sub(r'(?<!">)<code>(jaxos4\.)?([\w.]+)(?:\(\))?</code>', linked, output)
 
 
