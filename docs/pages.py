@@ -46,7 +46,7 @@ def on_pre_page(page, config, files):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Typesets equations, and marks what wraps on a narrow screen: commands, and lines wider than a terminal."""
+    """Typesets equations, and marks what wraps on a narrow screen: commands, and lines wider than a page."""
 
     def marked(block):
         language, lines = block[1], block[2].splitlines()
@@ -55,7 +55,7 @@ def on_page_markdown(markdown, page, config, files):
             return f'<div class="equation">{equation}</div>'
         if not language and all(COMMAND.match(line) for line in lines):
             language = "sh"
-        elif not language and max(map(len, lines), default=0) > 110:
+        elif not language and max(map(len, lines), default=0) > 96:
             language = " { .text .wide }"
         return f"```{language}\n{block[2]}```"
 
@@ -93,5 +93,5 @@ def commands() -> str:
         name = command.name or command.callback.__name__
         with contextlib.redirect_stdout(io.StringIO()) as said:
             app([name, "--help"], prog_name="jaxos4", standalone_mode=False)
-        text += f"\n## {name}\n\n```\n{said.getvalue().strip()}\n```\n"
+        text += f"\n## {name}\n\n```text\n{said.getvalue().strip()}\n```\n"
     return text
