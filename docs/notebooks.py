@@ -69,7 +69,7 @@ def page(name: str, ran: list[Cell]) -> str:
     parts, drawn = [title, offer, introduction.strip()], 0
     for cell in ran[1:]:
         parts.append(cell.source if cell.is_text else f"```python\n{cell.source}\n```")
-        parts += [f"``` {{ .text .wide }}\n{cell.said}\n```"] if cell.said else []
+        parts += [f"```\n{cell.said}\n```"] if cell.said else []
         for _ in cell.pictures:
             parts.append(f"![A figure of the code above.]({name}-{drawn}.svg){{ .panel }}")
             drawn += 1

@@ -22,6 +22,7 @@ PAGES = {
 PLACES = {}
 EQUATION = LatexToMathML(annotation=True)
 OBJECT = re.compile(r"^::: jaxos4\.((?:\w+\.)*)(\w+)$", flags=re.MULTILINE)
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 COMMAND = re.compile(r"(jaxos4|python3?|pip|bash|source|export|\.venv/\S+)\b| +\S")
 
 
@@ -45,7 +46,7 @@ def on_pre_page(page, config, files):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Typesets equations, and marks what wraps on a narrow screen: commands, and lines wider than a terminal."""
+    """Typesets equations, and marks what wraps on a narrow screen: commands, and lines wider than a page."""
 
     def marked(block):
         language, lines = block[1], block[2].splitlines()
@@ -54,7 +55,7 @@ def on_page_markdown(markdown, page, config, files):
             return f'<div class="equation">{equation}</div>'
         if not language and all(COMMAND.match(line) for line in lines):
             language = "sh"
-        elif not language and max(map(len, lines), default=0) > 110:
+        elif not language and max(map(len, lines), default=0) > 96:
             language = " { .text .wide }"
         return f"```{language}\n{block[2]}```"
 
@@ -72,12 +73,16 @@ def on_env(env, config, files):
 
 
 def on_post_page(output, page, config):
-    """Links each name of the package in a text to the API reference; a function only if `jaxos4.` is before it."""
+    """Keeps options on one line, and links names to the API reference; a function only if `jaxos4.` is before it."""
 
     def linked(code):
         place = PLACES.get(code[2]) if code[1] or code[2][0].isupper() else None
         return f'<a href="{get_relative_url(place, page.url)}">{code[0]}</a>' if place else code[0]
 
+    def unbroken(code):
+        return OPTION.sub(r'<span class="option">\g<0></span>', code[0])
+
+    output = re.sub(r"<code>.*?</code>", unbroken, output, flags=re.DOTALL)
     return re.sub(r'(?<!">)<code>(jaxos4\.)?([\w.]+)(?:\(\))?</code>', linked, output)
 
 
@@ -88,5 +93,5 @@ def commands() -> str:
         name = command.name or command.callback.__name__
         with contextlib.redirect_stdout(io.StringIO()) as said:
             app([name, "--help"], prog_name="jaxos4", standalone_mode=False)
-        text += f"\n## {name}\n\n```\n{said.getvalue().strip()}\n```\n"
+        text += f"\n## {name}\n\n```text\n{said.getvalue().strip()}\n```\n"
     return text

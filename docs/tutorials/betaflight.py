@@ -89,7 +89,8 @@ print(found.summary())
 
 # %% [markdown]
 # The true moments of inertia are 2.4, 2.8 and 4.6 e-3 kg m². Iz is as accurate as the drag
-# coefficient, which this airframe file knows, and yours probably does not.
+# coefficient, which this airframe file knows, and yours probably does not. In the picture,
+# crosses are not the truth but the guesses with which the search began.
 
 # %%
 found.plot.inertias()

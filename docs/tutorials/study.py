@@ -97,9 +97,9 @@ for name, each in ratio.items():
 # IBSS begins, and IBSS finds the optimum in all channels.
 
 # %%
-figure, axes = plt.subplots(figsize=(7, 3.2))
+figure, axes = plt.subplots(figsize=(6, 3.2))
 for (name, each), marker in zip(ratio.items(), "os^x"):
     axes.plot(model.parameter_names, each, marker, label=name, markerfacecolor="none")
 axes.axhline(1, color="gray", linewidth=0.8)
-axes.set(ylabel="RMSE / bound", yscale="log")
-axes.legend()
+axes.set(ylabel="RMSE / bound", ylim=0)
+axes.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1))
