@@ -5,6 +5,7 @@ import errno
 import json
 import math
 import os
+import re
 import secrets
 import shutil
 import sys
@@ -34,6 +35,8 @@ BROKEN = (
 )
 
 _LARGEST_TEXT = 1 << 27  # bytes of a JSON or TOML file: a study with inputs of a million samples
+# A key of TOML in 64 parts or more: the time and memory that `tomllib` takes for it grow with the square of the parts.
+_LONG_KEY = re.compile(rb"""(?:\.[ \t]*(?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[\w-]+)[ \t]*){63}""")
 _LARGEST = sys.float_info.max  # of a number: a longer integer has no float, and Python does not print it
 
 
@@ -94,7 +97,13 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The table in a TOML file. Errors are those of `read_json`."""
-    return _read_text(path, lambda content: tomllib.loads(content.decode()), "TOML", "correct that place", _LARGEST)
+
+    def decode(content: bytes) -> dict[str, Any]:
+        if _LONG_KEY.search(content):
+            raise RecursionError
+        return tomllib.loads(content.decode())
+
+    return _read_text(path, decode, "TOML", "correct that place", _LARGEST)
 
 
 def read_json(path: str | os.PathLike[str], remedy: str, largest: float = _LARGEST) -> Any:

@@ -23,6 +23,7 @@ from .results import NAMES
 _NAME = re.compile(r"[\w.() -]{1,80}")
 _REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
+_ALWAYS = {True: ("terms", "fitted_seconds"), False: ("channels", "windows")}  # of a vehicle's provenance, and an OS4's
 _EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
 
 _FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
@@ -111,6 +112,8 @@ def _problems(found: Identification, tests: dict[str, Any]) -> Iterator[str]:
             yield "`covariance`: a correlation exceeds 1"
     if not all(each > 0 for each in (found.provenance.sample_time, *(x.sample_time for x in found.sample_times))):
         yield "`sample_time`: is not positive"
+    if missing := [name for name in _ALWAYS[found.is_vehicle] if getattr(found.provenance, name) is msgspec.UNSET]:
+        yield f"`provenance`: has no {missing[0]}"
     for name, each in found.disturbances.items():
         if each.time_constant <= 0 or min(each.strength, each.sensor) < 0:
             yield f"`disturbances.{name}`: a time constant is not positive, or a standard deviation is negative"

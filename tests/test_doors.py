@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tokenize
 import tomllib
+import tracemalloc
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -25,6 +26,7 @@ from strange import in_one_line, survives_strange_values
 from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
 
+import jaxos4
 from jaxos4._files import read_toml
 from jaxos4.airframe import load_airframe
 from jaxos4.errors import InputError
@@ -54,7 +56,8 @@ NESTED = 250_000 * "["
 
 
 def exported(path):
-    """Exports to all simulators; each file is parsed."""
+    """Prints the result, and exports it to all simulators; each file is parsed."""
+    jaxos4.read_result(path).summary(verbose=True)
     found = read_result(path)
     for target in TARGETS:
         for text in (lambda written: (written.text, *written.samples))(export_vehicle(found, target, samples=1)):
@@ -106,6 +109,16 @@ def test_a_damaged_file_ends_in_one_line(name, tmp_path):
 # The cases that were found
 
 
+@pytest.mark.parametrize("key", ["a" + 20_000 * ".b", "a" + 20_000 * " . 'b'", '[a."b"' + 20_000 * r'."\""' + "]"])
+def test_a_key_of_many_parts_costs_little(key, save):
+    path = save(f"{key} = 1" if key[0] == "a" else key)
+    tracemalloc.start()
+    with pytest.raises(InputError, match="nested too deeply; correct that place"):
+        read_toml(path)
+    assert tracemalloc.get_traced_memory()[1] < 200e6  # of which 134 MB are the largest file
+    tracemalloc.stop()
+
+
 def result_with(change):
     result = json.loads(json.dumps(RESULT))
     change(result)
@@ -124,6 +137,7 @@ RESULTS = {
     "estimator": result_with(lambda r: r.update(estimator='x coding: unicode_escape \\u000aopen("pwned.txt","w")')),
     "control character": result_with(lambda r: r.update(doubts=[{"result": "no_skill", "cause": "\0", "remedy": ""}])),
     "sample time": result_with(lambda r: r["provenance"].update(sample_time=-1.0)),
+    "no length": result_with(lambda r: r["provenance"].pop("fitted_seconds")),
     "nested": NESTED,
     "nested inside": json.dumps(RESULT)[:-1] + ', "rollouts": ' + NESTED,
     "long number": json.dumps(RESULT)[:-1] + ', "rollouts": ' + 5000 * "9" + "}",

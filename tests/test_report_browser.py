@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
+from pages import CARDS, CUT, TEXTS, WIDE, WIDTHS, overlapping
 from sign_flights import flown
 from synthetic_identification import (
     SAMPLE_TIMES,
@@ -30,48 +31,6 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 BACKGROUND = {"light": "rgb(255, 255, 255)", "dark": "rgb(22, 25, 29)"}
-# The width of each element, and the pixels that it needs for letters of a readable size, in one question.
-WIDTHS = "all => all.map(one => [one.getBoundingClientRect().width, one.viewBox.baseVal.width])"
-# The texts that a reader sees, with their boxes: lines of HTML, and texts of figures, which are outlines.
-TEXTS = r"""() => {
-  const found = [];
-  const seen = (element) => element.checkVisibility({visibilityProperty: true});
-  const add = (text, box) => box.width > 1 && found.push([text, box.left, box.top, box.right, box.bottom]);
-  const walk = document.createTreeWalker(document.body ?? document.documentElement, NodeFilter.SHOW_TEXT);
-  while (walk.nextNode()) {
-    const node = walk.currentNode, holder = node.parentElement;
-    if (!node.data.trim() || !seen(holder) || holder.closest("svg, script, style, option, noscript")) continue;
-    const range = document.createRange();
-    range.selectNodeContents(node);
-    for (const box of range.getClientRects()) add(node.data.trim().slice(0, 30), box);
-  }
-  for (const group of document.querySelectorAll('g[id*="text_"]')) {
-    if (seen(group)) add(group.id, group.getBoundingClientRect());
-  }
-  return found;
-}"""
-# The texts of figures that are not completely inside their panel, which cuts them.
-CUT = """() => [...document.querySelectorAll('svg g[id*="text_"]')].filter(text => {
-  const box = text.getBoundingClientRect(), panel = text.ownerSVGElement.getBoundingClientRect();
-  return box.width && (box.left < panel.left - 1 || box.right > panel.right + 1
-    || box.top < panel.top - 1 || box.bottom > panel.bottom + 1);
-}).map(text => text.id)"""
-WIDE = """() => [...document.querySelectorAll("*")]
-  .filter(element => element.checkVisibility() && element.scrollWidth > element.clientWidth + 1
-    && /auto|scroll/.test(getComputedStyle(element).overflowX)).map(element => element.outerHTML.slice(0, 80))"""
-
-
-def overlapping(texts, *, by=1.0):
-    """Pairs of texts that share more than `by` pixels in both directions."""
-    texts = sorted(texts, key=lambda text: text[1])
-    found = []
-    for i, (name, left, top, right, bottom) in enumerate(texts):
-        for other, left2, top2, right2, bottom2 in texts[i + 1 :]:
-            if left2 >= right - by:
-                break
-            if min(right, right2) - max(left, left2) > by and min(bottom, bottom2) - max(top, top2) > by:
-                found.append((name, other))
-    return found
 
 
 def synthetic_design(kind, names, units, history):
@@ -158,7 +117,7 @@ def opened(browser, addresses):
     assert said == []
 
 
-@pytest.mark.parametrize("width", [390, 768, 1280])
+@pytest.mark.parametrize("width", [390, 720, 768, 1280])  # 720: a sheet of paper
 @pytest.mark.parametrize("name", ["study", "one flight", "vehicle", "os4", "log", "comparison", *DESIGNS])
 def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
     page = opened(name, width)
@@ -172,6 +131,29 @@ def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
     assert page.evaluate(CUT) == []
     for drawn, natural in page.locator(".panels svg").evaluate_all(WIDTHS):
         assert drawn >= natural  # letters of 8 points keep at least 8 pixels
+
+
+@pytest.mark.parametrize("name", ["study", "one flight", "vehicle", "os4", "log", "comparison"])
+def test_cards_on_a_phone_name_each_value_as_the_table_does(opened, name):
+    """With the unit. The name of a row stands alone, unless it is a number."""
+    found = opened(name, 390).evaluate(CARDS)
+    assert len(found) > 20
+    assert [each for each in found if each[0] != each[1] and (each[1] or each[2].isdigit())] == []
+
+
+@pytest.mark.parametrize("name", ["vehicle", "log"])
+def test_signals_fit_on_paper(opened, name):
+    """A sheet is narrower than the window in which the signals were drawn."""
+    page = opened(name)
+    page.emulate_media(media="print")
+    page.evaluate("document.body.style.width = '720px'")
+    boxes = page.locator("#timeline canvas").evaluate_all(
+        "all => all.map(each => each.getBoundingClientRect().toJSON())"
+    )
+    assert len(boxes) >= 2
+    assert all(box["right"] <= 720 for box in boxes)
+    assert all(box["width"] > 600 for box in boxes)
+    assert overlapping(page.evaluate(TEXTS)) == []
 
 
 def test_texts_that_overlap_are_found(opened):
@@ -188,6 +170,9 @@ def test_texts_that_overlap_are_found(opened):
 def test_it_follows_the_theme(opened, name, scheme):
     page = opened(name, scheme=scheme)
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == BACKGROUND[scheme]
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")  # paper is white
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == BACKGROUND["light"]
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
     page.get_by_role("button").filter(has_text="Dark" if scheme == "light" else "Light").click()
     other = {"light": "dark", "dark": "light"}[scheme]
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == BACKGROUND[other]

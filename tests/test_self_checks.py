@@ -1,5 +1,6 @@
 """A log is checked against itself: each fault is named with its cause, and good flights have none."""
 
+import json
 import re
 
 import equinox as eqx
@@ -127,6 +128,7 @@ def test_a_fault_is_named_with_its_cause(fault, flights):
             assert word in str(found[0])
         assert set(found[0].quantities) >= quantities
         assert found[0].contradicted == contradicted
+        json.dumps([each.to_dict() for each in found])
         named = [each for each in found if each.contradicted]
         assert len(named) <= 1 or fault in ("tilted", "gyro clipped"), found
 

@@ -23,14 +23,20 @@
     button.textContent = current() === "dark" ? "Light" : "Dark";
     button.setAttribute("aria-label", `Switch to ${button.textContent.toLowerCase()} colours`);
   };
-  button.addEventListener("click", () => {
-    root.dataset.theme = current() === "dark" ? "light" : "dark";
+  const show = (theme) => {
+    if (theme) root.dataset.theme = theme;
+    else delete root.dataset.theme;
     name();
     document.dispatchEvent(new Event("theme"));
+  };
+  button.addEventListener("click", () => show(current() === "dark" ? "light" : "dark"));
+  dark.addEventListener("change", () => show(root.dataset.theme));
+  // Paper is white.
+  let chosen;
+  addEventListener("beforeprint", () => {
+    chosen = root.dataset.theme;
+    show("light");
   });
-  dark.addEventListener("change", () => {
-    name();
-    document.dispatchEvent(new Event("theme"));
-  });
+  addEventListener("afterprint", () => show(chosen));
   name();
 })();

@@ -16,3 +16,54 @@ def stands_alone(text):
     ids = re.findall(r'\sid="([^"]*)"', outside)
     assert len(ids) == len(set(ids)) > 4
     assert text.count("<script") == text.count("</script") == 1
+
+
+# The width of each element, and the pixels that it needs for letters of a readable size, in one question.
+WIDTHS = "all => all.map(one => [one.getBoundingClientRect().width, one.viewBox.baseVal.width])"
+# The texts that a reader sees, with their boxes: lines of HTML, and texts of figures, which are outlines.
+TEXTS = r"""() => {
+  const found = [];
+  const seen = (element) => element.checkVisibility({visibilityProperty: true});
+  const add = (text, box) => box.width > 1 && found.push([text, box.left, box.top, box.right, box.bottom]);
+  const walk = document.createTreeWalker(document.body ?? document.documentElement, NodeFilter.SHOW_TEXT);
+  while (walk.nextNode()) {
+    const node = walk.currentNode, holder = node.parentElement;
+    if (!node.data.trim() || !seen(holder) || holder.closest("svg, script, style, option, noscript")) continue;
+    const range = document.createRange();
+    range.selectNodeContents(node);
+    for (const box of range.getClientRects()) add(node.data.trim().slice(0, 30), box);
+  }
+  for (const group of document.querySelectorAll('g[id*="text_"]')) {
+    if (seen(group)) add(group.id, group.getBoundingClientRect());
+  }
+  return found;
+}"""
+# The texts of figures that are not completely inside their panel, which cuts them.
+CUT = """() => [...document.querySelectorAll('svg g[id*="text_"]')].filter(text => {
+  const box = text.getBoundingClientRect(), panel = text.ownerSVGElement.getBoundingClientRect();
+  return box.width && (box.left < panel.left - 1 || box.right > panel.right + 1
+    || box.top < panel.top - 1 || box.bottom > panel.bottom + 1);
+}).map(text => text.id)"""
+# Of each cell of a table: its heading, the label that a card shows above it, and its text without a point.
+CARDS = r"""() => [...document.querySelectorAll("figure.table table")].flatMap(table => {
+  const heads = [...table.querySelectorAll("thead th")].map(head => head.textContent.trim());
+  return [...table.querySelectorAll("tbody tr:not(.group)")].flatMap(row => [...row.cells].map((cell, i) => [
+    heads[i], getComputedStyle(cell, "::before").content.replace(/^"|"$|^none$/g, ""), cell.textContent.replace(".", "")
+  ]));
+})"""
+WIDE = """() => [...document.querySelectorAll("*")]
+  .filter(element => element.checkVisibility() && element.scrollWidth > element.clientWidth + 1
+    && /auto|scroll/.test(getComputedStyle(element).overflowX)).map(element => element.outerHTML.slice(0, 80))"""
+
+
+def overlapping(texts, *, by=1.0):
+    """Pairs of texts that share more than `by` pixels in both directions."""
+    texts = sorted(texts, key=lambda text: text[1])
+    found = []
+    for i, (name, left, top, right, bottom) in enumerate(texts):
+        for other, left2, top2, right2, bottom2 in texts[i + 1 :]:
+            if left2 >= right - by:
+                break
+            if min(right, right2) - max(left, left2) > by and min(bottom, bottom2) - max(top, top2) > by:
+                found.append((name, other))
+    return found

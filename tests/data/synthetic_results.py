@@ -30,7 +30,7 @@ def held(value):
 def provenance(**fields):
     """Where a result is from."""
     versions = {"version": "0.6.0", "jax": "0.10.0", "device": "cpu", "precision": "float64"}
-    return {"airframe": "custom", "terms": [], "sample_time": 0.01, **versions, **fields}
+    return {"airframe": "custom", "terms": [], "sample_time": 0.01, "fitted_seconds": 60.0, **versions, **fields}
 
 
 def vehicle_result(values=VALUES, **changes):

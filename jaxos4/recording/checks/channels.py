@@ -68,7 +68,7 @@ def clipped_values(evidence: Evidence) -> Finding | None:
     if not found:
         return None
     each = [f"{n}: {count} ({100 * share:.2g} %) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
-    many = max(share for _, share, _ in found.values()) > evidence.limits.clipped
+    many = bool(max(share for _, share, _ in found.values()) > evidence.limits.clipped)
     return Finding(
         "clipped_values",
         "a sensor is clipped at the end of its range; these values count as not measured",
