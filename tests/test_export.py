@@ -6,7 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, refused
-from synthetic_results import AIRFRAME, VALUES, held, vehicle_result
+from synthetic_results import AIRFRAME, VALUES, held, provenance, vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table
@@ -281,7 +281,10 @@ def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tm
         ),
         (vehicle_result(result="nonfinite_trajectory", covariance=None), ("nonfinite_trajectory", "no estimate")),
         (vehicle_result(result="unheard"), ("`result` unheard",)),
-        (vehicle_result(model="corrected"), ("`model` corrected", "--model flight")),
+        (
+            vehicle_result(model="corrected", provenance=provenance(channels="rates", windows=1)),
+            ("`model` corrected", "--model flight"),
+        ),
         (vehicle_result(covariance=8 * [[1.0], []]), ("`covariance`",)),
         (vehicle_result(covariance=(-np.eye(len(VALUES))).tolist()), ("`covariance`", "run `jaxos4 estimate` again")),
         (vehicle_result({}), ("holds no estimate",)),
