@@ -1,4 +1,6 @@
-"""The gain of the thrust of a vehicle whose controller answers gusts, simulated by NumPy."""
+"""The thrust of a vehicle whose controller answers gusts, simulated by NumPy, and the noise of its accelerometer."""
+
+import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from helpers import CRAZYFLIE
 import jaxos4
 from jaxos4.flight import RATES
 from jaxos4.shooting import InnovationsProblem
-from jaxos4.shooting.gains import NoiseUnknowns
+from jaxos4.shooting.gains import LogNoise, NoiseUnknowns
 
 pytestmark = pytest.mark.slow
 
@@ -43,14 +45,38 @@ def hovering(rng, levels, samples=3000):
     return jaxos4.Flight(DT * np.arange(samples), np.tile(speeds[:, None], 4), states, specific_force=force)
 
 
+MODEL = jaxos4.FlightModel(CRAZYFLIE, terms=("accelerometer",))
+PLACE = MODEL.parameter_names.index("thrust_gain")
+
+
+def problem_of(flight, **settings):
+    problem = jaxos4.ShootingProblem(MODEL, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4")
+    return InnovationsProblem(problem, **settings)
+
+
+@eqx.filter_jit
+def likelihood(flight, noise):
+    return problem_of(flight, segments=1).innovations(MODEL.alpha, noise)
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+def test_derivatives_in_the_noise_of_a_force_are_those_of_finite_differences(averaged):
+    flight = hovering(np.random.default_rng(0), (1.0, 0.5, 0.05, 0.08), samples=300)
+    flight = dataclasses.replace(flight, averaging_time=DT) if averaged else flight
+    levels = np.log([[1.0] * 3 + [1.2], [0.1] * 3 + [0.4], [0.02] * 3 + [0.06], [1.0] * 3 + [0.05]])
+    gradient = likelihood(flight, LogNoise(*jnp.asarray(levels))).gradient
+    for i, step in enumerate(np.eye(4)):
+        change = 1e-5 * np.outer(step, np.arange(4) == 3)
+        costs = [likelihood(flight, LogNoise(*jnp.asarray(levels + sign * change))).cost.sum() for sign in (1, -1)]
+        slope = (costs[0] - costs[1]) / 2e-5
+        np.testing.assert_allclose(gradient[3, len(MODEL.alpha) + i].sum(), slope, rtol=1e-5)
+
+
 @eqx.filter_jit
 def thrust_of(flight, noise_unknowns):
     """The gain of the thrust, whose truth is 1, and its standard deviation."""
-    model = jaxos4.FlightModel(CRAZYFLIE, terms=("accelerometer",))
-    problem = jaxos4.ShootingProblem(model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4")
-    found = jaxos4.FilterError(tolerance=1e-3)(InnovationsProblem(problem, noise_unknowns=noise_unknowns))
-    place = model.parameter_names.index("thrust_gain")
-    return found.parameters[place], jnp.sqrt(found.covariance[place, place])
+    found = jaxos4.FilterError(tolerance=1e-3)(problem_of(flight, noise_unknowns=noise_unknowns))
+    return found.parameters[PLACE], jnp.sqrt(found.covariance[PLACE, PLACE])
 
 
 def test_the_thrust_is_right_if_a_controller_answers_smooth_gusts():
