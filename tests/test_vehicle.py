@@ -69,15 +69,22 @@ def shooting_problem(flight, airframe, terms=TERMS, **arguments):
 
 
 def first_problem(damping=0.0, share=1.0):
-    """The innovations of the first flight without its accelerometer, and the recording of each sample."""
+    """The innovations of the first flight without its accelerometer."""
     flight, airframe = (lane(part, 0) for part in flown(damping, share))
-    problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
-    return problem, np.zeros(flight.time.shape[0], int)
+    return InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
 
 
-def fitted(problem, recording, **options):
+def data_of(problem):
+    """The data of one recording."""
+    nothing = dict.fromkeys(("airframe", "version", "jax", "device", "precision"), "")
+    samples = problem.flight.time.size
+    clock = Clock(np.zeros(samples, int), PERIOD * np.arange(samples))
+    return Data(problem, problem.problem, clock, Provenance(sample_time=PERIOD, **nothing))
+
+
+def fitted(problem, **options):
     """The answer of `FilterError`, with intervals corrected by the jackknife."""
-    return corrected(search(jaxos4.FilterError(), problem, **options), problem.problem, recording)
+    return corrected(search(jaxos4.FilterError(), problem, **options), data_of(problem))
 
 
 @functools.cache
@@ -110,7 +117,7 @@ def test_inertias_lie_in_their_intervals_and_bisection_finds_what_newtons_method
     std, errors = of_inertias(found.std), of_inertias(found.parameters) - 1
     assert 3.54 < np.square(errors / std).sum() < 40.8, errors / std
     assert (std < 0.15).all()
-    levels = np.exp(np.asarray(found.parameters)[:, count : count + 6]).reshape(FLIGHTS, 2, 3)
+    levels = np.exp(np.asarray(found.parameters)[:, count : count + 8]).reshape(FLIGHTS, 2, 4)
     strength, sensor = levels[:, :, 0].T, levels[:, :, 2]
     np.testing.assert_allclose(strength / GUSTS, 1, atol=0.5)
     np.testing.assert_allclose(sensor, GYRO, rtol=0.1)
@@ -150,9 +157,9 @@ def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
 )
 def test_what_is_not_estimated_is_named(kind, damping, share):
     """A flight with a roll damping; in a hover with hardly any motion."""
-    problem, recording = first_problem(damping, share)
+    problem = first_problem(damping, share)
     unknowns, stages = problem.problem.unknowns, []
-    answer = fitted(problem, recording, progress=stages.append)
+    answer = fitted(problem, progress=stages.append)
     assert answer.answered
     assert ("fitting again without what came out negative" in stages) == (kind == "negative")
     std, half_width = np.asarray(answer.estimate.std)[: unknowns.count], np.asarray(unknowns.half_width)
@@ -178,11 +185,8 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
 @functools.cache
 def poorly_known():
     """The data of a flight that says little about alpha8, and the answer without a profile."""
-    problem, recording = first_problem(1.0)
-    nothing = dict.fromkeys(("airframe", "version", "jax", "device", "precision"), "")
-    provenance = Provenance(sample_time=PERIOD, **nothing)
-    data = Data(problem, problem.problem, Clock(recording, PERIOD * np.arange(recording.size)), provenance)
-    return data, fitted(problem, recording)
+    problem = first_problem(1.0)
+    return data_of(problem), fitted(problem)
 
 
 @pytest.mark.usefixtures("optimised")
@@ -268,9 +272,9 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
 
 @pytest.mark.usefixtures("optimised")
 def test_a_flight_that_the_model_cannot_follow_has_no_answer():
-    problem, recording = first_problem()
+    problem = first_problem()
     wild = eqx.tree_at(lambda p: p.problem.flight.omega, problem, 1e6 * problem.flight.omega)
-    answer = fitted(wild, recording)
+    answer = fitted(wild)
     assert not answer.answered
     assert names(answer.estimate) == "nonfinite_trajectory"
     bracket = problem.problem.unknowns.bracket
@@ -295,7 +299,7 @@ def test_motors_brake_as_they_drive_unless_flight_or_bracket_say_otherwise(braki
         center, half_width = (np.asarray(x).copy() for x in (own.center, own.half_width))
         center[place], half_width[place] = bracket
         problem = problem.within(jaxos4.Bracket.around(center, half_width))
-    answer = fitted(problem, np.zeros(flight.time.size, int))
+    answer = fitted(problem)
     place = answer.problem.unknowns.names.index("motor_braking")
     value = float(answer.estimate.parameters[place])
     is_plain = "motor_braking" in answer.fixed and "do not contradict" in answer.fixed["motor_braking"].note
