@@ -270,7 +270,11 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
 @pytest.mark.parametrize(
     ("content", "options", "fragments"),
     [
-        (result(model="corrected"), (), ("found.json", "`model` corrected: only a vehicle")),
+        (
+            result(model="corrected", provenance=provenance(channels="rates", windows=1)),
+            (),
+            ("found.json", "`model` corrected: only a vehicle"),
+        ),
         (result(disturbances={}), (), ("found.json", "does not say the disturbance of p")),
         (result(provenance=provenance(terms=["warp"])), (), ("found.json", "the term warp is not of")),
         (result(covariance=None), (), ("holds no estimate",)),

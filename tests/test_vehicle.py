@@ -46,14 +46,16 @@ def fly(loop, references, key):
 
 @functools.cache
 def flown(damping=0.0, share=1.0):
-    """Eight flights of 10 s in gusts of 5 to 10 rad/s^2, and their airframes with inertias that are 25 % off.
+    """Eight flights of 10 s in gusts of 5 to 10 rad/s^2 and 0.5 m/s^2, and airframes with inertias that are 25 % off.
 
     `damping`: of roll [1/s]. `share`: of the references and of the gusts.
     """
     wrong = [eqx.tree_at(lambda a: a.inertia, CRAZYFLIE, CRAZYFLIE.inertia * (1 + 0.25 * (-1) ** i)) for i in range(8)]
     physics = {"rotor_lag": LAG, "rotor_delay": DELAY, "damping": (damping, 0.5, 0.5)}
     loops = [
-        jaxos4.ClosedLoop(CRAZYFLIE, gust=share * gust, controller_inertia=airframe.inertia, **physics)
+        jaxos4.ClosedLoop(
+            CRAZYFLIE, gust=share * gust, thrust_gust=share * 0.5, controller_inertia=airframe.inertia, **physics
+        )
         for gust, airframe in zip(GUSTS, wrong, strict=True)
     ]
     keys = [jax.random.split(jax.random.key(i)) for i in range(FLIGHTS)]
