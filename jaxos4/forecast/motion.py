@@ -14,7 +14,7 @@ from ..flight import RATES, STATE_NAMES, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST
-from ..shooting.gains import Covariance, LogNoise, first_covariance, next_gains, step_of, transition
+from ..shooting.gains import Covariance, LogNoise, first_covariance, is_rate, next_gains, step_of, transition
 from ..simulation import rk4_step
 
 _Samples = Float[Numeric, "*samples"]
@@ -278,7 +278,7 @@ def _offset_weights(
     strength, time_constant = (jnp.full(6, x) for x in (tuning.push, tuning.push_time))
     strength = strength.at[channels].set(jnp.exp(noise.strength))
     smoothing = (
-        0.0 if noise.smoothing is None else jnp.where(np.arange(noise.strength.size) < 3, 0.0, jnp.exp(noise.smoothing))
+        0.0 if noise.smoothing is None else jnp.where(is_rate(noise.strength.size), 0.0, jnp.exp(noise.smoothing))
     )
     time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant) + smoothing)
     is_known, prior = ~jnp.isnan(accelerations), jnp.square(prior)

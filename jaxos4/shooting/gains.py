@@ -359,9 +359,8 @@ class NoiseUnknowns(NamedTuple):
         lowest = lowest.at[:, 1].set(jnp.where(rate, shortest, np.log(self.shortest_of_force)))
         highest = highest.at[:, 1].set(np.log(self.longest))
         # A rate has no filter: its place stays where it is.
-        fixed = rate[:, None] & np.ones(smoothing.shape, dtype=bool)
-        lowest = lowest.at[:, 3:].set(jnp.where(fixed, first[:, 3:], shortest))
-        highest = highest.at[:, 3:].set(jnp.where(fixed, first[:, 3:], np.log(self.longest_smoothing)))
+        lowest = lowest.at[:, 3:].set(jnp.where(rate[:, None], first[:, 3:], shortest))
+        highest = highest.at[:, 3:].set(jnp.where(rate[:, None], first[:, 3:], np.log(self.longest_smoothing)))
         lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))
         free = jnp.ones(first.shape, dtype=bool).at[:, 3:].set(~rate[:, None])
         first, lowest, highest, free = (
