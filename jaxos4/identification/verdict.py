@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..recording.checks import INERTIAS
+from ..airframe import INERTIAS
 
 IDENTIFIED = "identified"
 RESERVED = "identified with a reservation"

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import Airframe
+from ..airframe import INERTIAS, Airframe
 from ..errors import InputError, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..logs import Recording
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
-from .checks import INERTIAS, Evidence, Finding, different_thrust, findings, opposite_yaw
+from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import Ups, in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
 from .stretches import Stretch, cut, nothing_usable

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from .._files import check_writable, write_file
+from ..airframe import INERTIAS
 from ..errors import printable
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification
@@ -17,7 +18,6 @@ from ..identification.verdict import IDENTIFIED, RIGID_BODY, STATUSES, headline,
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .identification_figures import (
-    INERTIAS,
     correlation_matrix,
     frequency_responses,
     inertias_by_sample_time,

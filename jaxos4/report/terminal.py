@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 
+from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
 from ..identification.physical import PhysicalQuantity, physical_quantities
@@ -268,7 +269,7 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
     for part in sorted(shown, key=lambda part: part.begin):
         axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
         rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
-    headings, numbers = ("from [s]", "to [s]", "use", "roll", "pitch", "yaw"), ("from [s]", "to [s]")
+    headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
     Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
     if len(found.parts) > len(shown):
         console.print(f"and {len(found.parts) - len(shown)} shorter parts")

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ...airframe import GRAVITY
+from ...airframe import GRAVITY, INERTIAS, YAW
 from .estimates import BATCHES, Measured, batched
-from .evidence import INERTIAS, Evidence, Finding
+from .evidence import Evidence, Finding
 
 
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
@@ -72,7 +72,7 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
         f"torque and angular acceleration correlate by {-correlation:.2f}",
         "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
         "all four signs",
-        ("Iz",),
+        (YAW.inertia,),
         True,
     )
 
