@@ -125,7 +125,7 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
             values=_clipped(values),
             drawn=drawn,
             covariance=np.array(file.covariance)[np.ix_(places, places)],
-            doubts=file.reasons,
+            doubts=file.warnings,
             notes=tuple(notes),
             inertia_z=inertia_z,
         )

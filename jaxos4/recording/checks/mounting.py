@@ -194,7 +194,7 @@ def different_thrust(every: Sequence[Evidence]) -> Finding | None:
     return Finding(
         "different_vehicles",
         "the logs are of vehicles of different mass or thrust" + (", or of different batteries" if commanded else ""),
-        f"the same rotors lift {apart:.0%} more in one log than in another",
+        f"the same rotors lift {100 * apart:.0f} % more in one log than in another",
         "fit them separately, each with its own mass" + ("; log the battery's voltage" if commanded else ""),
         ("thrust", *INERTIAS),
         bool(not commanded or apart > limits.commanded_vehicles),
