@@ -263,7 +263,7 @@ def test_logs_of_two_vehicles(flights):
         other = Recording.of(fly_standard(loop, duration=20.0, seed=3))
         found = different_vehicles([flights[i], other], CRAZYFLIE)
         assert found is not None
-        assert "30%" in found.size
+        assert "30 %" in found.size
         assert found.contradicted == contradicted
 
 

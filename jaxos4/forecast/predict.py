@@ -104,7 +104,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
             LogNoise(*np.log(np.maximum(table, 1e-9)).T),  # finite
             used.sample_time,
             file.result,
-            (*file.reasons, *notes),
+            (*file.warnings, *notes),
         )
 
 

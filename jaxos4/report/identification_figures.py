@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-from ..airframe import Airframe
+from ..airframe import INERTIAS, Airframe
 from ..analysis.diagnostics import Correlations
 from ..analysis.frequency_response import RESPONSE, AxisResponse, FrequencyResponse
 from ..analysis.inertia import CenterOfMass
@@ -162,8 +162,6 @@ def strongest(found: Identification, *, least: float = 0.9, most: int = 5) -> li
 
 GAINS = (0.2, 5.0)
 """The gains that a figure of the response shows."""
-
-INERTIAS: tuple[str, ...] = ("Ix", "Iy", "Iz")
 
 
 def gain_band(one: AxisResponse) -> Float[np.ndarray, "2 frequencies"]:

@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..airframe import INERTIAS
 from ..analysis.frequency_response import RESPONSE
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
 from ..identification.results import Identification
-from .identification_figures import GAINS, INERTIAS, draw_response, gain_band
+from .identification_figures import GAINS, draw_response, gain_band
 from .style import BOUND_DASHES, FAINT, INK, log_axis, styles
 
 _RATES = ("p", "q", "r")

@@ -18,7 +18,7 @@ from .channels import (
     wrong_axes,
     wrong_scale,
 )
-from .evidence import INERTIAS as INERTIAS, LIMITS, Evidence as Evidence, Finding as Finding, Limits as Limits
+from .evidence import LIMITS, Evidence as Evidence, Finding as Finding, Limits as Limits
 from .mounting import (
     different_thrust as different_thrust,
     earth_axes,

@@ -20,8 +20,6 @@ from ..stretches import RULES, Stretch, cut, stretches
 from .estimates import Measured, Turns, attitude_turns, tilt_slopes, velocity_slopes
 from .response import Response, rotor_response
 
-INERTIAS = ("Ix", "Iy", "Iz")
-
 
 class Finding(msgspec.Struct, frozen=True):
     """A fault that a log shows.
