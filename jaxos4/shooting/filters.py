@@ -19,7 +19,7 @@ from .._custom_types import Count, Scalar
 from ..models.state import Forcing, Rates, State
 from .batching import with_batch
 from .gains import (
-    RATES,
+    RATE_COUNT,
     Channels,
     Covariance,
     Gains,
@@ -88,16 +88,16 @@ def _advance(
     """The estimates one sample later, and the innovations of this sample."""
     move, average, observe = functions
     seen = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
-    mean = average(State(Rates(*known.driven[:RATES])), forcing, scalars).rates
+    mean = average(State(Rates(*known.driven[:RATE_COUNT])), forcing, scalars).rates
     rates = Rates(*(x + a for x, a in zip(mean, seen, strict=False)))
     outputs = observe(State(rates), forcing, scalars)
     forces = zip(outputs, feedback.driven_seen, known.driven, seen, strict=True)
-    outputs = (*outputs[:RATES], *(h + share * x + a for h, share, x, a in [*forces][RATES:]))
+    outputs = (*outputs[:RATE_COUNT], *(h + share * x + a for h, share, x, a in [*forces][RATE_COUNT:]))
     # What was not measured has no gain.
     errors = tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
     driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
-    rates = move(State(Rates(*driven[:RATES])), forcing, scalars).rates
-    driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATES:]))
+    rates = move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates
+    driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
     later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, strict=True)
     driven = tuple(x + a * d + gain * e for x, a, d, gain, e in later)
     faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, strict=True)
@@ -238,8 +238,8 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     steps = step, jax.vmap(push)(basis(noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
     zero = jnp.zeros(segments, dtype=float)
-    start = (zero,) * RATES if observed.known is None else observed.known
-    known = _Known((*start, *(zero,) * (channels - RATES)), (zero,) * channels)
+    start = (zero,) * RATE_COUNT if observed.known is None else observed.known
+    known = _Known((*start, *(zero,) * (channels - RATE_COUNT)), (zero,) * channels)
     known = _emptied(known, observed.restart[0])
     nothing = Innovations(
         cost=zero,
@@ -300,7 +300,7 @@ def _filter_rows(
     def body(carry, rows):
         (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry
         forcing, tangents, row = rows
-        for x in known.driven[:RATES]:
+        for x in known.driven[:RATE_COUNT]:
             feasible = feasible & (jnp.abs(x) < FASTEST)
         (covariance, gains), push = jax.linearize(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]

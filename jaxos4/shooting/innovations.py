@@ -24,7 +24,8 @@ from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
 from .filters import innovate
-from .gains import INSTANT, LogNoise, NoiseUnknowns, Observed, Window, levels, own_names
+from .gains import INSTANT, LogNoise, Observed, Window
+from .noise_unknowns import NoiseUnknowns, levels, own_names
 from .problem import ShootingProblem
 from .scans import with_tangents
 from .segments import Segments, observe_in_segments
