@@ -300,7 +300,7 @@ class InnovationsProblem(AbstractProblem):
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
 
         def of(parameters: Parameters) -> Forcing:
-            return self.model.mean_forcing(inputs, parameters, samples)
+            return jax.tree.map(lambda leaf: leaf[samples], self.model.mean_forcing(inputs, parameters))
 
         if not self.model.forcing_parameters:
             known = segments_last(of(self.model.alpha))
