@@ -13,7 +13,7 @@ from ..flight import RATES
 from ..models.abstract import AbstractModel
 from ..models.state import Forcing, Rates, State
 from ..shooting import ShootingProblem
-from ..shooting.gains import LogNoise, Moved, first_covariance, is_rate, next_gains, step_of
+from ..shooting.gains import LogNoise, Transition, first_covariance, is_rate, next_gains, step_of
 from .frequency_response import modelled_acceleration
 
 Motion = TypeVar("Motion")
@@ -25,10 +25,10 @@ class Filtered(NamedTuple):
     driven: Float[Numeric, "*samples channels"]
     disturbance: Float[Numeric, "*samples channels"]
 
-    def later(self, moved: Moved, driven: Numeric, disturbance: Numeric | float = 0.0) -> "Filtered":
+    def later(self, over: Transition, driven: Numeric, disturbance: Numeric | float = 0.0) -> "Filtered":
         """One sample later, if nothing is measured. `driven`, `disturbance`: what each gains besides."""
-        driven = moved.driven_kept * self.driven + moved.reach * self.disturbance + driven
-        return Filtered(driven, moved.kept * self.disturbance + disturbance)
+        driven = over.driven_kept * self.driven + over.reach * self.disturbance + driven
+        return Filtered(driven, over.kept * self.disturbance + disturbance)
 
 
 @jax.jit
@@ -56,7 +56,7 @@ def filtered(
         innovation = y - known.driven
         error = jnp.where(jnp.isnan(y), 0.0, innovation)
         known = Filtered(known.driven + gains.driven * error, known.disturbance + gains.disturbance * error)
-        return (p, known.later(step.moved, added * dt)), (known, jnp.where(begins, jnp.nan, innovation))
+        return (p, known.later(step.transition, added * dt)), (known, jnp.where(begins, jnp.nan, innovation))
 
     zero = jnp.zeros((measured.shape[1], 1), dtype=float)  # one segment
     rows = measured[:, :, None], modelled[:, :, None], begins[:, None]
@@ -70,7 +70,7 @@ def open_loop(
     known: Filtered,
     rows: Any,
     gusts: Filtered,
-    moved: Moved,
+    over: Transition,
 ) -> Motion:
     """The motion after each step. Nothing is measured any more, and the disturbance fades.
 
@@ -78,14 +78,14 @@ def open_loop(
       step, and the mean of each specific force that they add.
     - `known`: at the start. Its rates do not count, as they are part of the motion.
     - `rows`: the forcing of each step. `gusts`: what each channel gains in it besides.
-    - `moved`: of a step, see `transition`.
+    - `over`: the transition of the disturbance over a step.
     """
-    rate = is_rate(moved.reach)
+    rate = is_rate(over.reach)
 
     def step(carry: tuple[Motion, Filtered], row: tuple[Any, Filtered]) -> tuple[tuple[Motion, Filtered], Motion]:
         (motion, known), (forcing, gust) = carry, row
         known = known._replace(driven=jnp.where(rate, 0.0, known.driven))
-        later = known.later(moved, *gust)
+        later = known.later(over, *gust)
         motion = advance(motion, forcing, jnp.where(rate, later.driven, (known.driven + later.driven) / 2))
         return (motion, later), motion
 
@@ -110,9 +110,8 @@ def traced(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) ->
     The model is evaluated at the measured rates. An innovation is a measured rate less its prediction from the sample
     before. `noise`: its first three channels are p, q and r.
     """
-    rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
+    flight, rates = problem.flight, np.asarray(problem.flight.states)[:, RATES]
     modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
     own = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
-    number = np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch)
-    known, innovation = filtered(own, rates, modelled, number, problem.flight.dt)
+    known, innovation = filtered(own, rates, modelled, flight.stretch_numbers, flight.dt)
     return Traced(np.asarray(known.disturbance), np.asarray(innovation))

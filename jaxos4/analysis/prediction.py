@@ -14,7 +14,7 @@ from .._custom_types import Numeric, Parameters, as_float
 from ..flight import RATES, Flight
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST, ShootingProblem
-from ..shooting.gains import LogNoise, transition
+from ..shooting.gains import LogNoise, Transition
 from .open_loop import Filtered, gyro_bias, open_loop
 
 HORIZONS = (0.1, 0.25, 0.5)
@@ -114,8 +114,7 @@ def starts(
     """
     dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
     around = int(near / dt)
-    stretch = np.zeros(samples, dtype=int) if flight.stretch is None else np.asarray(flight.stretch)
-    rates = np.asarray(flight.states)[:, RATES]
+    stretch, rates = np.asarray(flight.stretch_numbers), np.asarray(flight.states)[:, RATES]
     start = np.arange(around, samples - ahead.max() - around, max(int(round(every / dt)), 1))
     start = start[stretch[start - around] == stretch[np.minimum(start + ahead.max(), samples - 1)]]
     initial = rates[start[:, None] + np.arange(-around, around + 1)].mean(axis=1)
@@ -140,7 +139,7 @@ def _predict(
     steps: int,
 ) -> Float[Array, "starts steps 3"]:
     model, scalars, forcing = problem.model, tuple(parameters), problem.forcing(parameters)
-    fading = transition(jax.tree.map(as_float, noise), problem.flight.dt)
+    fading = Transition.of(jax.tree.map(as_float, noise), problem.flight.dt)
     calm = Filtered(jnp.zeros((steps, 3)), jnp.zeros((steps, 3)))
 
     def fly(first: Int[Array, ""], measured: Array, disturbance: Array) -> Float[Array, "steps 3"]:

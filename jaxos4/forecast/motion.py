@@ -14,7 +14,7 @@ from ..flight import RATES, STATE_NAMES, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST
-from ..shooting.gains import Covariance, LogNoise, first_covariance, is_rate, next_gains, step_of, transition
+from ..shooting.gains import Covariance, LogNoise, Transition, first_covariance, is_rate, next_gains, step_of
 from ..simulation import rk4_step
 
 _Samples = Float[Numeric, "*samples"]
@@ -178,7 +178,7 @@ def _fly(
         feasible = feasible & finite & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
         return jax.tree.map(lambda new, old: jnp.where(feasible, new, old), moved, motion), feasible
 
-    motion, _ = open_loop(advance, (begin, jnp.array(True)), known, rows, future.gusts, transition(noise, dt))
+    motion, _ = open_loop(advance, (begin, jnp.array(True)), known, rows, future.gusts, Transition.of(noise, dt))
     return jnp.stack(jax.tree.leaves(motion), axis=1)
 
 
@@ -251,8 +251,8 @@ def known_at_samples(
     # The bias of an accelerometer is its mean over the memory.
     force = force - _past(jnp.nan_to_num(force), kept) / jnp.maximum(_past(~jnp.isnan(force), kept), 1.0)
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
-    stretch = jnp.zeros(len(rates), dtype=int) if flight.stretch is None else flight.stretch
-    filters, _ = filtered(noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
+    seen = jnp.concatenate([rates, force], axis=1)
+    filters, _ = filtered(noise, seen, modelled, flight.stretch_numbers, flight.dt)
     return Known(state, filters, unsure), forcing, offset
 
 
@@ -305,5 +305,5 @@ def settled(noise: LogNoise, dt: Scalar, rows: int) -> tuple[Covariance, Covaria
     p, gains = jax.lax.scan(lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=rows)
     driven, disturbance = gains.driven[-1], gains.disturbance[-1]
     after, _ = next_gains(p, step_of(noise, jnp.zeros_like(dt)), measured, never)
-    absorbed = disturbance * dt / (disturbance * step.moved.reach + (1 - step.moved.kept) * driven)
+    absorbed = disturbance * dt / (disturbance * step.transition.reach + (1 - step.transition.kept) * driven)
     return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

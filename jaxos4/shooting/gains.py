@@ -98,7 +98,7 @@ class Covariance(NamedTuple):
     disturbance: Channels
 
 
-class Moved(NamedTuple):
+class Transition(NamedTuple):
     """d and x over one sample, without noise.
 
     - `kept`, `driven_kept`: the shares of d and of x that remain. `reach`: what a unit of d adds to x.
@@ -108,11 +108,17 @@ class Moved(NamedTuple):
     driven_kept: Channels
     reach: Channels
 
+    @classmethod
+    def of(cls, noise: LogNoise, dt: Float[Array, "..."]) -> "Transition":
+        """Over one sample of this length."""
+        response = _Response.of(noise)
+        return cls(response.fading(dt), response.driven_fading(dt), response.driven(dt))
+
 
 class Step(NamedTuple):
     """The disturbance over one sample, of each channel.
 
-    - `moved`: see there.
+    - `transition`: see there.
     - `driven_seen`, `seen`: what a unit of x and of d adds to the measurement.
     - `since_seen`: x at the end of the sample, for each unit of x in the measurement.
     - `added`: the covariance that its noise adds at the end of the sample.
@@ -121,7 +127,7 @@ class Step(NamedTuple):
     - `first`: the covariance before anything is measured; rates are known. `sensor`: the variance of its noise.
     """
 
-    moved: Moved
+    transition: Transition
     driven_seen: Channels
     seen: Channels
     since_seen: Channels
@@ -172,12 +178,6 @@ class _Response(NamedTuple):
         return jnp.where(is_rate(tau), tau * (time - slow), tau * (slow - quick) / (tau - fast))
 
 
-def transition(noise: LogNoise, dt: Float[Array, "..."]) -> Moved:
-    """The disturbance over one sample."""
-    response = _Response.of(noise)
-    return Moved(response.fading(dt), response.driven_fading(dt), response.driven(dt))
-
-
 def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) -> Step:
     """The step over one sample of this length. Measurements are means over `window`."""
     noise = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1), noise)
@@ -209,7 +209,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     mean = jnp.where(in_window > 0, -jnp.expm1(-in_window) / jnp.where(in_window > 0, in_window, 1.0), 1.0)
     force = jnp.where(rate, 0.0, variance)
     return Step(
-        moved=transition(noise, dt),
+        transition=Transition.of(noise, dt),
         driven_seen=jnp.where(rate, 1.0, response.driven_fading(begin) * mean),
         seen=measured(jnp.zeros_like(begin)),
         since_seen=jnp.where(rate, 1.0, response.driven_fading(dt - begin) / mean),
@@ -235,7 +235,7 @@ def next_gains(
     first = first_covariance(step, p.driven.shape[-1])
     first = first._replace(driven=first.driven + jnp.where(is_rate(first.driven), _UNKNOWN_RATE**2, 0.0))
     driven, cross, disturbance = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
-    (kept, _, reach), seen, since = step.moved, step.seen, step.since_seen
+    (kept, _, reach), seen, since = step.transition, step.seen, step.since_seen
     # Covariances with the measurement, and with `gap`: x at the end less what remains of the measurement. The gap does
     # not depend on x at the beginning, whose variance may be huge. So no difference of large numbers is computed.
     driven_seen = step.driven_seen * driven + seen * cross
