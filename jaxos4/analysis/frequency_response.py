@@ -190,9 +190,7 @@ def _parts(
     problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
 ) -> tuple[Float[Array, "steps 3"], Float[Array, "steps 3"]]:
     """The model's change of the measured rates over each step [rad/s^2]: by the rotors, and by the rates."""
-    every = jnp.arange(rates.shape[0])[None]
-    forcing = problem.model.mean_forcing(problem.flight.inputs, parameters, every)
-    forcing = jax.tree.map(lambda leaf: leaf[0], forcing)
+    forcing = problem.model.mean_forcing(problem.flight.inputs, parameters)
 
     def at(rates: Array, forcing: Forcing) -> Array:
         return jnp.stack(problem.model.angular_acceleration(Rates(*rates.T), forcing, tuple(parameters)), axis=1)

@@ -73,9 +73,9 @@ class AbstractOS4(AbstractModel):
         roll, pitch, yaw, thrust = (jnp.square(omega) @ airframe.mixer.T).T
         return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
 
-    def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
+    def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
         """That of `forcing`: measurements are instants."""
-        return jax.tree.map(lambda leaf: leaf[place], self.forcing(inputs, parameters))
+        return self.forcing(inputs, parameters)
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
         """See `AbstractModel`."""
