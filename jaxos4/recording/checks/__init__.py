@@ -8,6 +8,7 @@ from ...airframe import Airframe
 from ...logs import Recording
 from .channels import (
     clipped_values,
+    constant_force,
     impossible_values,
     rare_motors,
     rare_speeds,
@@ -40,6 +41,7 @@ CHECKS: tuple[Check, ...] = (
     thrust_direction,
     velocity_axes,
     clipped_values,
+    constant_force,
     rare_motors,
     rare_speeds,
     impossible_values,

@@ -79,6 +79,23 @@ def clipped_values(evidence: Evidence) -> Finding | None:
     )
 
 
+def constant_force(evidence: Evidence) -> Finding | None:
+    """A vertical specific force that never changes, although the rotors do."""
+    force = evidence.logged.specific_force
+    measured = np.empty(0) if force is None else force[np.isfinite(force[:, 2]), 2]
+    squares = np.square(evidence.logged.omega).sum(axis=1)
+    if len(set(measured.tolist())) != 1 or squares.std() < evidence.limits.thrust_moves * squares.mean():
+        return None
+    return Finding(
+        "constant_force",
+        "the vertical specific force never changes, although the rotors do",
+        f"{measured[0]:.4g} m/s^2 in all {measured.size} samples",
+        "log what the accelerometer measures, or leave its columns out",
+        ("thrust", *INERTIAS),
+        True,
+    )
+
+
 def rare_speeds(evidence: Evidence) -> Finding | None:
     """Rotor speeds at instants so far apart that what rotors do in between matters."""
     logged = evidence.logged
