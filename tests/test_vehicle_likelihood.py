@@ -17,7 +17,7 @@ from jaxos4.flight import STATE_NAMES
 from jaxos4.identification import uncertainty
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
-from jaxos4.identification.sample_time import moved, sample_time_of, search_sample_times, shortest
+from jaxos4.identification.sample_time import chosen_place, moved, sample_time_of, search_sample_times
 from jaxos4.identification.uncertainty import Profile, corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
@@ -94,13 +94,15 @@ PLATEAUS = {
     "last alone": ([(A, 0.9), (A, 0.8), (A, 0.1)], 2),
     "no plateau": ([(A, 0.1), (B, 0.1), (A, 0.1)], 0),
     "no answer": ([((), 0.1), (A, 0.1), (A, 0.1)], 1),
+    "no answer beside it": ([(A, 0.0), ((), 0.0), (B, 0.0), (B, 0.0)], 2),
+    "nothing shared": ([((10.0,), 0.0), ((), 0.0), ((10.0,), 0.0), ((10.0,), 0.0)], 0),
 }
 
 
 @pytest.mark.parametrize(("rows", "place"), PLATEAUS.values(), ids=PLATEAUS)
 def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(rows, place):
     """Answers agree within two standard deviations and three percent."""
-    assert shortest(table(*rows)) == place
+    assert chosen_place(table(*rows)) == place
     own, near, far = (table((values, 0.0))[0] for values in (A, (12.2, 20.0), (12.4, 20.0)))
     assert moved(own, near) == []
     assert moved(own, far) == moved(far, own) == ["Ix"]
@@ -111,8 +113,8 @@ def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
     near = table((A, 0.0), ((10.5, 20.0), 0.0), ((10.5, 20.0), 0.0))
     wide = {name: Constant(row.estimate, 2.0, "kg m^2") for name, row in near[0].constants.items()}
     vague = msgspec.structs.replace(near[0], constants=wide)
-    assert shortest(near) == 0
-    assert shortest([vague, *near[1:]]) == 1
+    assert chosen_place(near) == 0
+    assert chosen_place([vague, *near[1:]]) == 1
 
 
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):

@@ -4,8 +4,8 @@ Short samples contain the vibration of the sensors. Long samples hide motion. Th
 times, from the longest on. A sample time that the user gives is fitted in the same way, and longer ones beside it.
 
 The rule: the shortest sample time at which the innovations of the body rates are nearly white, and the moments of
-inertia are those of samples twice as long, within two standard deviations, and known nearly as well. If there is none:
-the shortest without vibration. If all have it: the longest with an answer.
+inertia are those of the next longer samples with an answer, within two standard deviations, and known nearly as well.
+If there is none: the shortest without vibration. If all have it: the longest with an answer.
 """
 
 import math
@@ -74,13 +74,19 @@ def start_of(likelihood: InnovationsProblem, found: Estimate) -> Float[np.ndarra
     return start if is_minimum else None
 
 
-def shortest(rows: Sequence[SampleTime]) -> int:
+def chosen_place(rows: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `rows`: the shortest sample time first."""
     answered = [i for i, row in enumerate(rows) if row.constants] or [0]
+    longer = dict(zip(answered, (rows[i] for i in answered[1:]), strict=False))
     limits = [RULE.white + RULE.chance / math.sqrt(max(row.samples, 1)) for row in rows]
     clean = [i for i in answered if abs(rows[i].correlation) <= limits[i]] or answered[-1:]
-    steady = (i for i in clean[:-1] if not moved(rows[i], rows[i + 1]) and not _vague(rows[i], rows[i + 1]))
-    return next(steady, clean[0])
+    return next((i for i in clean[:-1] if _agree(rows[i], longer[i])), clean[0])
+
+
+def _agree(row: SampleTime, other: SampleTime) -> bool:
+    """Whether the next longer sample time with an answer finds the same, and knows it no better."""
+    shared = row.constants.keys() & other.constants.keys()
+    return bool(shared) and not moved(row, other) and not _vague(row, other)
 
 
 def _vague(row: SampleTime, other: SampleTime) -> bool:

@@ -27,7 +27,7 @@ from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
 from .problem import Intervals, bracket_of
-from .sample_time import sample_time_of, search_sample_times, shortest
+from .sample_time import chosen_place, sample_time_of, search_sample_times
 from .search import search
 from .settings import VehicleSettings, name_and_class
 from .uncertainty import at_lowest, corrected
@@ -85,7 +85,7 @@ class VehicleCase:
         optima = search_sample_times(compared, solver, progress=progress)
         answers = [corrected(x, data) for x, data in zip(optima, compared, strict=True)]
         rows = [sample_time_of(answer) for answer in answers]
-        place = shortest(rows) if self.choose and rows else 0
+        place = chosen_place(rows) if self.choose and rows else 0
         data = self.data[place]
         if is_default:
             optimum = optima[place]

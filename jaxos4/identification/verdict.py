@@ -24,16 +24,16 @@ PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 class Tolerance(msgspec.Struct, frozen=True):
     """Limits of a verdict: the change that a doubt may cause, and the accuracy that is needed.
 
-    - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, by more than one of them
-      makes a reservation, by less is a note. Errors of discretisation reach 3 %, and an interval allows for one
-      standard deviation. Moves of reservations add up; see `judge`.
+    - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, unless it is a mere
+      `reservation`; by more than one of them makes a reservation, by less is a note. Errors of discretisation reach
+      3 %, and an interval allows for one standard deviation. Moves of reservations add up; see `judge`.
     - `vague`, `unknown`: half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a
       reservation, or is not identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
     - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
       of it, these are not identified. Segments last 1.25 s, and the jackknife compares at least four parts.
     - `prior`: the share of the information about a parameter that its bracket may give without a reservation.
     - `late`: motors that act earlier than they are recorded by more than this are recorded late [s].
-    - `sure`, `consistent`: what exceeds chance: so many standard deviations, or a probability below the second.
+    - `sure`, `consistent`: what exceeds chance: this many standard deviations, or a probability below the second.
     """
 
     share: float = 0.05
@@ -91,7 +91,7 @@ class Doubt(msgspec.Struct, frozen=True):
         return {"successful": RESERVED, "implausible": CONTRADICTED}.get(self.result, MISSING)
 
     def status_left(self, name: str, tolerance: Tolerance = TOLERANCE) -> str:
-        """The status that it alone leaves to the quantity of this name."""
+        """The status of the quantity of this name if this were the only doubt."""
         if name not in self.moves:
             return IDENTIFIED
         if (move := self.moves[name]) is None:
@@ -138,7 +138,7 @@ class Quantity(NamedTuple):
 
     - `value`: see `Verdict`. `spread`: half of its 95 % interval, as a share of it; 0 if it can be 0.
     - `missing`: why there is no estimate, and what to do; empty if there is one.
-    - `reservations`: what is to be known beside the doubts.
+    - `reservations`: caveats that are not doubts.
     """
 
     value: str = ""
@@ -237,5 +237,5 @@ def reason_lines(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[
     notes = [doubt for doubt in doubts if all(doubt.status_left(name) == IDENTIFIED for name in verdicts)]
     return [
         *(f"{', '.join(names)}: {reason}." for reason, names in concerned.items()),
-        *(f"note: {doubt}. It moves nothing." for doubt in notes if verdicts),
+        *(f"note: {doubt}. It affects no quantity." for doubt in notes if verdicts),
     ]

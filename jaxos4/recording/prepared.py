@@ -65,7 +65,7 @@ class Prepared(NamedTuple):
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
-    - `doubts`: what the logs show that concerns moments of inertia.
+    - `doubts`: what the logs show that concerns moments of inertia, or contradicts another quantity.
     - `log_step`: the longest sample of the logs [s].
     """
 
@@ -173,7 +173,7 @@ def _cleaned(
         raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
     evidence = Evidence(recording, airframe)
     found = [msgspec.structs.replace(each, cause=f"{name}: {each.cause}") for each in findings(evidence)]
-    doubts = [each for each in found if {*each.quantities} & {*INERTIAS}]
+    doubts = [each for each in found if _is_doubt(each)]
     notes = [str(each) for each in found if each not in doubts]
     slow = (facts._replace(gyro=None) if predicted else facts).too_slow
     usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
@@ -187,6 +187,11 @@ def _cleaned(
     if yaw := opposite_yaw(opposite.get("yaw")):
         doubts.append(msgspec.structs.replace(yaw, cause=f"{name}: {yaw.cause}"))
     return _Cleaned(usable, [*notes, *recording.named_notes, *note], doubts, evidence)
+
+
+def _is_doubt(finding: Finding) -> bool:
+    """Whether it concerns a moment of inertia, or contradicts another quantity of the vehicle."""
+    return bool({*finding.quantities} & {*INERTIAS}) or (finding.contradicted and finding.quantities != ("attitude",))
 
 
 def at_limit(recording: Recording, airframe: Airframe, rules: Preparation = RULES) -> tuple[str, str] | None:
