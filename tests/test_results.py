@@ -16,6 +16,7 @@ from rich.console import Console
 from strange import survives_strange_values
 from synthetic_identification import (
     SAMPLE_TIMES,
+    WRONG,
     behind_an_estimate,
     identified_flight,
     identified_vehicle,
@@ -43,12 +44,8 @@ FULL = {
 }
 
 
-def write(found, path):
-    path.write_text(json.dumps(found.to_dict()))
-
-
 def written(found, path):
-    write(found, path)
+    path.write_text(json.dumps(found.to_dict()))
     return jaxos4.read_result(path)
 
 
@@ -73,7 +70,7 @@ def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
 def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path):
     found = identified_vehicle(**FULL)
     write_flight_page(tmp_path / "fresh.html", found)
-    write(found, tmp_path / "found.json")
+    written(found, tmp_path / "found.json")
     code, out, err = run("report", "found.json")
     assert (code, err) == (0, "")
     assert out.startswith("found.html: ")
@@ -81,7 +78,7 @@ def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path)
     assert run("report", "found.json", "--out", "other.html")[0] == 0
     assert (tmp_path / "other.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
     refused(run("report", "found.json", "--out", "found.json"), "would overwrite an input")
-    write(identified_flight(), tmp_path / "os4.json")
+    written(identified_flight(), tmp_path / "os4.json")
     assert run("report", "os4.json")[0] == 0
     assert "<title>flight.csv</title>" in (tmp_path / "os4.html").read_text(encoding="utf-8")
     (tmp_path / "study").mkdir()
@@ -143,7 +140,7 @@ def shown(path):
     write_flight_page(path.with_suffix(".html"), found)
 
 
-WRONG = [
+DAMAGES = [
     (("predictions", "start", 1), 5, "`predictions`: starts must increase"),
     (("predictions", "start", 0), -1, "`predictions`: starts must increase"),
     (("predictions", "horizons", 0), -1.0, "`predictions`"),
@@ -177,7 +174,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "said"), WRONG, ids=lambda x: ".".join(map(str, x)) if isinstance(x, tuple) else ""
+    ("place", "value", "said"), DAMAGES, ids=lambda x: ".".join(map(str, x)) if isinstance(x, tuple) else ""
 )
 def test_what_no_result_has_is_named(run, tmp_path, place, value, said):
     table = identified_vehicle(**FULL).to_dict()
@@ -288,7 +285,7 @@ AGREE = (1.66e-5, 1.69e-5, 1.64e-5)
 @pytest.fixture
 def files(tmp_path):
     for i, ix in enumerate((*AGREE, 1.9e-5)):
-        write(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}), tmp_path / f"{i}.json")
+        written(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}), tmp_path / f"{i}.json")
     return [f"{i}.json" for i in range(4)]
 
 
@@ -319,9 +316,8 @@ def test_three_results_that_agree_are_pooled_and_one_that_does_not_is_named(run,
 
 
 def test_what_a_verdict_refuses_is_shown_and_does_not_count(tmp_path):
-    refusing = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
     results = [of_inertias(ix) for ix in AGREE]
-    wrong = msgspec.structs.replace(of_inertias(9e-5), verdicts=refusing, result="implausible")
+    wrong = msgspec.structs.replace(of_inertias(9e-5), verdicts=WRONG, result="implausible")
     found = jaxos4.compare_results([*results, wrong])
     assert found.quantities[0].used == (True, True, True, False)
     assert found.quantities[0].value == pytest.approx(np.mean(AGREE))
@@ -335,7 +331,7 @@ def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):
     refused(run("compare", "0.json"), "two results or more")
     refused(run("compare", "--report", "page.html"), "--report: is for a comparison of results")
     refused(run("compare", *files, "--quick"), "--quick: is for a comparison of estimators")
-    write(identified_flight(), tmp_path / "os4.json")
+    written(identified_flight(), tmp_path / "os4.json")
     refused(run("compare", "0.json", "os4.json"), "os4.json: is of the published model")
     heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, jnp.asarray(0.03))
     other = of_inertias(1.66e-5, airframe=heavy)
