@@ -273,6 +273,20 @@ def documented_class(page: str) -> str:
 
 
 COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
+# Runs each line of its arguments. Prints its code, what it printed, and the packages that are loaded after it.
+EACH = """
+import contextlib, io, json, sys
+from jaxos4.cli import main
+for line in sys.argv[1:]:
+    sys.argv, printed = ["jaxos4", *line.split()], io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+    packages = sorted({name.split(".")[0] for name in sys.modules})
+    sys.__stdout__.write(json.dumps([line, code, printed.getvalue(), packages]) + "\\n")
+"""
 
 
 def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) -> subprocess.CompletedProcess[str]:
