@@ -59,6 +59,15 @@ def in_blocks(page: str) -> list[str]:
     return commands("\n".join(blocks(PAGES[page])))
 
 
+def merged(lines: list[str]) -> list[str]:
+    """Estimates that differ only in the files that they write are one, which writes all of them."""
+    found: dict[str, dict[str, None]] = {}
+    for line in lines:
+        options = r" --(?:out|report) \S+" if " estimate " in line else "$^"
+        found.setdefault(re.sub(options, "", line), {}).update(dict.fromkeys(re.findall(options, line)))
+    return [line + "".join(files) for line, files in found.items()]
+
+
 def parser(line: str):
     """The parser of a command, and its arguments."""
     program, *words = shlex.split(line.removeprefix("python -m "))
@@ -110,13 +119,12 @@ def test_the_commands_of_pages_run(story, run, tmp_path, request):
     if story == "real":
         log, vehicle = request.getfixturevalue("shared_flights") / "cinerat/cinerat_281.csv", airframe_table(CINERAT)
         shutil.copy(log, tmp_path / "mylog.bbl")
-    every = dict.fromkeys(line for page in STORIES[story] for line in in_blocks(page))
+    every = [line for page in STORIES[story] for line in in_blocks(page)]
+    here = [re.sub(SHORTER, "15", line) for line in every if not any(re.match(each, line) for each in ELSEWHERE)]
     said = ""
     # A page shows what comes of a simulated flight before it says how to simulate one.
-    for line in sorted(every, key=lambda line: "simulate --closed-loop" not in line):
-        if any(re.match(pattern, line) for pattern in ELSEWHERE):
-            continue
-        code, out, err = run(*shlex.split(re.sub(SHORTER, "15", line))[1:])
+    for line in sorted(merged(here), key=lambda line: "simulate --closed-loop" not in line):
+        code, out, err = run(*shlex.split(line)[1:])
         assert code == next((code for option, code in EXIT_CODES.items() if option in line), 0), (line, err)
         said += " ".join(out.split())
         if "--airframe-out" in line:
