@@ -1,7 +1,6 @@
 """The documentation agrees with the code, and the type checker of the tests sees every call."""
 
 import json
-import pathlib
 import re
 import shutil
 import subprocess
@@ -12,7 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, EACH, documented_class, how_we_compile, standard_flight, standard_problem, start
+from helpers import (
+    CRAZYFLIE,
+    EACH,
+    ROOT,
+    blocks,
+    documented_class,
+    how_we_compile,
+    standard_flight,
+    standard_problem,
+    start,
+)
 from jaxtyping import Array, Float, TypeCheckError, jaxtyped
 from synthetic_identification import identified_flight, identified_vehicle
 from typechecker import check
@@ -25,13 +34,7 @@ from jaxos4.estimators import ESTIMATORS
 from jaxos4.noise import NOISES
 from jaxos4.study import load_study
 
-ROOT = pathlib.Path(__file__).resolve().parents[1]
 EXTEND = ROOT / "docs" / "extend"
-
-
-def blocks(page: pathlib.Path, language: str) -> list[str]:
-    """The blocks of code in a page."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
 
 
 def run_blocks(page: str, **given) -> dict:

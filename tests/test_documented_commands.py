@@ -7,7 +7,7 @@ import tomllib
 
 import pytest
 import typer
-from helpers import ROOT
+from helpers import ROOT, blocks
 from small_experiments import load
 from typer.main import get_command
 
@@ -49,14 +49,8 @@ def commands(text: str) -> list[str]:
     return list(dict.fromkeys(" ".join(line.split("#")[0].split()) for line in lines))
 
 
-def blocks(text: str, language: str = "") -> list[str]:
-    """The blocks of a page in this language."""
-    every = re.findall(r"^```(\w*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
-    return [block for name, block in every if name == language]
-
-
 def in_blocks(page: str) -> list[str]:
-    return commands("\n".join(blocks(PAGES[page])))
+    return commands("\n".join(blocks(ROOT / page)))
 
 
 def merged(lines: list[str]) -> list[str]:
@@ -111,7 +105,7 @@ def filled_in(airframe: str, vehicle: dict) -> str:
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("story", STORIES)
 def test_the_commands_of_pages_run(story, run, tmp_path, request):
-    complete, (own,) = blocks(PAGES["docs/index.md"], "toml"), blocks(PAGES["docs/drone.md"], "toml")[-1:]
+    complete, (own,) = blocks(ROOT / "docs/index.md", "toml"), blocks(ROOT / "docs/drone.md", "toml")[-1:]
     (tmp_path / "vehicle.toml").write_text(own)
     mine, vehicle = tmp_path / "mine.toml", tomllib.loads(own)
     if story == "study":

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import CRAZYFLIE, refused
 from matplotlib.figure import Figure
-from pages import stands_alone, words
+from pages import printed, stands_alone, words
 from rich.console import Console
 from strange import survives_strange_values
 from synthetic_identification import (
@@ -49,12 +49,6 @@ def written(found, path):
     return jaxos4.read_result(path)
 
 
-def text_of(found):
-    console = Console(width=80, file=io.StringIO())
-    print_identification(console, found, verbose=True)
-    return console.file.getvalue()
-
-
 @pytest.mark.parametrize(
     "found", [identified_vehicle(**FULL), identified_flight(**behind_an_estimate())], ids=["vehicle", "os4"]
 )
@@ -62,7 +56,7 @@ def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
     again = written(found, tmp_path / "found.json")
     assert (again.estimate, again.problem) == (None, None)
     assert again.to_dict() == found.to_dict()
-    assert text_of(again) == text_of(found)
+    assert printed(again) == printed(found)
     assert written(again, tmp_path / "again.json").to_dict() == found.to_dict()
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "found.json").read_bytes()
 
@@ -133,7 +127,7 @@ def test_channels_that_are_logged_rarely_stay_in_thinned_traces():
 def shown(path):
     """All that is made of a result's file."""
     found = jaxos4.read_result(path)
-    text_of(found)
+    printed(found)
     assert found._repr_html_()
     assert len(found.to_dataframe()) >= len(found.to_dataset()["parameter"])
     print_comparison(Console(file=io.StringIO()), jaxos4.compare_results([found, path]))

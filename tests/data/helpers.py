@@ -265,6 +265,12 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
         assert fragment in err
 
 
+def blocks(page: pathlib.Path, language: str = "") -> list[str]:
+    """The blocks of a page in this language."""
+    every = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return [block for name, block in every if name == language]
+
+
 def documented_class(page: str) -> str:
     """The class that a page of `docs/extend` shows, as a file of its own has it."""
     text = (ROOT / "docs" / "extend" / page).read_text(encoding="utf-8")
