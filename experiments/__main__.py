@@ -1,19 +1,23 @@
 """Runs a script of an experiment in double precision: `python -m experiments closed_loop.effects --help`.
 
 With `--publish NAME`, the tables that it prints become a result file, see `published.py`. `python -m experiments
-render` writes the tables of the pages from these files.
+render` writes the tables of the pages from these files. `python -m experiments again NAME ...` computes published
+results once more, and `again all` every one.
 """
 
 import importlib
+import shlex
+import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
 import typer
 
 from experiments.monte_carlo import machine
-from experiments.published import RECORDER, render
+from experiments.published import FOLDER, RECORDER, read, render
 
 
 def scripts() -> Iterator[str]:
@@ -39,7 +43,7 @@ def published(arguments: list[str]) -> str | None:
 def run(name: str, arguments: list[str]) -> None:
     """Runs a script with its arguments."""
     if name not in scripts():
-        raise SystemExit(f"{name}: no such script; give one of {', '.join(scripts())}, or render.")
+        raise SystemExit(f"{name}: no such script; give one of {', '.join(scripts())}, again or render.")
     result = published(arguments)
     command = [name, *arguments]
     jax.config.update("jax_enable_x64", True)
@@ -54,8 +58,28 @@ def run(name: str, arguments: list[str]) -> None:
         RECORDER.publish(result, command, machine())
 
 
+def commands(names: Sequence[str], folder: Path = FOLDER) -> dict[str, list[str]]:
+    """The arguments that compute published results once more, by their names; `all`: every result.
+
+    A script that finds its `--out` file continues it: remove the file first.
+    """
+    every = sorted(path.stem for path in folder.glob("*.json"))
+    chosen = every if list(names) == ["all"] else names
+    return {name: [*shlex.split(read(name, folder).command), "--publish", name] for name in chosen}
+
+
+def again(names: Sequence[str]) -> None:
+    """Computes published results once more, each in a process of its own."""
+    for name, arguments in commands(names).items():
+        begin = time.perf_counter()
+        ended = subprocess.run([sys.executable, "-m", "experiments", *arguments], check=False).returncode
+        print(f"{name}: {time.perf_counter() - begin:.0f} s{f', ended with {ended}' if ended else ''}")
+
+
 if __name__ == "__main__":
     if sys.argv[1:] == ["render"]:
         render()
+    elif sys.argv[1:2] == ["again"]:
+        again(sys.argv[2:])
     else:
         run(sys.argv[1] if len(sys.argv) > 1 else "none", sys.argv[2:])

@@ -45,6 +45,7 @@ def machine() -> Row:
 def write_report(out: Path | None, report: Row) -> None:
     """Writes what there is of a report, if it has a file."""
     if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(report, indent=1) + "\n")
 
 

@@ -76,6 +76,7 @@ class Recorder:
 
         @functools.wraps(main)
         def run(**arguments: Any) -> None:
+            commit()  # of the code that runs, although a later one may be checked out when it ends
             self.settings = {name: _plain(value) for name, value in arguments.items()}
             main(**arguments)
 

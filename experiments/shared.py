@@ -5,6 +5,7 @@ import io
 import itertools
 import json
 import os
+import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -60,9 +61,16 @@ def flight_files(folder: Path | None, names: Iterable[str]) -> list[Path]:
 def run_studies(studies: dict[str, Study], out: Path) -> None:
     """Runs or resumes each study in the folder of its name in `out`. Raises what `open_store` raises.
 
-    Prints a line for each study, scenario, noise scale and estimator.
+    Prints a line for each study, scenario, noise scale and estimator, and what this run took: nothing for cells that
+    were there.
     """
-    found = {name: run_with_bar(study, out / name) for name, study in studies.items()}
+    found, spent = {}, []
+    for name, study in studies.items():
+        begin = time.perf_counter()
+        found[name] = run_with_bar(study, out / name)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        spent.append((name or study.title, f"{study.flights:,}", f"{time.perf_counter() - begin:.0f}", f"{peak:,.0f}"))
+    print_table("time and memory of this run", ("study", "flights", "time [s]", "peak memory [MiB]"), spent)
     titles = {f"{study.title}: {study.flights} flights, seed {study.seed}" for study in studies.values()}
     error = 1 / np.sqrt(2 * max(study.flights for study in studies.values()))
     headings = "scenario", "noise", "estimator", "RMSE / bound", "95 % intervals that hold [%]", "rollouts", "results"

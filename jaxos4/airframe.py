@@ -4,7 +4,7 @@ import math
 from dataclasses import MISSING, fields
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +19,32 @@ from .errors import InputError, named, shortened
 
 GRAVITY, STANDARD_GRAVITY = 9.81, 9.80665
 """The gravity of an airframe that gives none, and the unit g [m/s^2]."""
+
+
+class Axis(NamedTuple):
+    """What belongs to one axis of the body.
+
+    - `motion`: about it. `rate`, `inertia`: the names of the body rate and of the moment of inertia.
+    - `coupling`, `inverse`: the alphas of its rate equation that are the gyroscopic coupling and 1 / `inertia`.
+    - `place`: that of `inverse` among alpha_1..8, counted from 0.
+    """
+
+    motion: str
+    rate: str
+    inertia: str
+    coupling: str
+    inverse: str
+    place: int
+
+
+AXES = ROLL, PITCH, YAW = (
+    Axis("roll", "p", "Ix", "alpha1", "alpha3", 2),
+    Axis("pitch", "q", "Iy", "alpha4", "alpha6", 5),
+    Axis("yaw", "r", "Iz", "alpha7", "alpha8", 7),
+)
+MOTIONS, INERTIAS = tuple(axis.motion for axis in AXES), tuple(axis.inertia for axis in AXES)
+INVERSES = [axis.place for axis in AXES]
+"""The places of the alphas that are reciprocals of moments of inertia."""
 
 ALTERNATING_SPINS = (1.0, -1.0, 1.0, -1.0)
 

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._custom_types import Key, Numeric, RotorSpeeds, as_float, setting
-from .airframe import Airframe
+from .airframe import AXES, Airframe
 
-AXES = ("roll", "pitch", "yaw")
 STANDARD_TONES = ((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), (0.5, 0.9, 1.7))
 
 Amplitude = float | Sequence[float] | Float[Numeric, "3"]

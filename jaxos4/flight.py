@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ._custom_types import Count, RotorSpeeds, Scalar, States, as_float
+from ._custom_types import Count, Numeric, RotorSpeeds, Scalar, States, as_float
 from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
@@ -135,6 +135,13 @@ class Flight(eqx.Module):
         # A recorded flight's sample time needs no compiled program.
         time = self.time if isinstance(self.time, Tracer) else np.asarray(self.time)
         return as_float((time[-1] - time[0]) / (time.shape[0] - 1))
+
+    @property
+    def stretch_numbers(self) -> Int[Numeric, " samples"]:
+        """`stretch`, also of a flight that is one; NumPy unless it is traced."""
+        if isinstance(self.stretch, Tracer):
+            return self.stretch
+        return np.zeros(self.time.shape[0], dtype=int) if self.stretch is None else np.asarray(self.stretch)
 
     @property
     def inputs(self) -> Inputs:

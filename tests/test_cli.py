@@ -65,7 +65,7 @@ def test_estimate_recovers_the_truth_within_its_intervals(run):
         assert name in out
     for name in ("alpha2", "alpha5"):  # 6e-9, far below the noise
         assert report["parameters"][name]["note"] == "below noise"
-    assert "residuals white (Ljung-Box), tests at 1%: all" in out
+    assert "residuals white (Ljung-Box), tests at 1 %: all" in out
     for row in report["fit"].values():
         assert row["percent"] > 85
         assert abs(row["correlation"]) < 0.3
@@ -87,7 +87,7 @@ def test_windows_and_validation(run):
     code, out, err, report = estimate(run, "--channels", "rates", "--window", "0.5", "--validate", "other.csv")
     assert code == 0, err
     assert "validation on other.csv" in out
-    assert "residuals free of the inputs (cross-correlation), tests at 1%: all" in out
+    assert "residuals free of the inputs (cross-correlation), tests at 1 %: all" in out
     assert "Ljung-Box" not in out  # the initial state of each window correlates its residuals
     assert report["provenance"]["windows"] == 4
     for row in (*report["fit"].values(), *report["validation"]["fit"].values()):

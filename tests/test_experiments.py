@@ -210,6 +210,37 @@ def test_coverage(tmp_path):
         assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
 
 
+def test_defaults(tmp_path):
+    settings = ["equation error, memory 0", "equation error, memory 1 (default)", "ant colony, q 0.1"]
+    rows = result_of(tmp_path, "defaults", flights=8, seed=7, settings=settings)["rows"]
+    assert [(row["setting"], row["scale"]) for row in rows] == [
+        (settings[0], 1.0),
+        *((settings[1], scale) for scale in (0.1, 1.0, 10.0)),
+        (settings[2], 1.0),
+    ]
+    assert max(rows[2]["efficiency"]) < max(rows[0]["efficiency"]) / 3
+    assert rows[4]["results"] == {"successful": 8}
+    assert 0 <= rows[4]["gap"] < 0.02  # its cost above that of output error
+
+
+def test_robust_intervals():
+    """Those by the residuals hold the truth under coloured noise; those by the bound of white noise do not."""
+    load("coverage", "robust").main(flights=16, seed=13)
+    white, robust = (float(row[-1]) for row in RECORDER.tables[-1].rows)
+    assert white < 70 < 80 < robust
+
+
+def test_times_of_commands(monkeypatch):
+    monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
+    load("speed", "commands").main(repeats=1, commands=["simulate --help"])
+    ((command, cold, again),) = RECORDER.tables[-1].rows
+    assert command == "jaxos4 simulate --help"
+    assert 0 < float(cold)
+    assert again.count(again.split()[0]) == 3  # one run: median, least and most are one number
+    with pytest.raises(SystemExit, match="missing.csv"):
+        load("speed", "commands").main(repeats=1, commands=["estimate missing.csv"])
+
+
 def test_long_flight(tmp_path):
     """Windows follow a drift that one shot cannot. One shot ends at the bounds, and its result says so."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}

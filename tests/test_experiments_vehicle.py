@@ -1,8 +1,7 @@
-"""The experiments with vehicles and the benchmarks, in small configurations."""
+"""The experiments with vehicles, in small configurations."""
 
 import numpy as np
 import pytest
-from helpers import how_we_compile
 from scipy.signal import lfilter
 from small_experiments import load, plot, result_of
 
@@ -164,43 +163,3 @@ def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
     moved = clocks.aligned(recording)
     assert np.median(np.abs(moved.states[:-5, 6] - angle(time[:-5]))) < 0.005
     np.testing.assert_array_equal(moved.states[:, 7], states[:, 7])
-
-
-# Benchmarks.
-
-
-def test_benchmarks(monkeypatch, tmp_path):
-    for name, value in how_we_compile().items():
-        monkeypatch.setenv(name, value)
-    fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
-    sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
-    growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}
-    others = {"contenders": fits, "shooters": shots, "network_steps": 0, "simulations": 0}
-    report = result_of(tmp_path, "benchmarks", **sizes, **growth, **others)
-    rows = report["fits"]["known"]
-    # Both reach the same optimum, and are timed in turns.
-    assert {name: row["reached"] for name, row in rows.items()} == dict.fromkeys(fits, 1.0)
-    assert all(len(row["laps"]) == 2 and row["min_seconds"] <= row["median_seconds"] for row in rows.values())
-    assert all(row["peak_mib"] > 10 for row in rows.values())
-    assert report["shots"]["jaxos4"]["steps_per_second"] > 0
-    assert 0 < report["roofline"]["share"] < 1
-    plot(tmp_path, "benchmarks")
-
-
-def test_a_benchmark_skips_who_is_missing_or_fails_and_times_only_who_reaches_the_least_cost():
-    run = load("benchmarks")
-    case = run.make_case(2, 50)
-    failing = run.Contender("scipy_fit:levenberg_marquardt", alone=True, options={"unknown": 1})
-    absent = run.Contender("scipy_fit:levenberg_marquardt", "no_such_package")
-    skipped = []
-    assert run.line_up({"failing": failing, "absent": absent}, case, 1, skipped) == {}
-    assert "failing: failed: TypeError" in skipped[0]
-    assert skipped[1] == "absent: no_such_package is not installed: pip install no_such_package"
-    truth, first = np.tile(case.truth, (2, 1)), np.zeros((2, 12))
-    answers = {
-        "both": {"parameters": truth, "first": first},
-        "one of both": {"parameters": np.stack([truth[0], case.starts[1]]), "first": first},
-        "only the first": {"parameters": truth[:1], "first": first[:1]},
-        "diverged": {"parameters": 1e3 * truth, "first": first},
-    }
-    assert list(run.reached(case, answers).values()) == [1.0, 0.5, 1.0, 0.0]

@@ -195,7 +195,7 @@ def test_the_vehicle_is_drawn_as_it_was_identified(tmp_path):
     assert [text.get_text().strip() for text in bars.texts] == ["not identified"] * 2
 
 
-CAREFUL = Verdict("identified with a reservation", "", ("it is known to 20% only",))
+CAREFUL = Verdict("identified with a reservation", "", ("it is known to 20 % only",))
 
 
 @pytest.mark.parametrize(

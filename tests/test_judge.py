@@ -11,7 +11,8 @@ from scipy.special import chdtri
 import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.identification.answers import Answer, overwhelmed
-from jaxos4.identification.doubts import doubts_of, vibration
+from jaxos4.identification.doubts import doubts_of_predictions, vibration
+from jaxos4.identification.doubts_of_values import doubts_of_values
 from jaxos4.identification.results import (
     Constant,
     Disturbance,
@@ -57,12 +58,13 @@ def skill(**rates):
     return PredictionSkill([0.1, 0.248, 0.5], 100, **{name: rate(rates.get(name, 0.8)) for name in "pqr"})
 
 
-def doubts(changed=None, inertias=None, skill=None, **others):
+def doubts(changed=None, inertias=None, skill=None, still=(), **others):
     """The doubts about a believable estimate, some of whose parameters or inertias (value, std) are changed."""
     parameters, constants = believable()
     parameters |= {name: parameter(*values) for name, values in (changed or {}).items()}
     constants |= {name: Constant(*values, "kg m^2") for name, values in (inertias or {}).items()}
-    return doubts_of(VEHICLE, parameters, constants, skill, **others)
+    found = doubts_of_values(VEHICLE, parameters, constants, **others)
+    return (*found, *doubts_of_predictions(skill, still))
 
 
 def test_nothing_speaks_against_a_good_estimate_and_one_without_roll_and_pitch_is_none():
@@ -75,7 +77,7 @@ def test_nothing_speaks_against_a_good_estimate_and_one_without_roll_and_pitch_i
     parameters, constants = believable()
     del parameters["alpha3"]
     parameters["alpha6"] = parameter(10.0, 5.0)
-    found = doubts_of(VEHICLE, parameters, {"Iz": constants["Iz"]}, None)
+    found = doubts_of_values(VEHICLE, parameters, {"Iz": constants["Iz"]})
     assert [str(doubt).split()[0] for doubt in found] == ["roll", "pitch"]
 
 
@@ -138,7 +140,8 @@ def test_a_gyro_that_vibrates_is_named():
 def test_predictions_of_a_fit_without_skill_are_not_believed(rates, axes):
     """Skill 0.1 s ahead is a reservation. Without any, predictions are refused; if clearly so, inertias too."""
     (doubt,) = doubts(skill=skill(**rates))
-    assert (doubt.result, doubt.moves) == ("successful", {"predictions": None})
+    assert (doubt.result, doubt.severity) == ("successful", "identified with a reservation")
+    assert doubt.moves == {"predictions": None}
     assert axes in str(doubt)
     assert doubts(skill=skill(**dict.fromkeys(rates))) == ()  # not measured
     # The held-out parts are too short for 0.25 s.

@@ -39,8 +39,8 @@ def test_a_sample_has_the_covariance_of_state_disturbance_and_measurement(begin,
     for channel, own in ((0, None), (3, smoothing)):
         total, added = sample(dt, tau, begin, length, own)
         drive = strength**2 * (1.0 if own is None else (tau + own) / tau)
-        moved = found.moved
-        found_total = [moved.driven_kept, found.driven_seen, moved.reach, moved.kept, found.seen]
+        over = found.transition
+        found_total = [over.driven_kept, found.driven_seen, over.reach, over.kept, found.seen]
         expected = [total[0, 0], total[2, 0], *total[:, 1]]
         np.testing.assert_allclose([leaf[channel, 0] for leaf in found_total], expected, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose((found.since_seen * found.driven_seen)[channel], total[0, 0], rtol=1e-9)
@@ -155,8 +155,7 @@ def test_stretches_and_padding_do_not_change_the_forcing_of_means():
 
 @eqx.filter_jit
 def both_forcings(model, inputs, parameters):
-    own = model.mean_forcing(inputs, parameters, np.arange(len(inputs.omega))[None])
-    return model.forcing(inputs, parameters), jax.tree.map(lambda leaf: leaf[0], own)
+    return model.forcing(inputs, parameters), model.mean_forcing(inputs, parameters)
 
 
 # A flight.

@@ -1,6 +1,9 @@
 """Published results: the tables of the pages are those of the result files, which are of this version."""
 
+import pytest
+
 import jaxos4
+from experiments.__main__ import commands
 from experiments.monte_carlo import machine, print_table
 from experiments.published import FOLDER, PAGES, Recorder, read, rendered, shown
 
@@ -40,3 +43,15 @@ def test_what_a_script_prints_is_published_and_a_page_that_differs_is_seen(tmp_p
     assert rendered(page, tmp_path) == page
     changed = page.replace("0.2 %", "0.3 %")
     assert rendered(changed, tmp_path) != changed
+
+
+def test_results_are_computed_again_by_their_own_commands(tmp_path):
+    for name, flights in (("one", 1), ("two", 2)):
+        recorder = Recorder()
+        print_table("errors", ["flights"], [[str(flights)]], tables=recorder.tables)
+        recorder.publish(name, ["small.run", "--cases", "two words", "--flights", str(flights)], machine(), tmp_path)
+    one = ["small.run", "--cases", "two words", "--flights", "1", "--publish", "one"]
+    assert commands(["one"], tmp_path) == {"one": one}
+    assert list(commands(["all"], tmp_path)) == ["one", "two"]
+    with pytest.raises(SystemExit, match="three: no such result"):
+        commands(["three"], tmp_path)

@@ -25,14 +25,14 @@ def test_the_text_of_a_flight():
         *("alpha3 1/(kg m^2) 57712 [56709, 58716] 1.3e+02", "alpha6 1/(kg m^2) - - - not identifiable: not excited"),
         *("cannot be distinguished from 0.", "multiple of the noise: alpha2 0.25.", "p 97.5, q 81.3"),
         "The residuals of q are not white noise: the model does not explain",
-        *(f"{test}, tests at 1%: not those of q." for test in (white, free)),
+        *(f"{test}, tests at 1 %: not those of q." for test in (white, free)),
         "Ix 1.733e-05 +- 2.9e-07, J_R below noise; the alphas agree with one rigid body, p = 0.21.",
         "validation on other.csv [%] (residuals in multiples of the noise): p 81.3 (2).",
         "ibss, published model, rates channels: successful, 812 rollouts, 35.4 s",
     )
     clean = printed(identified_flight(fit={"p": WHITE}, validation=None, provenance={"windows": 4}))
     assert not any(said in clean for said in ("white noise", "Ljung-Box", "validation"))
-    says(clean, "tests at 1%: all.")
+    says(clean, "tests at 1 %: all.")
 
 
 DIVERGED = {"result": "nonfinite_trajectory"}

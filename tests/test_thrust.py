@@ -11,8 +11,8 @@ from helpers import CRAZYFLIE
 
 import jaxos4
 from jaxos4.flight import RATES
-from jaxos4.shooting import InnovationsProblem
-from jaxos4.shooting.gains import LogNoise, NoiseUnknowns
+from jaxos4.shooting import InnovationsProblem, NoiseUnknowns
+from jaxos4.shooting.gains import LogNoise
 
 pytestmark = pytest.mark.slow
 

@@ -62,8 +62,8 @@ def data_of(flight, sample_time):
 
 
 @eqx.filter_jit
-def mean_forcing_of(model, inputs, parameters, place):
-    return model.mean_forcing(inputs, parameters, place)
+def mean_forcing_of(model, inputs, parameters):
+    return model.mean_forcing(inputs, parameters)
 
 
 # The choice of the sample time.
@@ -216,8 +216,8 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share)
     of_all, of_rates = (cost_of(each, jnp.asarray(parameters), noise) for each in (problem, silent))
 
     named = dict(zip(problem.unknowns.names, parameters.tolist(), strict=False))
-    forcing = mean_forcing_of(problem.model, flight.inputs, jnp.asarray(parameters), rows[None])
-    expected = named["thrust_gain"] * np.asarray(forcing.specific_thrust)[0] + named["az_bias"]
+    forcing = mean_forcing_of(problem.model, flight.inputs, jnp.asarray(parameters))
+    expected = named["thrust_gain"] * np.asarray(forcing.specific_thrust)[rows] + named["az_bias"]
     apart = np.abs(np.subtract.outer(rows, rows))
 
     def correlation(time):

@@ -13,15 +13,15 @@ from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification.answers import Solution, vehicle_constants
-from jaxos4.identification.checks import consequences
-from jaxos4.identification.doubts import doubts_of, doubts_of_log, few_parts, stronger_or_weaker
+from jaxos4.identification.doubts import doubts_of_log, few_parts, stronger_or_weaker
+from jaxos4.identification.doubts_of_values import consequences, doubts_of_values
 from jaxos4.identification.identify import describe
-from jaxos4.identification.quantities import prediction_horizons
+from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, headline, outcome, verdict_of
+from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, judge, reason_lines
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -36,6 +36,10 @@ MISSING, CONTRADICTED = "not identified", "contradicted"
 def flown(airframe=CRAZYFLIE, *, duration=20.0, seed=0, name="flight.csv", **loop):
     settings = {"gust": 2.0, "logged": "speeds"} | loop
     return Recording.of(fly_standard(jaxos4.ClosedLoop(airframe, **settings), duration=duration, seed=seed), name)
+
+
+def verdict_of(name, quantity, doubts, *tolerance):
+    return judge({name: quantity}, doubts, *tolerance).verdicts[name]
 
 
 @pytest.mark.parametrize(
@@ -57,8 +61,8 @@ def test_a_doubt_counts_by_how_far_it_moves_a_quantity(move, result, status):
     assert found.trusted == (status in (IDENTIFIED, RESERVED))
     assert [doubt.cause in reason for reason in found.reasons] == [True] * (status != IDENTIFIED)
     assert verdict_of("Iy", Quantity(), [doubt]).status == IDENTIFIED
-    # A note stands in the headline, and says that it is no more.
-    said = headline({"Ix": found}, [doubt])
+    # A note is listed too, and says that it is no more.
+    said = reason_lines({"Ix": found}, [doubt])
     assert any("moves nothing" in line for line in said) == (status == IDENTIFIED)
     assert any("moves nothing" in line for line in said) or any(doubt.cause in line for line in said)
 
@@ -84,7 +88,7 @@ def test_reservations_add_up_beside_an_impossible_parameter(moves, results, stat
         found = verdict_of("Ix", Quantity(), order)
         assert found.status == status
         assert verdict_of("Iy", Quantity(), order).status == IDENTIFIED
-    assert outcome("successful", ["Ix"], {"Ix": found}, doubts) == result
+    assert judge({"Ix": Quantity()}, doubts).result("successful", ["Ix"]) == result
     assert status == RESERVED or len(found.reasons) == 2
 
 
@@ -130,16 +134,18 @@ def test_predictions_reach_as_far_as_their_skill_is_clear():
     poor = RateSkill([0.5, 0.03, 0.4], [0.1, 0.21, 0.1], *[[None] * 3] * 3)
     found = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, clear, poor, clear), ["yaw"])
     assert found.value == "better than constant rates up to roll 0.5 s, pitch 0.1 s ahead"
-    assert found.reservations == ("yaw cannot be checked",)
+    assert found.reservations == ("yaw cannot be checked; fly more yaw",)
 
 
 def test_the_result_is_that_of_what_was_asked():
     doubts = [Doubt("no_skill", "a", "b", {"predictions": None}), Doubt("implausible", "c", "d", {"Ix": None})]
-    verdicts = {name: verdict_of(name, Quantity(), doubts) for name in ("Ix", "Iy", "predictions")}
-    assert outcome("successful", ("Ix", "Iy"), verdicts, doubts) == "implausible"
-    assert outcome("successful", ("Iy",), verdicts, doubts) == "successful"
-    vague = {"Ix": verdict_of("Ix", Quantity(spread=1.0), [])}
-    assert outcome("successful", ("Ix",), vague, []) == "unidentifiable"
+    judged = judge(dict.fromkeys(("Ix", "Iy", "predictions"), Quantity()), doubts)
+    assert judged.result("successful", ("Ix", "Iy")) == "implausible"
+    assert judged.result("successful", ("Iy",)) == "successful"
+    assert judged.result("successful", judged.verdicts) == "no_skill"
+    vague = judge({"Ix": Quantity(spread=1.0)}, [])
+    assert vague.result("successful", ("Ix",)) == "unidentifiable"
+    assert vague.result("max_sweeps", ("Ix",)) == "max_sweeps"
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +188,7 @@ def test_yaw_that_contradicts_the_other_axes_leaves_them_alone():
         alpha = dict(zip(model.parameter_names, np.asarray(CorrectedOS4(OS4).alpha).tolist(), strict=False))
         rows = {name: ParameterEstimate(x, 0.02 * abs(x) + 1e-3, None, None, "", "") for name, x in alpha.items()}
         rows |= {name: ParameterEstimate(x, 0.02, None, None, "", "") for name, x in changed.items()}
-        return [set(doubt.moves) for doubt in doubts_of(model, rows, {}, None)]
+        return [set(doubt.moves) for doubt in doubts_of_values(model, rows, {})]
 
     assert moved() == []
     # alpha1 and alpha4 of a body whose Iz is larger than alpha8 says.
@@ -249,6 +255,17 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
     assert {*written["verdicts"]} > {"Ix", "Iy", "Iz", "thrust", "motors", "center of mass", "damping", "predictions"}
     assert written["verdicts"]["Iz"]["status"] == MISSING
     assert all(set(doubt) == {"result", "cause", "remedy", "moves"} for doubt in written["doubts"])
+
+
+def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
+    row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "outside its bracket")
+    table = dict.fromkeys(("alpha3", "alpha6", "thrust_gain", "rotor_delay"), row)
+    constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy")}
+    said = vehicle_quantities(fitted[1].answer, table, constants, None, [])
+    outside = {name: [x for x in said[name].reservations if "outside" in x] for name in ("Ix", "thrust", "motors")}
+    remedies = {name: each.partition("; ")[2] for name, (each,) in outside.items()}
+    checked = "check the airframe, or give a wider `bracket`"
+    assert remedies == {"Ix": checked, "thrust": checked, "motors": "give a wider `bracket`"}
 
 
 def without_the_strongest_thrust(flight):

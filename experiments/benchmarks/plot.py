@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.benchmarks.contenders import is_ours
 from experiments.shared import plotter, read_json
 from jaxos4.report.style import FAINT, INK, log_axis, styles
 
@@ -19,7 +20,7 @@ def _draw_times(panel: Axes, title: str, rows: dict[str, Any]) -> None:
     ours, others = (look.color for look in styles(["ibss", "svsf"]).values())
     for place, (seconds, name) in enumerate(timed):
         row = rows[name]
-        panel.barh(place, 1e3 * seconds, color=ours if name.startswith("jaxos4") else others, height=0.6)
+        panel.barh(place, 1e3 * seconds, color=ours if is_ours(name) else others, height=0.6)
         panel.plot([1e3 * row["min_seconds"], 1e3 * row["max_seconds"]], [place, place], color=INK, linewidth=1.0)
     panel.set_yticks(range(len(names)), names)
     panel.set_ylim(len(names) - 0.4, -0.6)

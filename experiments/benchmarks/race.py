@@ -105,11 +105,11 @@ def race(racers: dict[str, Racer], repeats: int) -> dict[str, dict[str, Any]]:
     return {name: racer.row() for name, racer in racers.items()}
 
 
-def ratios(rows: dict[str, dict[str, Any]], reference: str) -> None:
-    """Adds how many times faster than the reference each one is: median, smallest and largest of all laps."""
-    if reference not in rows:
-        return
-    base = np.array(rows[reference]["laps"])
-    for row in rows.values():
-        ratio = base / np.array(row["laps"])
-        row["ratio"] = [float(np.median(ratio)), float(ratio.min()), float(ratio.max())]
+def ratios(rows: dict[str, dict[str, Any]], contenders: dict[str, Contender]) -> None:
+    """Adds how many times as fast as each of its rivals each one is: median, smallest and largest of all laps."""
+    for name, row in rows.items():
+        row["ratios"] = {}
+        for rival in contenders[name].rivals:
+            if "laps" in row and "laps" in rows.get(rival, {}):
+                ratio = np.array(rows[rival]["laps"]) / np.array(row["laps"])
+                row["ratios"][rival] = [float(np.median(ratio)), float(ratio.min()), float(ratio.max())]

@@ -13,7 +13,7 @@ import typer
 
 import jaxos4
 from experiments.benchmarks.case import ALL, RATES, Case, costs, trajectories
-from experiments.benchmarks.contenders import FITS, NETWORKS, REFERENCE_FIT, REFERENCE_SHOT, SHOTS, Contender
+from experiments.benchmarks.contenders import FITS, NETWORKS, QUICK, SHOTS, Contender
 from experiments.benchmarks.race import line_up, race, ratios
 from experiments.benchmarks.tables import print_report
 from experiments.monte_carlo import machine, write_report
@@ -24,6 +24,7 @@ SAME_COST = 0.01  # an error of a seventh of a standard deviation costs as much
 REACHED = 0.99  # the share of flights in which a contender must reach the least cost, to be timed
 CENTRE = 0.8  # starts lie within this share of the half-widths around the truth
 NEAR = 0.1  # the same for shots, so that no trajectory diverges
+MANY = 10_000  # flights; more are fitted in one lap, because it is long
 SHOT_TOLERANCE = 1e-6  # relative: costs of one shot by two programs
 
 
@@ -75,7 +76,7 @@ def fits(contenders: dict[str, Contender], case: Case, alone: int, repeats: int,
         racers[name].stop()
     for name, row in rows.items():
         row["reached"] = shares[name]
-    ratios({name: row for name, row in rows.items() if name in ready}, REFERENCE_FIT)
+    ratios(rows, contenders)
     return rows
 
 
@@ -93,7 +94,7 @@ def shots(contenders: dict[str, Contender], case: Case, repeats: int, skipped: l
             skipped.append(f"{name}: its costs are not those of NumPy")
             racers.pop(name).stop()
     rows = race(racers, repeats)
-    ratios(rows, REFERENCE_SHOT)
+    ratios(rows, contenders)
     for row in rows.values():
         row["steps_per_second"] = len(case.forcing) / row["median_seconds"]
     return rows
@@ -102,17 +103,22 @@ def shots(contenders: dict[str, Contender], case: Case, repeats: int, skipped: l
 def growth(
     estimator: str, flights: list[int], steps: list[int], parameters: list[int], repeats: int, skipped: list[str]
 ) -> list[dict[str, Any]]:
-    """Time and memory of one method as the number of flights, steps or unknowns grows. Growth in steps: rates alone."""
-    plan: list[tuple[str, int, Case, dict[str, Any]]] = []
-    plan += [("flights", count, make_case(count, 500), {}) for count in flights]
-    plan += [("steps", count, make_case(10, count), {"channels": "rates"}) for count in steps]
+    """Time and memory of one method as the number of flights, steps or unknowns grows.
+
+    Growth in steps: rates alone. The most unknowns are the eight parameters and a free initial state.
+    """
+    plan: list[tuple[str, int, dict[str, Any], dict[str, Any]]] = []  # axis, size, of the case, of the method
+    plan += [("flights", count, {"flights": count, "steps": 500}, {}) for count in flights]
+    plan += [("steps", count, {"flights": 10, "steps": count}, {"channels": "rates"}) for count in steps]
     if parameters:
-        plan += [("unknowns", count, make_case(100, 500), {"parameters": count}) for count in parameters]
-        plan += [("unknowns", 20, make_case(100, 500, known=False), {})]
+        same = {"flights": 100, "steps": 500}
+        plan += [("unknowns", count, same, {"parameters": count}) for count in parameters]
+        plan += [("unknowns", 20, same | {"known": False}, {})]
     rows = []
-    for axis, size, case, options in plan:
+    for axis, size, flown, options in plan:
         contender = Contender("jaxos4_fit:fit", options={"estimator": estimator, **options})
-        found = race(line_up({f"{axis} {size}": contender}, case, 1, skipped), repeats)
+        racers = line_up({f"{axis} {size}": contender}, make_case(**flown), 1, skipped)
+        found = race(racers, repeats if flown["flights"] <= MANY else 1)
         rows += [{"axis": axis, "size": size, **row} for row in found.values()]
     return rows
 
@@ -125,7 +131,8 @@ def networks(steps: int, simulations: int, flights: int, skipped: list[str]) -> 
     problem = jaxos4.ShootingProblem(model, flight, sigma=case.sigma, initial_state=flight.states[0], channels="rates")
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
     budgets = ({"steps": steps}, {"simulations": simulations})
-    contenders = {n: c._replace(options=b) for (n, c), b in zip(NETWORKS.items(), budgets, strict=True)}
+    pairs = zip(NETWORKS.items(), budgets, strict=True)
+    contenders = {name: c._replace(options=budget) for (name, c), budget in pairs if any(budget.values())}
     racers = line_up(contenders, case, flights, skipped)
     answers = {name: racer.answer for name, racer in racers.items()}
     rows = race(racers, 1)
@@ -155,14 +162,14 @@ def main(
     repeats: Annotated[int, typer.Option(help="Number of laps.")] = 7,
     steps: Annotated[int, typer.Option(help="Number of steps of a flight.")] = 500,
     starts: Annotated[list[str], typer.Option(help="Initial states: known, free.")] = ("known", "free"),
-    contenders: Annotated[list[str], typer.Option(help="Names of the fits; by default all.")] = tuple(FITS),
+    contenders: Annotated[list[str], typer.Option(help="Names of the fits; by default the quick ones.")] = QUICK,
     shooters: Annotated[list[str], typer.Option(help="Names of the shots; by default all.")] = tuple(SHOTS),
     growing: Annotated[str, typer.Option(help="The estimator whose growth is measured; empty: none.")] = "output-error",
-    grow_flights: Annotated[list[int], typer.Option(help="Numbers of flights.")] = (1, 10, 100, 1000, 10_000),
+    grow_flights: Annotated[list[int], typer.Option(help="Numbers of flights.")] = (1, 10, 100, 1000, 10_000, 100_000),
     grow_steps: Annotated[list[int], typer.Option(help="Numbers of steps.")] = (100, 1000, 10_000, 100_000),
     grow_parameters: Annotated[list[int], typer.Option(help="Numbers of parameters.")] = (1, 2, 4, 8),
     network_steps: Annotated[int, typer.Option(help="Steps of the network's training; 0: no networks.")] = 3000,
-    simulations: Annotated[int, typer.Option(help="Simulated flights for sbi.")] = 10_000,
+    simulations: Annotated[int, typer.Option(help="Simulated flights for sbi; 0: without sbi.")] = 10_000,
     seed: Annotated[int, typer.Option(help="Of noise and starts.")] = 0,
     out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
 ) -> None:

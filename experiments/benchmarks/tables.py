@@ -3,22 +3,27 @@
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
+from experiments.benchmarks.contenders import is_ours
 from experiments.monte_carlo import print_table
 
-_RATIO = "times faster"
-_WIDTH = 120
+_TIME, _MEMORY = "ms / flight (least, most)", "memory [MiB]"
+_WIDTH = 190
 
 
 def print_report(report: dict[str, Any]) -> None:
     """Prints each part of the report that is there."""
     for start, rows in report["fits"].items():
-        title = f"{start} initial state; median (least, most) of the laps; ratios to CasADi, single shooting"
-        headings = "method", "flights", "ms / flight", _RATIO, "CPU ms", "MiB", "reached"
-        print_table(title, headings, _fits(rows), _WIDTH)
-    headings = "method", "M steps/s", "ms / shot", _RATIO, "MiB"
-    print_table("shots; ratios to C -O3, one core", headings, _shots(report["shots"]), _WIDTH)
+        speeds = "times as fast as compiled CasADi", "times as fast as C"
+        headings = "method", "flights", _TIME, *speeds, "processor [ms / flight]", _MEMORY, "optimum reached [%]"
+        print_table(f"fits, {start} initial state", headings, _fits(rows), _WIDTH)
+    headings = "method", "million steps / s", "ms / shot (least, most)", "times as fast as C, 8 lanes", _MEMORY
+    print_table("shots", headings, _shots(report["shots"]), _WIDTH)
     if rows := report["growth"]:
-        print_table("growth", ("with", "size", "ms / flight", "MiB"), _growth(rows), _WIDTH)
+        print_table("growth", ("with", "size", _TIME, _MEMORY), _growth(rows), _WIDTH)
+        headings = "with", "from", "to", "exponent of time", "exponent of memory"
+        print_table("growth: exponents", headings, _exponents(rows), _WIDTH)
     if rows := report["networks"]:
         headings = "method", "training [s]", "ms / flight", "RMSE / bound"
         print_table("networks on the rates", headings, _networks(rows), _WIDTH)
@@ -29,23 +34,42 @@ def print_report(report: dict[str, Any]) -> None:
 
 
 def _fits(rows: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    for name, row in sorted(rows.items(), key=lambda item: item[1].get("median_seconds", float("inf"))):
-        flights, reached = str(row["flights"]), f"{100 * row['reached']:.4g} %"
+    """The opponents from the fastest to the slowest, and then the methods of this package."""
+
+    def place(item: tuple[str, dict[str, Any]]) -> tuple[bool, float]:
+        name, row = item
+        return is_ours(name), row.get("median_seconds", np.inf)
+
+    for name, row in sorted(rows.items(), key=place):
+        flights, reached = str(row["flights"]), f"{100 * row['reached']:.4g}"
         if "laps" not in row:
-            yield name, flights, "not timed", "", "", "", reached
+            yield name, flights, "not timed", "", "", "", "", reached
         else:
             processor, peak = f"{1e3 * row['processor_seconds']:.3g}", f"{row['peak_mib']:.0f}"
-            yield name, flights, _spread(row), _ratio(row), processor, peak, reached
+            yield name, flights, _spread(row), _ratio(row, "CasADi"), _ratio(row, "C,"), processor, peak, reached
 
 
 def _shots(rows: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     for name, row in rows.items():
-        yield name, f"{row['steps_per_second'] / 1e6:.3g}", _spread(row), _ratio(row), f"{row['peak_mib']:.0f}"
+        yield name, f"{row['steps_per_second'] / 1e6:.3g}", _spread(row), _ratio(row, "C,"), f"{row['peak_mib']:.0f}"
 
 
 def _growth(rows: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
     for row in rows:
-        yield row["axis"], str(row["size"]), _spread(row), f"{row['peak_mib']:.0f}"
+        yield row["axis"], f"{row['size']:,}", _spread(row), f"{row['peak_mib']:.0f}"
+
+
+def _exponents(rows: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    """Of the time and the peak memory of all flights, fitted to the larger half of the sizes."""
+    for axis in dict.fromkeys(row["axis"] for row in rows):
+        some = [row for row in rows if row["axis"] == axis]
+        some = some[min(len(some) // 2, max(len(some) - 2, 0)) :]
+        if len(some) > 1:
+            sizes = np.log([row["size"] for row in some])
+            times = np.log([row["median_seconds"] * row["flights"] for row in some])
+            memory = np.log([row["peak_mib"] for row in some])
+            exponents = [f"{np.polyfit(sizes, y, 1)[0]:.2f}" for y in (times, memory)]
+            yield axis, f"{some[0]['size']:,}", f"{some[-1]['size']:,}", *exponents
 
 
 def _networks(rows: dict[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -71,7 +95,7 @@ def _spread(row: dict[str, Any]) -> str:
     return f"{median:.3g} ({least:.3g}, {most:.3g})"
 
 
-def _ratio(row: dict[str, Any]) -> str:
-    if "ratio" not in row:
-        return ""
-    return "{:.3g} ({:.3g}, {:.3g})".format(*row["ratio"])
+def _ratio(row: dict[str, Any], tool: str) -> str:
+    """How many times as fast as its rival of this tool it is: median, least and most."""
+    found = next((ratio for rival, ratio in row["ratios"].items() if rival.startswith(tool)), None)
+    return "{:.3g} ({:.3g}, {:.3g})".format(*found) if found else ""

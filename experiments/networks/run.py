@@ -185,6 +185,8 @@ def main(
         trained = fit(f"{label} {noise:g}", NETWORKS[networks[0]] | {"noise": (noise, noise)})
         add(label, trained, channels, "rates", [noise])
     write_report(out, report)
+    seconds = ((label, f"{spent:.0f}") for label, spent in report["training_seconds"].items())
+    print_table("training", ("network", "time [s]"), seconds)
     headings = "estimator", "noise", *PARAMETERS, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"
     title = f"RMSE / Cramer-Rao bound: of the rates for a network alone, of {channels} for the others"
     print_table(title, headings, map(cells, report["rows"]), width=170)

@@ -15,19 +15,33 @@ from ..models.state import Forcing, Rates
 from ..results import NINETY_FIVE
 from ..shooting import ShootingProblem
 
-# How far apart frequencies are [Hz].
-_RESOLUTION = 1.0
-# The regression's memory [s]: as long as the flight controller's answer. A longer one finds the same, less precisely.
-_MEMORY, _FEWEST_LAGS = 0.1, 4
-# The regression needs so many samples for each unknown.
-_SAMPLES = 8
-# The highest frequency [Hz]: few vehicles move above.
-HIGHEST = 40.0
-# The band in which the model is compared [Hz], and the largest error of a clear gain there.
-_LOW, _HIGH, _UNCLEAR = 4.0, 20.0, 0.5
 # Of the regression, as a share of the sum of squares.
 _RIDGE = 1e-13
 _BOUNDLESS = 700.0  # a logarithm whose factor is still a number
+
+
+class ResponseSettings(NamedTuple):
+    """What tunes a frequency response.
+
+    - `resolution`, `highest`: how far apart frequencies are, and the highest [Hz]: few vehicles move faster.
+    - `memory`: of the regression [s], as long as the flight controller's answer. A longer one finds the same, less
+      precisely. `fewest_lags`: of a memory that is shorter than this in samples.
+    - `samples`: the regression needs so many for each of its coefficients.
+    - `low`, `high`: the band in which the model is compared [Hz].
+    - `unclear`: the standard deviation of a gain, as a share of the model's, from which on the gain does not count.
+    """
+
+    resolution: float = 1.0
+    highest: float = 40.0
+    memory: float = 0.1
+    fewest_lags: int = 4
+    samples: int = 8
+    low: float = 4.0
+    high: float = 20.0
+    unclear: float = 0.5
+
+
+RESPONSE = ResponseSettings()
 
 
 class Agreement(NamedTuple):
@@ -77,7 +91,7 @@ class AxisResponse(NamedTuple):
     covariance: Float[np.ndarray, "frequencies frequencies"]
     averages: float
 
-    def agreement(self, low: float = _LOW, high: float = _HIGH) -> Agreement:
+    def agreement(self, low: float = RESPONSE.low, high: float = RESPONSE.high) -> Agreement:
         """How strongly the vehicle answers compared with the model, from `low` to `high` [Hz]."""
         clear = self.clear & (self.frequency >= low) & (self.frequency <= high)
         if not clear.any():
@@ -108,7 +122,7 @@ class AxisResponse(NamedTuple):
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
         """Whether the gain at each frequency is known to half of the model's, whatever the gain."""
-        return self.gain * self.error < _UNCLEAR
+        return self.gain * self.error < RESPONSE.unclear
 
 
 class FrequencyResponse(NamedTuple):
@@ -176,9 +190,7 @@ def _parts(
     problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
 ) -> tuple[Float[Array, "steps 3"], Float[Array, "steps 3"]]:
     """The model's change of the measured rates over each step [rad/s^2]: by the rotors, and by the rates."""
-    every = jnp.arange(rates.shape[0])[None]
-    forcing = problem.model.mean_forcing(problem.flight.inputs, parameters, every)
-    forcing = jax.tree.map(lambda leaf: leaf[0], forcing)
+    forcing = problem.model.mean_forcing(problem.flight.inputs, parameters)
 
     def at(rates: Array, forcing: Forcing) -> Array:
         return jnp.stack(problem.model.angular_acceleration(Rates(*rates.T), forcing, tuple(parameters)), axis=1)
@@ -193,7 +205,11 @@ def _parts(
 
 
 def response(
-    u: Float[np.ndarray, " samples"], y: Float[np.ndarray, " samples"], usable: Bool[np.ndarray, " samples"], dt: float
+    u: Float[np.ndarray, " samples"],
+    y: Float[np.ndarray, " samples"],
+    usable: Bool[np.ndarray, " samples"],
+    dt: float,
+    settings: ResponseSettings = RESPONSE,
 ) -> AxisResponse:
     """The frequency response from u to y, in closed loop too.
 
@@ -203,10 +219,10 @@ def response(
 
     **Arguments:** signals with one sample every `dt` [s], and which of them are `usable`.
     """
-    lags = max(round(_MEMORY / dt), _FEWEST_LAGS)
-    frequency = np.arange(_RESOLUTION, min(0.4 / dt, HIGHEST + _RESOLUTION / 2), _RESOLUTION)
+    lags, apart = max(round(settings.memory / dt), settings.fewest_lags), settings.resolution
+    frequency = np.arange(apart, min(0.4 / dt, settings.highest + apart / 2), apart)
     rows = np.flatnonzero(np.convolve(usable, np.ones(lags + 1))[: usable.size] > lags + 0.5)
-    if rows.size < _SAMPLES * (2 * lags + 2):
+    if rows.size < settings.samples * (2 * lags + 2):
         nothing = np.full(frequency.size, np.nan)
         return AxisResponse(frequency, nothing, nothing, nothing, np.diag(nothing), 0.0)
     before = rows[:, None] - np.arange(lags + 1)
@@ -234,5 +250,5 @@ def response(
         np.imag(whole),
         caused / (caused + disturbed),
         np.real(spread) @ np.real(spread).T + np.outer(answered, answered),
-        rows.size * dt * _RESOLUTION,
+        rows.size * dt * apart,
     )

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
-from ..airframe import Airframe
+from ..airframe import INVERSES, PITCH, ROLL, Airframe
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from .evaluation import inverse, unit_eigen
 
@@ -21,7 +21,7 @@ _NUMERATOR[[1, 4], 3] = 1.0
 _TRIANGLE = np.ones((3, 3)) - 2 * np.eye(3)
 # A coordinate of the centre of mass [m] is the slope of torque over thrust, divided by an alpha and the mass, with this
 # sign.
-_COORDINATES = (("x", "pitch_thrust", "alpha6", 1.0), ("y", "roll_thrust", "alpha3", -1.0))
+_COORDINATES = (("x", "pitch_thrust", PITCH.inverse, 1.0), ("y", "roll_thrust", ROLL.inverse, -1.0))
 
 
 class InertiaFit(eqx.Module):
@@ -103,7 +103,7 @@ def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) ->
 
     It starts at the reciprocals of alpha3, 6, 8 if they are within a factor of 100 of the airframe's inertia.
     """
-    first = 1 / alpha[..., [2, 5, 7]]
+    first = 1 / alpha[..., INVERSES]
     first = np.where((first > inertia / 100) & (first < 100 * inertia), first, inertia)
     rotor = (alpha[..., 1] * first[..., 0] + alpha[..., 4] * first[..., 1]) / 2
     constants = np.concatenate([first, rotor[..., None]], axis=-1)

@@ -14,8 +14,8 @@ from .._custom_types import Numeric, Parameters, as_float
 from ..flight import RATES, Flight
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST, ShootingProblem
-from ..shooting.gains import LogNoise, transition
-from .open_loop import gyro_bias, open_loop
+from ..shooting.gains import LogNoise, Transition
+from .open_loop import Filtered, gyro_bias, open_loop
 
 HORIZONS = (0.1, 0.25, 0.5)
 """How far ahead rates are predicted, if nothing else is wanted [s]."""
@@ -114,8 +114,7 @@ def starts(
     """
     dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
     around = int(near / dt)
-    stretch = np.zeros(samples, dtype=int) if flight.stretch is None else np.asarray(flight.stretch)
-    rates = np.asarray(flight.states)[:, RATES]
+    stretch, rates = np.asarray(flight.stretch_numbers), np.asarray(flight.states)[:, RATES]
     start = np.arange(around, samples - ahead.max() - around, max(int(round(every / dt)), 1))
     start = start[stretch[start - around] == stretch[np.minimum(start + ahead.max(), samples - 1)]]
     initial = rates[start[:, None] + np.arange(-around, around + 1)].mean(axis=1)
@@ -140,8 +139,8 @@ def _predict(
     steps: int,
 ) -> Float[Array, "starts steps 3"]:
     model, scalars, forcing = problem.model, tuple(parameters), problem.forcing(parameters)
-    fading = transition(jax.tree.map(as_float, noise), problem.flight.dt)
-    calm = jnp.zeros((steps, 3, 2))
+    fading = Transition.of(jax.tree.map(as_float, noise), problem.flight.dt)
+    calm = Filtered(jnp.zeros((steps, 3)), jnp.zeros((steps, 3)))
 
     def fly(first: Int[Array, ""], measured: Array, disturbance: Array) -> Float[Array, "steps 3"]:
         rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
@@ -156,7 +155,8 @@ def _predict(
 
         driving = jax.tree.map(lambda leaf: leaf[:-1], rows)
         start = Rates(*(measured - gyro_bias(model, measured, begin, scalars)))
-        return jax.vmap(observed)(open_loop(advance, start, disturbance, driving, calm, fading, jnp.zeros(0)), later)
+        flown = open_loop(advance, start, Filtered(measured, disturbance), driving, calm, fading)
+        return jax.vmap(observed)(flown, later)
 
     return jax.vmap(fly)(jnp.asarray(start), jnp.asarray(initial), jnp.asarray(disturbance))
 

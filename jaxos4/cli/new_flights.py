@@ -36,7 +36,7 @@ _OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": N
 _OPEN |= {"model": "published", "excitation": "multisine", "channels": "all", "initial_state": "free"}
 _CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
 _CLOSED |= {"sensors": None, "references": None}
-_MOST = {"gust": 1e6, "lag": 1.0, "delay": 1.0, "noise": 1e6}
+_RANGES = {"gust": (0, 1e6), "lag": (0, 1), "delay": (0, 1), "noise": (0, 1e6), "accuracy": (1e-6, 1e6)}
 
 
 def simulate(
@@ -167,8 +167,6 @@ def design(
     """
     asked = of_kind(closed_loop, locals())
     check_outputs(airframe, bracket, out=out, figure=figure)
-    if not 0 < asked["accuracy"] < 1e6:
-        raise InputError(f"--accuracy: must be positive and finite, got {asked['accuracy']:g}.")
     begin = time.perf_counter()
     with stages("loading the library") as progress, option_names(bracket=bracket):
         found = _find(asked, progress)
@@ -182,8 +180,9 @@ def design(
         with stages("drawing"):
             write_design(found, asked["accuracy"] / 100, figure)
     print_design(Console(highlight=False), found, asked["accuracy"] / 100)
-    kind, rows = found.task.kind if closed_loop else f"{asked['model']} model", found.designed.inputs.shape[0]
-    typer.echo(f"{out}: {rows} samples of {asked['dt']:g} s, {kind}, {time.perf_counter() - begin:.0f} s")
+    samples = f"{found.designed.inputs.shape[0]} samples of {asked['dt']:g} s"
+    kind, seconds = found.task.kind if closed_loop else f"{asked['model']} model", time.perf_counter() - begin
+    typer.echo(f"{out}: {samples}, {kind}, {seconds:.0f} s")
 
 
 def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "jaxos4.Design":
@@ -215,8 +214,9 @@ def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
         if name in others and name not in own:
             how = "without --closed-loop; leave it out" if closed_loop else "with --closed-loop; add that"
             raise InputError(f"--{name.replace('_', '-')}: is for flights {how}.")
-        if name in _MOST and not 0 <= value <= _MOST[name]:
-            raise InputError(f"--{name}: must lie in 0 to {_MOST[name]:g}, got {value}.")
+        low, high = _RANGES.get(name, (None, None))
+        if low is not None and not low <= value <= high:
+            raise InputError(f"--{name}: must lie in {low:g} to {high:g}, got {value}.")
     return dict(asked) | {name: default for name, default in own.items() if asked.get(name) is None}
 
 

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._custom_types import Scalar, integer, setting
-from ..airframe import Airframe
+from ..airframe import MOTIONS, Airframe
 from ..models.rotors import Motor
 from ..models.terms import STEEPEST
 from ..noise import FORCE_SIGMA
@@ -22,7 +22,7 @@ PerAxis = Float[Array, "3"]
 Pair = Float[Array, "2"]
 
 LOGGED = ("commands", "speeds")
-_BODY, _XYZ, _XY, _TILT = ("roll", "pitch", "yaw"), ("x", "y", "z"), ("x", "y"), ("roll", "pitch")
+_BODY, _XYZ, _XY, _TILT = MOTIONS, ("x", "y", "z"), ("x", "y"), MOTIONS[:2]
 
 
 class Air(eqx.Module):

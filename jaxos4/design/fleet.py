@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, as_float
+from ..airframe import INERTIAS, INVERSES, MOTIONS
 from ..bracket import Bracket
 from ..closed_loop import ClosedLoop, References, fly_closed_loop
 from ..errors import InputError
 from ..flight import ANGLES, POSITION, VELOCITY, Flight
-from ..models.abstract import PARAMETER_NAMES
 from ..models.flight_model import FlightModel
 from ..models.state import Attitude, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
@@ -27,10 +27,6 @@ from .task import Series
 
 LANES = 64
 """The number of flights in a batch. All batches share one program."""
-
-INERTIAS = ("Ix", "Iy", "Iz")
-# The place of the alpha that is torque over each moment of inertia.
-_INVERSE = [PARAMETER_NAMES.index(name) for name in ("alpha3", "alpha6", "alpha8")]
 
 
 def model_of(loop: ClosedLoop) -> FlightModel:
@@ -114,14 +110,14 @@ class Fleet(eqx.Module):
     @classmethod
     def of(cls, loop: ClosedLoop, bracket: Bracket, dt: float, key: Key) -> "Fleet":
         """Vehicles from a bracket of the parameters of `model_of(loop)`."""
-        inertia = 1 / np.asarray(drawn(bracket, key, LANES))[:, _INVERSE]
+        inertia = 1 / np.asarray(drawn(bracket, key, LANES))[:, INVERSES]
         if not (np.isfinite(inertia).all() and (inertia > 0).all()):
             raise InputError("`bracket`: alpha3, alpha6 and alpha8 must be positive.")
         loops = batch_of(loop, np.arange(LANES) >= cls.still, inertia=inertia, force_noise=np.zeros(LANES))
         model, prior = model_of(loop), jnp.asarray(1 / np.square(np.asarray(bracket.half_width)))
         delay = loop.rotor_delay if loop.logged == "commands" else 0.0
         known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": delay}
-        for i, axis in enumerate(("roll", "pitch", "yaw")):
+        for i, axis in enumerate(MOTIONS):
             known |= {f"{axis}_offset": loop.offset[i], f"{axis}_damping": loop.damping[i]}
         names, alpha = model.parameter_names, np.asarray(model.alpha)
         parameters = np.array([float(known.get(name, value)) for name, value in zip(names, alpha, strict=True)])
@@ -129,16 +125,16 @@ class Fleet(eqx.Module):
 
     def inertias_first(self, of_inertias: tuple, of_parameters: tuple) -> tuple:
         """Something of Ix, Iy and Iz, then the same of the model's parameters that are not their reciprocals."""
-        return (*of_inertias, *(one for i, one in enumerate(of_parameters) if i not in _INVERSE))
+        return (*of_inertias, *(one for i, one in enumerate(of_parameters) if i not in INVERSES))
 
     def about_inertias(self, information: Float[Numeric, "*some n n"]) -> Float[np.ndarray, "*some n n"]:
         """From information about the model's unknowns to that about log Ix, log Iy, log Iz, and the others."""
         alpha, slopes = np.asarray(self.parameters), np.eye(information.shape[-1])
-        for place in _INVERSE:  # the inertia is thrust_gain / alpha, as in the table that `jaxos4 estimate` prints
+        for place in INVERSES:  # the inertia is thrust_gain / alpha, as in the table that `jaxos4 estimate` prints
             slopes[place, place] = -alpha[place]
             if "thrust_gain" in self.model.parameter_names:
                 slopes[place, self.model.parameter_names.index("thrust_gain")] = alpha[place]
-        slopes = slopes[:, self.inertias_first(tuple(_INVERSE), tuple(range(len(slopes))))]
+        slopes = slopes[:, self.inertias_first(tuple(INVERSES), tuple(range(len(slopes))))]
         return slopes.T @ np.asarray(information) @ slopes
 
     def with_prior(self, information: Float[Numeric, "n n"]) -> Float[np.ndarray, "n n"]:

@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float
+from ..airframe import INERTIAS
 from ..bracket import Bracket
 from ..closed_loop import ClosedLoop, standard_references, with_largest
 from ..errors import InputError
 from ..flight import ANGLES, RATES
 from . import task
 from .envelope import Envelope, Uses
-from .fleet import INERTIAS, LANES, Fleet, batch_of, fly_batch, model_of
+from .fleet import LANES, Fleet, batch_of, fly_batch, model_of
 from .task import Coefficients, Designed, Flown, Search
 
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].

@@ -18,12 +18,12 @@ from .solver import AbstractSolver, Found, before_shots, chosen
 class State(NamedTuple):
     """The search of a stage before a sweep.
 
-    - `unknowns`, `model`: where it is, and the local model of the cost there. See `before_shots`.
+    - `unknowns`, `model`: where it is, and the local model of the cost there. Before the first shot: `before_shots`.
     - `directions`, `brackets`: of the next sweep.
     - `spread`: the covariance of the unknowns before the stage.
     - `growth`: how many times as wide each direction's bracket is.
     - `trust`: the share of the longest predicted step that a sweep may go; 1: no limit.
-    - `sweeps`, `rollouts`: of this stage.
+    - `sweeps`, `shots`: of this stage. The first shot is at the start, before any sweep.
     - `done`: whether the stage ended by itself.
     """
 
@@ -35,7 +35,7 @@ class State(NamedTuple):
     growth: PerDirection
     trust: Scalar
     sweeps: Count
-    rollouts: Count
+    shots: Count
     done: Flag
 
 
@@ -99,25 +99,25 @@ class IBSS(AbstractSolver[State]):
     damping: float = eqx.field(static=True, default=0.1)
 
     def init(self, stage: Stage, before: Found) -> State:
-        """At the start, without directions: the first shot is the first step of the loop, and is compiled once."""
-        unknowns = before.unknowns
+        """At the start, with closed brackets: the first step of the loop is one shot there, and is compiled once."""
+        unknowns, closed = before.unknowns, jnp.zeros_like(before.unknowns)
         directions = Directions.none(unknowns)
         return State(
             unknowns=unknowns,
             model=before_shots(before.model),
             directions=directions,
-            brackets=_open(directions, directions.above, directions.above),
+            brackets=_open(directions, closed, closed),
             spread=before.spread,
             growth=jnp.ones_like(unknowns),
             trust=jnp.ones((), dtype=float),
             sweeps=jnp.zeros((), dtype=int),
-            rollouts=jnp.zeros((), dtype=int),
+            shots=jnp.zeros((), dtype=int),
             done=jnp.zeros((), dtype=bool),
         )
 
     def step(self, stage: Stage, state: State) -> State:
-        """One sweep: bisect, judge, look around, open. See docs/method/ibss.md."""
-        is_start = jnp.isnan(state.model.cost).any()
+        """The shot at the start, or one sweep: bisect, judge, look around, open. See docs/method/ibss.md."""
+        is_start = state.shots == 0
         brackets, unknowns, model, shots = self._bisect(stage, state)
         kept, stalled = self._judge(stage, state, unknowns, model)
         unknowns, model = chosen(kept, (unknowns, model), (state.unknowns, state.model))
@@ -139,7 +139,7 @@ class IBSS(AbstractSolver[State]):
             growth=growth,
             trust=trust,
             sweeps=state.sweeps + ~is_start,
-            rollouts=state.rollouts + shots * stage.searched.sum(),
+            shots=state.shots + shots,
             done=near | stalled | (is_start & ~kept),
         )
 
@@ -153,7 +153,8 @@ class IBSS(AbstractSolver[State]):
         covariance = jnp.square(misfit) * gram(state.directions.basis)
         known = stage.searched & stage.searched[:, None] & _finite(state.unknowns, state.model)
         spread = jnp.where(known, covariance, before.spread)
-        return Found(state.unknowns, state.model, spread, state.sweeps, state.rollouts, state.done)
+        rollouts = state.shots * stage.searched.sum()
+        return Found(state.unknowns, state.model, spread, state.sweeps, rollouts, state.done)
 
     def _look_around(self, stage: Stage, unknowns: WindowUnknowns, model: LocalModel) -> Directions:
         """The directions in which the cost is nearly separable, and predicted steps; the bracket is information."""

@@ -27,13 +27,13 @@ from ..shooting import (
     WindowUnknowns,
     in_blocks,
 )
-from .solver import AbstractSolver, Found, before_shots, chosen, cost_of, solve
+from .solver import AbstractSolver, Found, chosen, cost_of, solve
 
 
 class State(NamedTuple):
     """The search of a stage before a shot.
 
-    - `best`, `model`: the best unknowns so far, and the local model there, see `before_shots`.
+    - `best`, `model`: the best unknowns so far, and the local model there.
     - `trial`: where the shot will be.
     - `damping`: of the last step, or of the first one.
     - `shots`: how many there were.
@@ -88,16 +88,14 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
     def init(self, stage: Stage, before: Found) -> State:
         """The first trial is the start. Any cost is better than none."""
-        model = before_shots(before.model)
         damping = jnp.full((), self.factor * self.damping, dtype=float)
         none, going = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        return State(before.unknowns, model, before.unknowns, damping, none, going)
+        return State(before.unknowns, before.model, before.unknowns, damping, none, going)
 
     def step(self, stage: Stage, state: State) -> State:
         """Shoot at the trial, keep the better, and propose the next trial."""
         model, before = stage.local_model(state.trial), state.model
-        known = ~jnp.isnan(before.cost).any()
-        better = ~(known & (cost_of(model) >= cost_of(before)))
+        better = (state.shots == 0) | (cost_of(model) < cost_of(before))
         best, model = chosen(better, (state.trial, model), (state.best, before))
         damping = state.damping * jnp.where(better, 1 / self.factor, self.factor)
         damping = jnp.maximum(damping, self.least_damping)

@@ -171,7 +171,7 @@ def cost_of(model: LocalModel) -> Scalar:
 
 
 def before_shots(model: LocalModel) -> LocalModel:
-    """A local model before the first shot: its cost is NaN, and nothing is feasible. Any shot is better."""
+    """A local model before the first shot: its cost is not known, and nothing is feasible."""
     return model._replace(cost=jnp.full_like(model.cost, jnp.nan), feasible=jnp.zeros_like(model.feasible))
 
 

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import Airframe
+from ..airframe import AXES, INERTIAS, YAW, Airframe
 from ..errors import InputError, named, printable
 from ..identification.results import Identification
 from ..linalg import covariance_root
 from ..models.flight_model import without_recording
 from ..result_file import vehicle_result
-from .vehicle import CARRIED, INERTIAS, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
+from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # Why some parameters are not carried; notes on the rotors' inertia name alpha2 and alpha5. All others have one note.
 _NOT_CARRIED = {
@@ -63,7 +63,7 @@ class Identified(NamedTuple):
     @property
     def identifies_iz(self) -> bool:
         """Whether the flights show Iz, if the airframe's drag coefficient is right."""
-        return INERTIAS["Iz"] in self.drawn
+        return YAW.inverse in self.drawn
 
     def _made(self, values: dict[str, float]) -> RigidVehicle:
         estimated = rigid_vehicle(self.airframe, values)
@@ -73,7 +73,7 @@ class Identified(NamedTuple):
         rounding = 1e-9
         allowed = min(max(self.inertia_z, (1 + rounding) * abs(ix - iy)), (1 - rounding) * (ix + iy))
         gain = values.get("thrust_gain", 1.0)
-        vehicle = rigid_vehicle(self.airframe, values | {INERTIAS["Iz"]: gain / allowed})
+        vehicle = rigid_vehicle(self.airframe, values | {YAW.inverse: gain / allowed})
         if not self.identifies_iz:
             return vehicle
         # Flights show the yaw torque over Iz: another Iz means another drag coefficient.
@@ -125,7 +125,7 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
             values=_clipped(values),
             drawn=drawn,
             covariance=np.array(file.covariance)[np.ix_(places, places)],
-            doubts=file.reasons,
+            doubts=file.warnings,
             notes=tuple(notes),
             inertia_z=inertia_z,
         )
@@ -133,7 +133,7 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
             own = tuple(note for note in found.notes if not note.startswith("Iz: "))
             found = found._replace(notes=(*own, _given_note(found, inertia_z)))
         if why := found.vehicle.impossible:
-            guessed = inertia_z is None and not found.identifies_iz and why.startswith(tuple(INERTIAS))
+            guessed = inertia_z is None and not found.identifies_iz and why.startswith(INERTIAS)
             guess = "; Iz was not identified and is a guess: give `inertia_z`" if guessed else ""
             raise InputError(
                 f"no vehicle is like this: {why}{guess}; correct the airframe, or fly with more excitation."
@@ -166,9 +166,9 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
     """
     rows, constants, notes = file.parameters, file.rigid_body.constants, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
-    for moment, name in INERTIAS.items():
-        if constants and moment not in constants:
-            found.pop(name, None)  # the estimate says that this one is not to be trusted
+    for axis in AXES:
+        if constants and axis.inertia not in constants:
+            found.pop(axis.inverse, None)  # the estimate says that this one is not to be trusted
     if "rotor_reaction" in found and not found["rotor_reaction"][0] > significant * found["rotor_reaction"][1]:
         del found["rotor_reaction"]
     if "rotor_reaction" not in found and "rotor_reaction" in (*rows, *file.held):
@@ -178,9 +178,9 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
         del found["thrust_curve"]
     values = {name: value for name, (value, _) in found.items()}
     values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values
-    for moment, name in INERTIAS.items():
-        if name not in found:
-            notes.append(f"{moment}: not identified; a guess, from the airframe or from the bracket")
+    for axis in AXES:
+        if axis.inverse not in found:
+            notes.append(f"{axis.inertia}: not identified; a guess, from the airframe or from the bracket")
     for names, why in _NOT_CARRIED.items():
         some = [name for name in found if without_recording(name) in names]
         if some:
@@ -193,7 +193,7 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
     fixed = [name for name in values.keys() - found.keys() if without_recording(name) in CARRIED]
     if fixed:
         notes.append(f"do not vary in samples, because the flights do not identify them: {', '.join(sorted(fixed))}")
-    zero = [name for name in (*INERTIAS.values(), "thrust_gain") if values.get(name) == 0]
+    zero = [name for name in (*(axis.inverse for axis in AXES), "thrust_gain") if values.get(name) == 0]
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")
     return values, list(found), notes

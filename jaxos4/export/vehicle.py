@@ -6,16 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import GRAVITY, Airframe
+from ..airframe import AXES, GRAVITY, INERTIAS, MOTIONS, PITCH, ROLL, Airframe
 from ..analysis.inertia import center_of_mass
-from ..excitation import AXES
 
-# Moments of inertia, each with the parameter that is `thrust_gain` divided by it.
-INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 # Parameters that are 0 in a vehicle if they come out negative, and all that `rigid_vehicle` reads.
-NOT_NEGATIVE = ("rotor_lag", "rotor_delay", *(f"{x}_damping" for x in AXES), "x_drag", "y_drag", "z_drag")
-CARRIED = (*INERTIAS.values(), "thrust_gain", *(f"{x}_offset" for x in AXES), "roll_thrust", "pitch_thrust")
-CARRIED += ("roll_velocity", "pitch_velocity", "rotor_reaction", "thrust_curve", *NOT_NEGATIVE)
+NOT_NEGATIVE = ("rotor_lag", "rotor_delay", *(f"{x}_damping" for x in MOTIONS), "x_drag", "y_drag", "z_drag")
+CARRIED = (*(axis.inverse for axis in AXES), "thrust_gain", *(f"{x}_offset" for x in MOTIONS), *NOT_NEGATIVE)
+CARRIED += ("roll_thrust", "pitch_thrust", "roll_velocity", "pitch_velocity", "rotor_reaction", "thrust_curve")
 
 
 class RigidVehicle(NamedTuple):
@@ -121,23 +118,23 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     """The vehicle with parameters of a `FlightModel`, by name, and else the airframe's. Offsets are averaged."""
     mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)
-    for axis, inverse in enumerate(INERTIAS.values()):
-        if inverse in values:
+    for place, axis in enumerate(AXES):
+        if axis.inverse in values:
             # Torques exceed the airframe's by the same factor as thrust.
-            inertia[axis] = gain / values[inverse]
-    offsets = ([x for name, x in values.items() if name.startswith(f"{axis}_offset")] for axis in AXES)
+            inertia[place] = gain / values[axis.inverse]
+    offsets = ([x for name, x in values.items() if name.startswith(f"{axis}_offset")] for axis in MOTIONS)
     offset = np.array([np.mean(of_axis or [0.0]) for of_axis in offsets])
     slopes = {name: values.get(name, 0.0) for name in ("roll_thrust", "pitch_thrust")}
     offset[:2] -= GRAVITY * np.array(list(slopes.values()))
     # The centre of mass, x and y, in the frame of the airframe's rotor positions [m].
-    named = slopes | {"alpha3": gain / inertia[0], "alpha6": gain / inertia[1]}
+    named = slopes | {ROLL.inverse: gain / inertia[0], PITCH.inverse: gain / inertia[1]}
     found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)
     center = np.array([coordinate.value for coordinate in found])
     reaction = values.get("rotor_reaction")
     rotor_inertia = float(airframe.rotor_inertia) if reaction is None else reaction * inertia[2]
     speed = float(airframe.max_rotor_speed)
     drag = np.array([values.get(f"{axis}_drag", 0.0) for axis in "xyz"])
-    moment = [values.get(f"{axis}_velocity", 0.0) for axis in AXES[:2]]
+    moment = [values.get(f"{axis}_velocity", 0.0) for axis in MOTIONS[:2]]
     vehicle = RigidVehicle(
         mass=mass,
         gravity=float(airframe.gravity),
@@ -151,7 +148,7 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
         lag=values.get("rotor_lag", 0.0),
         delay=values.get("rotor_delay", 0.0),
         torque=inertia * offset,
-        damping=inertia * np.array([values.get(f"{axis}_damping", 0.0) for axis in AXES]),
+        damping=inertia * np.array([values.get(f"{axis}_damping", 0.0) for axis in MOTIONS]),
         drag=mass * drag,
         flapping=inertia[:2] * moment,
         thrust_curve=values.get("thrust_curve", 1.0),

@@ -39,14 +39,11 @@ class Measured(NamedTuple):
         zero = np.zeros(len(angles))
         roll, pitch, yaw = ((half[0, :, i], *np.insert([zero, zero], i, half[1, :, i], axis=0)) for i in range(3))
         attitude = np.stack(product(yaw, product(pitch, roll)), axis=1)
-        stretch = np.zeros(len(angles), int) if flight.stretch is None else np.asarray(flight.stretch)
         columns = np.concatenate([position, velocity, angles, rates], axis=1).T
         noise = np.nan_to_num([white_noise(column, 4) for column in columns])
         states = np.concatenate([position, velocity, attitude, rates], axis=1)
-        force = (
-            np.full((len(states), 3), np.nan) if flight.specific_force is None else np.asarray(flight.specific_force)
-        )
-        return cls(states, force, np.asarray(flight.omega), stretch, float(flight.dt), noise)
+        force = flight.recorded[:, len(STATE_NAMES) :]
+        return cls(states, force, np.asarray(flight.omega), np.asarray(flight.stretch_numbers), float(flight.dt), noise)
 
     def accelerations(self, gravity: float) -> Float[np.ndarray, "samples 6"]:
         """From each sample to the next: p', q', r' [rad/s^2], and the specific force that velocity implies [m/s^2]."""

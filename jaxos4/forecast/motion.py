@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Numeric, Scalar
-from ..analysis.open_loop import filtered, gyro_bias, open_loop
+from ..analysis.open_loop import Filtered, filtered, gyro_bias, open_loop
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST
-from ..shooting.gains import Covariance, LogNoise, first_covariance, is_rate, next_gains, step_of, transition
+from ..shooting.gains import Covariance, LogNoise, Transition, first_covariance, is_rate, next_gains, step_of
 from ..simulation import rk4_step
 
 _Samples = Float[Numeric, "*samples"]
@@ -58,14 +58,12 @@ class Known(NamedTuple):
     """The knowledge at each sample, or at one.
 
     - `state`: as measured, as in `PARTS`.
-    - `driven`: the filters' rates and unexplained specific forces [rad/s; m/s^2]. `disturbance`: what drives these
-      [rad/s^2; m/s^2].
+    - `filters`: rates and unexplained specific forces [rad/s; m/s^2], and what drives these [rad/s^2; m/s^2].
     - `unsure`: the standard deviation of each offset, see `Futures`.
     """
 
     state: Float[Numeric, "... 13"]
-    driven: Float[Numeric, "... channels"]
-    disturbance: Float[Numeric, "... channels"]
+    filters: Filtered
     unsure: Float[Numeric, "... 6"]
 
 
@@ -76,19 +74,18 @@ class Futures(NamedTuple):
     - `offset`: what p', q', r' [rad/s^2] and the specific force [m/s^2] have in this recording besides the model, from
       the past of each sample.
     - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
-    - `begin`, `pushed`: errors of `Known.driven` and of the disturbances at the start.
+    - `errors`: of the filters at the start.
     - `off`: errors of the offsets, and what they make of the disturbances at the start, in standard deviations.
-    - `gusts`: what `Known.driven` and the disturbance of each channel gain in each step besides the model.
+    - `gusts`: what each channel gains in each step besides the model.
     """
 
     parameters: Float[Array, "futures parameters"]
     forcing: Forcing
     offset: Float[Array, "futures samples 6"]
     filtered: Bool[Array, " futures"]
-    begin: Float[Array, "futures channels"]
-    pushed: Float[Array, "futures channels"]
+    errors: Filtered
     off: Float[Array, "futures 2 6"]
-    gusts: Float[Array, "futures steps channels 2"]
+    gusts: Filtered
 
 
 class _Free(NamedTuple):
@@ -160,11 +157,14 @@ def _fly(
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
     scalars, axes = tuple(future.parameters), model.force_axes
     p, v, q, w = (start.state[places] for places in PARTS.values())
-    steps = future.gusts.shape[0]
+    steps = future.gusts.driven.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    w = jnp.where(future.filtered, start.driven[:3], w) - gyro_bias(model, w, still, scalars) + future.begin[:3]
     error, absorbed = start.unsure * future.off
+    measured = Filtered(jnp.zeros(noise.strength.size).at[:3].set(w), jnp.zeros(noise.strength.size))
+    known = jax.tree.map(lambda x, y, e: jnp.where(future.filtered, x, y) + e, start.filters, measured, future.errors)
+    known = known._replace(disturbance=known.disturbance.at[:3].add(absorbed[:3]))
+    w = known.driven[:3] - gyro_bias(model, w, still, scalars)
     offset = future.offset[first] + error
     begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
 
@@ -178,11 +178,7 @@ def _fly(
         feasible = feasible & finite & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
         return jax.tree.map(lambda new, old: jnp.where(feasible, new, old), moved, motion), feasible
 
-    disturbance = jnp.where(future.filtered, start.disturbance, 0.0) + future.pushed
-    disturbance = disturbance.at[:3].add(absorbed[:3])
-    force = jnp.where(future.filtered, start.driven[3:], 0.0) + future.begin[3:]
-    begin = begin, jnp.array(True)
-    motion, _ = open_loop(advance, begin, disturbance, rows, future.gusts, transition(noise, dt), force)
+    motion, _ = open_loop(advance, (begin, jnp.array(True)), known, rows, future.gusts, Transition.of(noise, dt))
     return jnp.stack(jax.tree.leaves(motion), axis=1)
 
 
@@ -255,9 +251,9 @@ def known_at_samples(
     # The bias of an accelerometer is its mean over the memory.
     force = force - _past(jnp.nan_to_num(force), kept) / jnp.maximum(_past(~jnp.isnan(force), kept), 1.0)
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
-    stretch = jnp.zeros(len(rates), dtype=int) if flight.stretch is None else flight.stretch
-    found = filtered(noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
-    return Known(state, found.driven, found.disturbance, unsure), forcing, offset
+    seen = jnp.concatenate([rates, force], axis=1)
+    filters, _ = filtered(noise, seen, modelled, flight.stretch_numbers, flight.dt)
+    return Known(state, filters, unsure), forcing, offset
 
 
 def _offset_weights(
@@ -277,9 +273,7 @@ def _offset_weights(
     channels = np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
     strength, time_constant = (jnp.full(6, x) for x in (tuning.push, tuning.push_time))
     strength = strength.at[channels].set(jnp.exp(noise.strength))
-    smoothing = (
-        0.0 if noise.smoothing is None else jnp.where(is_rate(noise.strength.size), 0.0, jnp.exp(noise.smoothing))
-    )
+    smoothing = 0.0 if noise.smoothing is None else jnp.where(is_rate(noise.strength), 0.0, jnp.exp(noise.smoothing))
     time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant) + smoothing)
     is_known, prior = ~jnp.isnan(accelerations), jnp.square(prior)
     total, squares = _past(is_known, kept), _past(is_known, kept**2)
@@ -310,6 +304,6 @@ def settled(noise: LogNoise, dt: Scalar, rows: int) -> tuple[Covariance, Covaria
     measured, never = jnp.ones(step.sensor.shape, dtype=bool), jnp.zeros(1, dtype=bool)
     p, gains = jax.lax.scan(lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=rows)
     driven, disturbance = gains.driven[-1], gains.disturbance[-1]
-    after = Covariance(p.driven * (1 - driven), p.cross * (1 - driven), p.disturbance - p.cross * disturbance)
-    absorbed = disturbance * dt / (disturbance * step.moved.reach + (1 - step.moved.kept) * driven)
+    after, _ = next_gains(p, step_of(noise, jnp.zeros_like(dt)), measured, never)
+    absorbed = disturbance * dt / (disturbance * step.transition.reach + (1 - step.transition.kept) * driven)
     return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import Parameters, as_float
+from ..analysis.open_loop import Filtered
 from ..errors import InputError, named, printable, shortened
 from ..flight import FORCE_NAMES
 from ..identification import Identification
@@ -104,7 +105,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
             LogNoise(*np.log(np.maximum(table, 1e-9)).T),  # finite
             used.sample_time,
             file.result,
-            (*file.reasons, *notes),
+            (*file.warnings, *notes),
         )
 
 
@@ -277,11 +278,11 @@ def _fly(
     known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, seen, noise, prior, tuning)
 
     after, added, absorbed = jax.tree.map(np.asarray, settled(noise, dt, tuning.settled))
-    first = _pairs(after, generator.standard_normal((draws, channels, 2)))
+    errors = _pairs(after, generator.standard_normal((draws, channels, 2)))
     gusts = _pairs(added, generator.standard_normal((draws, steps, channels, 2)))
     off = generator.standard_normal((draws, 6))
-    drawn = first[..., 0], first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
-    surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
+    drawn = errors, np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
+    surely = jax.tree.map(lambda x: as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])), drawn)
     futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
     chunks = (np.minimum(np.arange(i, i + chunk), start.size - 1) for i in range(0, start.size, chunk))
@@ -290,9 +291,9 @@ def _fly(
     return state[start], states, spread
 
 
-def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:
+def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> Filtered:
     """Rates or forces, and disturbances, with this covariance, from independent numbers of variance 1."""
     driven = np.sqrt(np.maximum(covariance.driven, 0.0))
     slope = np.divide(covariance.cross, driven, out=np.zeros_like(driven), where=driven > 0)
     own = np.sqrt(np.maximum(covariance.disturbance - slope**2, 0.0))
-    return np.stack([driven * normal[..., 0], slope * normal[..., 0] + own * normal[..., 1]], axis=-1)
+    return Filtered(driven * normal[..., 0], slope * normal[..., 0] + own * normal[..., 1])

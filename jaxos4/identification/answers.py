@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import Parameters
+from ..airframe import AXES, INERTIAS, INVERSES, MOTIONS, YAW
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.evaluation import Evaluation
 from ..analysis.inertia import fit_inertia
@@ -33,9 +34,6 @@ from .results import (
 from .search import Optimum
 
 UNIT = "kg m^2"
-# The place of the alpha that is torque over this moment of inertia.
-INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
-AXES = {"p": "roll", "q": "pitch", "r": "yaw"}
 NEGATIVE_NOTE = "came out negative, which is impossible; at the limit"
 
 
@@ -119,12 +117,12 @@ class Solution(NamedTuple):
     sample_times: tuple[SampleTime, ...] = ()
 
 
-def parameter_table(answer: Answer, prior: float, reasons: Mapping[str, str] = {}) -> dict[str, ParameterEstimate]:
+def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {}) -> dict[str, ParameterEstimate]:
     """Estimates by parameter name, without those that are fixed.
 
     The rule of `jaxos4.bracket.is_identifiable` decides which have an estimate. The others have a note instead.
 
-    **Arguments:** `prior`: how the estimator uses the bracket. `reasons`: why a parameter is not identifiable, by name.
+    **Arguments:** `prior`: how the estimator uses the bracket. `missing`: why a parameter is not identifiable, by name.
     """
     estimate, unknowns = answer.estimate, answer.problem.unknowns
     std, width = map(np.asarray, _intervals(estimate))
@@ -141,7 +139,7 @@ def parameter_table(answer: Answer, prior: float, reasons: Mapping[str, str] = {
             bound=finite_or_none(answer.bound[i]),
             ci95=(max(value - half, least), value + half) if known else None,
             unit=unknowns.units[i],
-            note=_note(answer, i, half) if known else reasons.get(name, "not identifiable from this flight"),
+            note=_note(answer, i, half) if known else missing.get(name, "not identifiable from this flight"),
             bracket=(float(lower[i]), float(upper[i])) if np.isfinite([lower[i], upper[i]]).all() else None,
         )
 
@@ -175,16 +173,16 @@ def overwhelmed(answer: Answer) -> dict[str, str]:
     Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then doubted for that reason.
     """
     omega, mixer = np.asarray(answer.problem.flight.omega, dtype=float), np.asarray(answer.problem.model.airframe.mixer)
-    torques, names = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0), answer.problem.model.parameter_names
+    torques = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0)
     alpha, weak = np.abs(np.asarray(answer.estimate.parameters)), {}
     strengths = {rate: row.strength for rate, row in answer.disturbances.items()}
-    for (rate, axis), place, torque in zip(AXES.items(), INVERSE.values(), torques, strict=True):
-        control = alpha[place] * torque
-        if names[place] in answer.fixed:
-            weak |= {axis: "the flights say less about alpha8 than its bracket"} if axis == "yaw" else {}
-        elif strengths.get(rate, 0.0) > control:
-            weak[axis] = (
-                f"about {axis}, the disturbance ({strengths[rate]:.2g} rad/s^2) is larger than what the rotors do "
+    for axis, torque in zip(AXES, torques, strict=True):
+        control, strength = alpha[axis.place] * torque, strengths.get(axis.rate, 0.0)
+        if axis.inverse in answer.fixed:
+            weak |= {axis.motion: f"the flights say less about {axis.inverse} than its bracket"} if axis == YAW else {}
+        elif strength > control:
+            weak[axis.motion] = (
+                f"about {axis.motion}, the disturbance ({strength:.2g} rad/s^2) is larger than what the rotors do "
                 f"({control:.2g} rad/s^2)"
             )
     return weak
@@ -197,7 +195,7 @@ def rigid_body(answer: Answer) -> RigidBody:
     values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
     if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
         return RigidBody()
-    table = zip(("Ix", "Iy", "Iz", "J_R"), values.tolist(), std.tolist(), strict=True)
+    table = zip((*INERTIAS, "J_R"), values.tolist(), std.tolist(), strict=True)
     constants = {name: Constant(value, error, UNIT) for name, value, error in table}
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
@@ -210,23 +208,23 @@ def vehicle_constants(answer: Answer) -> RigidBody:
     gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
     for gain in gains:
         # Torques exceed those of the airframe by this factor, also if it is hardly known.
-        for row in INVERSE.values():
-            alpha[row] /= values[gain]
-            slopes[row, row], slopes[row, gain] = 1 / values[gain], -alpha[row] / values[gain]
+        for place in INVERSES:
+            alpha[place] /= values[gain]
+            slopes[place, place], slopes[place, gain] = 1 / values[gain], -alpha[place] / values[gain]
     slopes[~known] = 0.0
     unknown = np.where(known, 0.0, (TABLES.unknown * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = slopes @ np.asarray(answer.estimate.covariance) @ slopes.T + np.diag(unknown)
     # What no likelihood sees makes all moments of inertia wrong by one factor.
     scale = TABLES.scale * bool(gains)
-    shared = scale * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
+    shared = scale * np.where(np.isin(np.arange(8), INVERSES), alpha, 0.0)
     covariance += shared[:, None] * shared
     constants, thrust = {}, "mass" if gains else "thrust_coefficient"
     drag = f"the drag coefficient {float(model.airframe.drag_coefficient):.3g}"
-    notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and {drag} are right"}
-    for name, row in INVERSE.items():
-        if known[row] and alpha[row] > 0:
-            std = float(np.sqrt(covariance[row, row])) / alpha[row] ** 2
-            constants[name] = Constant(1 / float(alpha[row]), float(std), UNIT, notes[name])
+    for axis in AXES:
+        place, needed = axis.place, f"{thrust} and {drag}" if axis == YAW else f"arms and {thrust}"
+        if known[place] and alpha[place] > 0:
+            std = float(np.sqrt(covariance[place, place])) / alpha[place] ** 2
+            constants[axis.inertia] = Constant(1 / float(alpha[place]), float(std), UNIT, f"if {needed} are right")
     # Alphas that are fixed are no evidence for or against a rigid body.
     if not known.all():
         return RigidBody(constants)
@@ -245,9 +243,7 @@ def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str
             level_p=float(diagnostics.level_p[i]),
             correlation=float(diagnostics.colour[i]),
             white_p=float(diagnostics.white_p[i]),
-            input_correlation=dict(
-                zip(("roll", "pitch", "yaw"), diagnostics.input_correlation[i].tolist(), strict=True)
-            ),
+            input_correlation=dict(zip(MOTIONS, diagnostics.input_correlation[i].tolist(), strict=True)),
             input_p=float(diagnostics.input_p[i]),
         )
         for i, column in enumerate(CASCADE_ORDER[: problem.size])

@@ -1,7 +1,6 @@
 """Predictions of measurements that were not fitted."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -54,8 +53,9 @@ def predict_held_out(
     every = predicted_by(values, noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
     predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
     own, fixed = skill(predicted), [name in answer.fixed for name in names]
-    regressed = skill(predicted_by(_regressed(answer.problem, data.room, values, fixed), None))
-    tables = (own.skill, own.std, own.rmse, own.persistence, regressed.skill)
+    regressed = np.asarray(_regressed(with_room(answer.problem, data.room), as_float(values), np.asarray(fixed)))
+    compared = skill(predicted_by(regressed, None))
+    tables = (own.skill, own.std, own.rmse, own.persistence, compared.skill)
     rates = {
         rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
     }
@@ -104,13 +104,8 @@ def vehicle_traces(
     return traces.thinned(), crossed
 
 
-def _regressed(problem: ShootingProblem, room: int, values: np.ndarray, fixed: Sequence[bool]) -> np.ndarray:
-    """The parameters by regression."""
-    return np.asarray(_regression(with_room(problem, room), as_float(values), np.asarray(fixed)))
-
-
 @eqx.filter_jit
-def _regression(problem: ShootingProblem, values: Array, fixed: Numeric) -> Array:
+def _regressed(problem: ShootingProblem, values: Array, fixed: Numeric) -> Array:
     """The parameters by regression; fixed ones, and those that it cannot estimate, have the values of the fit."""
     linear = np.array([not each.in_forcing for each in problem.model.parameters])
     own = jnp.where(linear & ~fixed, problem.unknowns.center, values)

@@ -3,7 +3,7 @@
 - recordings -> `Data`, with a likelihood: `prepare_flight` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
   case, which knows the other steps.
 - `Data` -> `Solution`, the data with their `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
-- `Solution` -> `Checked`: `case.check`, by checks.py with doubts.py, quantities.py and verdict.py.
+- `Solution` -> `Checked`: `case.check`, by checks.py with quantities.py, doubts.py and verdict.py.
 - `Checked` -> `Identification`: `describe`.
 """
 

@@ -27,9 +27,8 @@ from ..results import RESULTS
 from ..shooting import ShootingProblem, padded
 from .answers import Answer, Solution
 from .checks import Checked, check_flight
-from .data import Clock, Data, HeldOut, Progress, silent
+from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, silent, versions
 from .problem import Intervals, bracket_of, flight_problem
-from .provenance import Provenance, airframe_name, versions
 from .results import COLOURED, has_answer
 from .settings import FlightSettings, class_name, name_and_class
 

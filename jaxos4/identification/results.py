@@ -13,7 +13,7 @@ from ..analysis.traces import Traces
 from ..estimate import Estimate
 from ..results import result_names
 from ..shooting import ShootingProblem
-from .provenance import Provenance as Provenance
+from .data import Provenance
 from .tables import dataframe, dataset, series
 from .verdict import TOLERANCE, Doubt, Verdict
 
@@ -259,7 +259,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return tuple(self.provenance.flights or (self.provenance.flight or "flight",))
 
     @property
-    def reasons(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Why the estimate cannot be trusted, or only with care, and what to do; one line each."""
         said = "use with care: " if self.successful else "not to be trusted because "
         return tuple(f"{said}{doubt}" for doubt in self.doubts)

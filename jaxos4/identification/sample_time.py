@@ -15,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..airframe import AXES, PITCH, ROLL, YAW
 from ..estimate import REACH, AbstractEstimator, Estimate
 from ..results import result_names
 from ..shooting import InnovationsProblem
-from .answers import AXES, Answer, overwhelmed, vehicle_constants
+from .answers import Answer, overwhelmed, vehicle_constants
 from .data import Data, Progress, silent
 from .results import Constant, SampleTime
 from .search import Optimum, search
@@ -84,7 +85,7 @@ def shortest(rows: Sequence[SampleTime]) -> int:
 
 def _vague(row: SampleTime, other: SampleTime) -> bool:
     """Whether another sample time knows Ix or Iy clearly better."""
-    both = [name for name in ("Ix", "Iy") if name in row.constants and name in other.constants]
+    both = {ROLL.inertia, PITCH.inertia} & row.constants.keys() & other.constants.keys()
     return any(row.constants[name].std > RULE.wider * other.constants[name].std for name in both)
 
 
@@ -103,10 +104,10 @@ def sample_time_of(answer: Answer) -> SampleTime:
     scales = [each.name for each in answer.problem.model.parameters if each.scales_torque]
     answered = answer.answered and not any(name in answer.fixed for name in scales)
     constants = vehicle_constants(answer).constants if answered else {}
-    if answered and "yaw" in overwhelmed(answer):
-        constants = {name: row for name, row in constants.items() if name != "Iz"}
-    rates = [row.correlation for name, row in answer.disturbances.items() if name in AXES] if answer.answered else []
-    largest, samples = max(rates, key=abs, default=1.0), 0
+    if answered and YAW.motion in overwhelmed(answer):
+        constants = {name: row for name, row in constants.items() if name != YAW.inertia}
+    found = [answer.disturbances[axis.rate] for axis in AXES if axis.rate in answer.disturbances] * answer.answered
+    largest, samples = max((row.correlation for row in found), key=abs, default=1.0), 0
     if answer.answered and answer.estimate.parts is not None:
         # The sum of the squares of the innovations of a body rate, which have a mean of 1.
         samples = round(float(np.asarray(answer.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))

@@ -94,7 +94,7 @@ class Optimum(NamedTuple):
         return self.likelihood.noise(self.values)
 
     @property
-    def parts(self) -> Parts:
+    def by_segment(self) -> Parts:
         """The likelihood of each segment, at the estimate."""
         if self.estimate.parts is None:
             raise ValueError("`estimator` must return the `parts` of the likelihood.")
@@ -132,7 +132,7 @@ def search(
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
     optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
-    optimum = optimum._replace(likelihood=likelihood.passing(optimum.parts.passed))
+    optimum = optimum._replace(likelihood=likelihood.passing(optimum.by_segment.passed))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_plain_values(estimator, optimum, progress)
 
@@ -186,7 +186,7 @@ def deviations(covariance: Float[ArrayLike, "unknowns unknowns"]) -> Float[np.nd
 def disturbances_of(optimum: Optimum) -> dict[str, Disturbance]:
     """The disturbance of each channel: accelerations that the model does not explain."""
     noise = jax.tree.map(np.exp, optimum.noise)
-    products = np.asarray(optimum.parts.products).sum(axis=0)
+    products = np.asarray(optimum.by_segment.products).sum(axis=0)
     correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)
     largest = np.take_along_axis(correlation, np.abs(correlation).argmax(axis=1)[:, None], axis=1)[:, 0]
     return {

@@ -20,12 +20,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import as_float
+from ..airframe import INVERSES
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
 from ..results import NINETY_FIVE
 from ..shooting import InnovationsProblem
-from .answers import INVERSE, Answer
+from .answers import Answer
 from .data import Data, Progress, silent
 from .results import FixedParameter, has_answer
 from .search import Optimum, disturbances_of, search
@@ -122,14 +123,14 @@ def at_lowest(
         if not optimum.converged:
             return answer
         poor = optimum.std > PROFILE.well_known * np.abs(optimum.values[: optimum.whole.count])
-        for place in sorted({*INVERSE.values()} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
+        for place in sorted({*INVERSES} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
-            reach, end = upper_end(optimum, place)
-            optimum = optimum._replace(rollouts=end.rollouts)
-            if end.converged and optimum.cost - end.cost > PROFILE.lower:
-                lower = end.values
+            end, fit = upper_end(optimum, place)
+            optimum = optimum._replace(rollouts=fit.rollouts)
+            if fit.converged and optimum.cost - fit.cost > PROFILE.lower:
+                lower = fit.values
                 break
-            factors[optimum.whole.names[place]] = max(reach / NINETY_FIVE, 1.0)
+            factors[optimum.whole.names[place]] = max(end / NINETY_FIVE, 1.0)
         if lower is None:
             return corrected(optimum, data, factors)
         if not left:
@@ -156,20 +157,20 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
     solver, covariance = FilterError(tolerance=PROFILE.tolerance), np.asarray(optimum.estimate.covariance)
     # How the minimum moves with this parameter, in steps of its standard deviation.
     along = covariance[:, place] / np.sqrt(covariance[place, place])
-    unknowns, at, root, reach, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
+    unknowns, at, root, end, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
     for _ in range(PROFILE.fits):
-        unknowns, before, at = unknowns + (reach - at) * along, at, reach
+        unknowns, before, at = unknowns + (end - at) * along, at, end
         fixed = {optimum.whole.names[place]: float(unknowns[place])}
         other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
         rise, unknowns, last = other.cost - optimum.cost, other.values, root
         if not other.converged or rise < -PROFILE.lower:
             break
         root = np.sqrt(max(2 * rise, 0.0))
-        reach = at + (NINETY_FIVE - root) / max((root - last) / (at - before), PROFILE.slope)
-        reach = float(np.clip(reach, at / 2, 2 * at))
+        end = at + (NINETY_FIVE - root) / max((root - last) / (at - before), PROFILE.slope)
+        end = float(np.clip(end, at / 2, 2 * at))
         if abs(root - NINETY_FIVE) < PROFILE.close:
             break
-    return reach, other
+    return end, other
 
 
 def _widening(
@@ -178,28 +179,28 @@ def _widening(
     """The factors of the jackknife for the parameters in the places `free`. `recording`: of each sample."""
     index, owned = map(np.asarray, optimum.likelihood.cut[:2])
     middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
-    parts = optimum.parts
+    segments = optimum.by_segment
     # In a segment of padding nothing was measured.
-    used = np.asarray(parts.information).any(axis=(1, 2))
+    used = np.asarray(segments.information).any(axis=(1, 2))
     number = recording[np.minimum(middle, recording.size - 1)][used]
-    gradient = np.asarray(parts.gradient)[used][:, free]
-    information = np.asarray(parts.information)[used][:, free[:, None], free]
+    gradient = np.asarray(segments.gradient)[used][:, free]
+    information = np.asarray(segments.information)[used][:, free[:, None], free]
     prior = np.diag(1 / np.square(np.asarray(optimum.whole.half_width)[free]))
     ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
     return np.max([np.ones(free.size), *ways], axis=0)
 
 
-def parts_of(lanes: int, recording: Int[np.ndarray, " lanes"]) -> list[Int[np.ndarray, " lanes"]]:
-    """The ways to divide lanes into parts: into blocks of neighbours, and into recordings if there are enough."""
-    ways = [np.arange(lanes) * min(lanes, JACKKNIFE.most) // lanes, recording]
+def parts_of(segments: int, recording: Int[np.ndarray, " segments"]) -> list[Int[np.ndarray, " segments"]]:
+    """The ways to divide segments into parts: into blocks of neighbours, and into recordings if there are enough."""
+    ways = [np.arange(segments) * min(segments, JACKKNIFE.most) // segments, recording]
     return [way for way in ways if np.unique(way).size >= JACKKNIFE.fewest]
 
 
 def disagreement(
-    gradient: Float[np.ndarray, "lanes unknowns"],
-    information: Float[np.ndarray, "lanes unknowns unknowns"],
+    gradient: Float[np.ndarray, "segments unknowns"],
+    information: Float[np.ndarray, "segments unknowns unknowns"],
     prior: Float[np.ndarray, "unknowns unknowns"],
-    part: Int[np.ndarray, " lanes"],
+    part: Int[np.ndarray, " segments"],
 ) -> Float[np.ndarray, " unknowns"]:
     """By how much parts disagree: the jackknife's standard error over the likelihood's; at least 1.
 
@@ -210,9 +211,9 @@ def disagreement(
 
     **Arguments:**
 
-    - `gradient`, `information`: of the negative log-likelihood of each lane, at the estimate from all lanes.
+    - `gradient`, `information`: of the negative log-likelihood of each segment, at the estimate from all segments.
     - `prior`: the information of the prior.
-    - `part`: the number of the part of each lane.
+    - `part`: the number of the part of each segment.
 
     Reference: Efron and Tibshirani 1993, An Introduction to the Bootstrap, ch. 11.
     """

@@ -25,9 +25,8 @@ from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_o
 from ..shooting.feedthrough import FEEDTHROUGHS, input_innovations
 from .answers import Solution
 from .checks import Checked, check_vehicle
-from .data import Clock, Data, HeldOut, Progress
+from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
 from .problem import Intervals, bracket_of
-from .provenance import Provenance, airframe_name, versions
 from .sample_time import sample_time_of, search_sample_times, shortest
 from .search import search
 from .settings import VehicleSettings, name_and_class

@@ -3,12 +3,12 @@
 A doubt counts against a quantity by how far the quantity would move if the doubt were true.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
 
-from ..recording.checks import INERTIAS
+from ..airframe import AXES, INERTIAS
 
 IDENTIFIED = "identified"
 RESERVED = "identified with a reservation"
@@ -21,42 +21,12 @@ _TRUSTED = (IDENTIFIED, RESERVED)
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 
 
-class Move(msgspec.Struct, frozen=True):
-    """The change of a quantity if a doubt were true.
-
-    - `share`: of the quantity. Parameters can be 0: theirs is a share of the half-width of their bracket.
-    - `deviations`: the same in standard deviations of the estimate.
-    """
-
-    share: float
-    deviations: float
-
-
-class Doubt(msgspec.Struct, frozen=True):
-    """A reason not to trust an estimate, or a part of it.
-
-    - `result`: the name of the result code to which it leads if it refuses the moments of inertia; `"successful"`: it
-      only makes a reservation.
-    - `cause`, `remedy`: what is wrong, and what to do.
-    - `moves`: the quantities that it concerns, each with how far it would move if the doubt were true. `None`: nothing
-      says how far.
-    """
-
-    result: str
-    cause: str
-    remedy: str
-    moves: dict[str, Move | None] = {}
-
-    def __str__(self) -> str:
-        return f"{self.cause}; {self.remedy}"
-
-
 class Tolerance(msgspec.Struct, frozen=True):
     """Limits of a verdict: the change that a doubt may cause, and the accuracy that is needed.
 
     - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, by more than one of them
       makes a reservation, by less is a note. Errors of discretisation reach 3 %, and an interval allows for one
-      standard deviation. Moves of reservations add up; see `weights`.
+      standard deviation. Moves of reservations add up; see `judge`.
     - `vague`, `unknown`: half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a
       reservation, or is not identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
     - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
@@ -78,6 +48,71 @@ class Tolerance(msgspec.Struct, frozen=True):
 
 
 TOLERANCE = Tolerance()
+
+
+class Move(msgspec.Struct, frozen=True):
+    """The change of a quantity if a doubt were true.
+
+    - `share`: of the quantity. Parameters can be 0: theirs is a share of the half-width of their bracket.
+    - `deviations`: the same in standard deviations of the estimate.
+    """
+
+    share: float
+    deviations: float
+
+    def limits_exceeded(self, tolerance: Tolerance) -> int:
+        """The number of the two limits that it exceeds."""
+        return (self.share > tolerance.share) + (self.deviations > tolerance.deviations)
+
+
+Moves = Mapping[str, Move | None]
+"""Quantities by name, each with how far it would move; `None`: nothing says how far."""
+
+
+class Doubt(msgspec.Struct, frozen=True):
+    """A reason not to trust an estimate, or a part of it. Made by `reservation`, `refusal`, `contradiction`.
+
+    - `result`: the name of the result code to which it leads if it refuses what was asked; see `severity`.
+    - `cause`, `remedy`: what is wrong, and what to do.
+    - `moves`: the quantities that it concerns, each with how far it would move if the doubt were true.
+    """
+
+    result: str
+    cause: str
+    remedy: str
+    moves: dict[str, Move | None] = {}
+
+    def __str__(self) -> str:
+        return f"{self.cause}; {self.remedy}"
+
+    @property
+    def severity(self) -> str:
+        """The status that it leaves to a quantity if nothing says how far the quantity would move."""
+        return {"successful": RESERVED, "implausible": CONTRADICTED}.get(self.result, MISSING)
+
+    def status_left(self, name: str, tolerance: Tolerance = TOLERANCE) -> str:
+        """The status that it alone leaves to the quantity of this name."""
+        if name not in self.moves:
+            return IDENTIFIED
+        if (move := self.moves[name]) is None:
+            return self.severity
+        worst = RESERVED if self.severity == RESERVED else CONTRADICTED
+        return (IDENTIFIED, RESERVED, worst)[move.limits_exceeded(tolerance)]
+
+
+def reservation(cause: str, remedy: str, moves: Moves) -> Doubt:
+    """A doubt that refuses nothing."""
+    return Doubt("successful", cause, remedy, dict(moves))
+
+
+def refusal(result: str, cause: str, remedy: str, moves: Moves) -> Doubt:
+    """A doubt because the flights or the search do not show the quantities. `result`: the name of its result code."""
+    return Doubt(result, cause, remedy, dict(moves))
+
+
+def contradiction(cause: str, remedy: str, moves: Moves) -> Doubt:
+    """A doubt because physics, the airframe or the data contradict the estimate."""
+    return Doubt("implausible", cause, remedy, dict(moves))
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -112,52 +147,62 @@ class Quantity(NamedTuple):
     reservations: tuple[str, ...] = ()
 
 
-def weights(doubts: Sequence[Doubt], name: str, tolerance: Tolerance = TOLERANCE) -> list[str]:
-    """The status that each doubt leaves to a quantity that has this name.
+class Judgement(NamedTuple):
+    """The verdict for each quantity, and the doubts that refuse it: their places, and the result codes they lead to."""
+
+    verdicts: dict[str, Verdict]
+    refusals: dict[str, list[tuple[int, str]]]
+
+    def result(self, search: str, required: Iterable[str]) -> str:
+        """The name of the result code: `"successful"` if all required quantities can be trusted.
+
+        Otherwise that of the first doubt that refuses one of them; `search`, of the search, if it has no answer.
+        """
+        refused = [name for name in required if not self.verdicts[name].trusted]
+        if not refused:
+            return "successful"
+        without_doubt = (0, search if search != "successful" else "unidentifiable")
+        return min((each for name in refused for each in self.refusals[name]), default=without_doubt)[1]
+
+
+def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt], tolerance: Tolerance = TOLERANCE) -> Judgement:
+    """The verdict for each quantity. `doubts`: all of the identification."""
+    verdicts, refusals = {}, {}
+    for name, quantity in quantities.items():
+        causes: dict[str, list[str]] = {status: [] for status in STATUSES}
+        refusals[name] = []
+        for place, status in enumerate(_statuses_left(doubts, name, tolerance)):
+            causes[status].append(_reason(doubts[place], name))
+            # A reservation that contradicts together with another decides nothing by itself.
+            if status not in _TRUSTED and doubts[place].severity != RESERVED:
+                refusals[name].append((place, doubts[place].result))
+        causes[RESERVED] += quantity.reservations
+        if quantity.missing and not causes[MISSING]:
+            causes[MISSING].append(quantity.missing)
+        motion = next((axis.motion for axis in AXES if axis.inertia == name), "motion")
+        known = f"it is known to {100 * quantity.spread:.0f} % only; fly more {motion}, or longer"
+        if quantity.spread > tolerance.unknown:
+            causes[MISSING].append(known)
+        elif quantity.spread > tolerance.vague:
+            causes[RESERVED].append(known)
+        status = next((each for each in STATUSES[:0:-1] if causes[each]), IDENTIFIED)
+        verdicts[name] = Verdict(status, quantity.value, tuple(causes[status]) if status != IDENTIFIED else ())
+    return Judgement(verdicts, refusals)
+
+
+def _statuses_left(doubts: Sequence[Doubt], name: str, tolerance: Tolerance) -> list[str]:
+    """The status that each doubt leaves to the quantity of this name.
 
     Reservations of known size add up. If one of them is impossible, and together they exceed what one doubt may move,
     they contradict the quantity: an impossible parameter shows that the model errs, and another doubt by how much.
     """
-    alone = [_weight(doubt, name, tolerance) for doubt in doubts]
+    alone = [doubt.status_left(name, tolerance) for doubt in doubts]
     reserved = (i for i, status in enumerate(alone) if status == RESERVED)
     sized = {i: move for i in reserved if (move := doubts[i].moves[name]) is not None}
     total = Move(sum(move.share for move in sized.values()), sum(move.deviations for move in sized.values()))
-    if all(doubts[i].result == "successful" for i in sized) or _far(total, tolerance) < 2:
+    if all(doubts[i].severity == RESERVED for i in sized) or total.limits_exceeded(tolerance) < 2:
         return alone
     return [CONTRADICTED if i in sized else status for i, status in enumerate(alone)]
-
-
-def _weight(doubt: Doubt, name: str, tolerance: Tolerance) -> str:
-    if name not in doubt.moves:
-        return IDENTIFIED
-    move = doubt.moves[name]
-    if move is None:
-        return {"successful": RESERVED, "implausible": CONTRADICTED}.get(doubt.result, MISSING)
-    worst = RESERVED if doubt.result == "successful" else CONTRADICTED
-    return (IDENTIFIED, RESERVED, worst)[_far(move, tolerance)]
-
-
-def _far(move: Move, tolerance: Tolerance) -> int:
-    """The number of the two limits that a move exceeds."""
-    return (move.share > tolerance.share) + (move.deviations > tolerance.deviations)
-
-
-def verdict_of(name: str, quantity: Quantity, doubts: Sequence[Doubt], tolerance: Tolerance = TOLERANCE) -> Verdict:
-    """The verdict for a quantity. `doubts`: all of the identification."""
-    causes: dict[str, list[str]] = {status: [] for status in STATUSES}
-    for doubt, status in zip(doubts, weights(doubts, name, tolerance), strict=True):
-        causes[status].append(_reason(doubt, name))
-    causes[RESERVED] += quantity.reservations
-    if quantity.missing and not causes[MISSING]:
-        causes[MISSING].append(quantity.missing)
-    motion = {"Ix": "roll", "Iy": "pitch", "Iz": "yaw"}.get(name, "motion")
-    known = f"it is known to {quantity.spread:.0%} only; fly more {motion}, or longer"
-    if quantity.spread > tolerance.unknown:
-        causes[MISSING].append(known)
-    elif quantity.spread > tolerance.vague:
-        causes[RESERVED].append(known)
-    status = next((each for each in STATUSES[:0:-1] if causes[each]), IDENTIFIED)
-    return Verdict(status, quantity.value, tuple(causes[status]) if status != IDENTIFIED else ())
 
 
 def _reason(doubt: Doubt, name: str) -> str:
@@ -169,48 +214,28 @@ def _reason(doubt: Doubt, name: str) -> str:
     return f"{doubt} (this would move {', '.join(sizes)})" if sizes else str(doubt)
 
 
-def headline(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
-    """The quantities by their status, then each reason with the quantities that it concerns, then mere notes."""
-    return [*statuses(verdicts), *reasons(verdicts, doubts)]
-
-
-def statuses(verdicts: dict[str, Verdict], tabled: Collection[str] = ()) -> list[str]:
+def status_lines(verdicts: dict[str, Verdict], tabled: Collection[str] = ()) -> list[str]:
     """The quantities by their status. `tabled`: those whose value stands in a table, and not here."""
     lines = []
     for status in STATUSES:
-        shown = {name: verdict for name, verdict in verdicts.items() if verdict.status == status}
         said = [
             f"{name} {verdict.value}".strip() if verdict.trusted and name not in tabled else name
-            for name, verdict in shown.items()
+            for name, verdict in verdicts.items()
+            if verdict.status == status
         ]
         lines += [f"{status}: {(', ' if tabled else '; ').join(said)}."] * bool(said)
     return lines
 
 
-def reasons(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
+def reason_lines(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
     """Each reason with the quantities that it concerns, then mere notes."""
     concerned: dict[str, list[str]] = {}
     for status in STATUSES:
         for name, verdict in verdicts.items():
             for reason in verdict.reasons if verdict.status == status else ():
                 concerned.setdefault(reason, []).append(name)
-    every = [weights(doubts, name) for name in verdicts]
-    notes = [doubt for i, doubt in enumerate(doubts) if all(own[i] == IDENTIFIED for own in every)]
+    notes = [doubt for doubt in doubts if all(doubt.status_left(name) == IDENTIFIED for name in verdicts)]
     return [
         *(f"{', '.join(names)}: {reason}." for reason, names in concerned.items()),
         *(f"note: {doubt}. It moves nothing." for doubt in notes if verdicts),
     ]
-
-
-def outcome(search: str, required: Sequence[str], verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> str:
-    """The name of the result code: `"successful"` if all required quantities can be trusted.
-
-    Otherwise that of the first doubt that refuses one of them; `search`, of the search, if it has no answer.
-    """
-    refused = [name for name in required if not verdicts[name].trusted]
-    if not refused:
-        return "successful"
-    decisive = {i for name in refused for i, status in enumerate(weights(doubts, name)) if status not in _TRUSTED}
-    # A reservation that contradicts together with another decides nothing by itself.
-    decided = (doubts[i].result for i in sorted(decisive) if doubts[i].result != "successful")
-    return next(decided, search if search != "successful" else "unidentifiable")

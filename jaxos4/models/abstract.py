@@ -108,8 +108,8 @@ class AbstractModel(eqx.Module):
         """The forcing of a whole flight. Row k acts from sample k to sample k + 1."""
 
     @abc.abstractmethod
-    def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
-        """The forcing of the samples `place`, whose measurements may be means, see `Forcing.early`."""
+    def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
+        """The forcing of a whole flight whose measurements may be means, see `Forcing.early`."""
 
     @abc.abstractmethod
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:

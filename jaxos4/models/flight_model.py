@@ -156,10 +156,10 @@ class FlightModel(AbstractModel):
         fine = self._rotors(inputs.divided, parameters, are_parts=True)
         return self._beside(inputs, jax.tree.map(lambda leaf: leaf[following].mean(axis=1), fine))
 
-    def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
+    def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The forcing over each sample around its time, as `Flight.within` has the rotor speeds."""
         if inputs.within is None:
-            return jax.tree.map(lambda leaf: leaf[place], self.forcing(inputs, parameters))
+            return self.forcing(inputs, parameters)
         samples, parts, _ = inputs.within.shape
         edges, length = np.linspace(0, 1, parts + 1), jnp.asarray(inputs.averaging_time) / inputs.dt
         after = jnp.clip(edges - (1 - length) / 2, 0, length)  # begin of the window
@@ -173,20 +173,15 @@ class FlightModel(AbstractModel):
         fine = self._rotors(inputs.divided, parameters, are_parts=True)
         fine = jax.tree.map(lambda leaf: leaf.reshape(samples, parts), fine)
         whole, early = jax.tree.map(lambda leaf: leaf.mean(axis=1), fine), jax.tree.map(lambda leaf: leaf @ left, fine)
-        whole = whole._replace(specific_thrust=fine.thrust @ seen, early=early)
-        return self._beside(inputs, jax.tree.map(lambda leaf: leaf[place], whole), place)
+        return self._beside(inputs, whole._replace(specific_thrust=fine.thrust @ seen, early=early))
 
-    def _beside(self, inputs: Inputs, rotors: Forcing, place: Int[Numeric, "*rows"] | None = None) -> Forcing:
-        """The forcing by the rotors, and what acts beside them. `place`: the samples of its rows; by default all."""
+    def _beside(self, inputs: Inputs, rotors: Forcing) -> Forcing:
+        """The forcing by the rotors, and what acts beside them."""
         own, velocity = jnp.zeros(inputs.omega.shape[0], dtype=int), inputs.velocity
         if inputs.stretches is not None:
             own = of_stretches(self.recordings, inputs.stretches.number)
-        if place is not None:
-            own, velocity = own[place], None if velocity is None else velocity[place]
         shares = tuple((own == i).astype(rotors.roll.dtype) for i in range(max(self.recordings) + 1))
-        return rotors._replace(
-            recording=shares, velocity=None if velocity is None else tuple(jnp.moveaxis(velocity, -1, 0))
-        )
+        return rotors._replace(recording=shares, velocity=None if velocity is None else tuple(velocity.T))
 
     def _rotors(self, inputs: Inputs, parameters, *, are_parts: bool = False) -> Forcing:
         """The forcing by the rotors. `are_parts`: see `Grid`."""

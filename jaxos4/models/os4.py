@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import Numeric, Scalar, as_float
-from ..airframe import OS4, Airframe, alpha_from_inertia
+from ..airframe import INVERSES, OS4, Airframe, alpha_from_inertia
 from ..flight import Inputs
 from .abstract import DEFAULT_HALF_WIDTH, PARAMETER_NAMES, AbstractModel, Parameter
 from .state import Attitude, Forcing, Rates, State, Translation, attitude_rates, sines_and_cosines
@@ -44,7 +44,7 @@ class AbstractOS4(AbstractModel):
     def half_width(self) -> Float[Array, "8"]:
         """`DEFAULT_HALF_WIDTH`, with the widths of alpha3, alpha6 and alpha8 scaled to the airframe's inertia."""
         os4, own = (alpha_from_inertia(airframe.inertia, jnp.zeros(())) for airframe in (OS4, self.airframe))
-        scaled = np.isin(np.arange(8), (2, 5, 7))
+        scaled = np.isin(np.arange(8), INVERSES)
         return jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0) * DEFAULT_HALF_WIDTH
 
     def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> None:
@@ -73,9 +73,9 @@ class AbstractOS4(AbstractModel):
         roll, pitch, yaw, thrust = (jnp.square(omega) @ airframe.mixer.T).T
         return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
 
-    def mean_forcing(self, inputs: Inputs, parameters, place: Int[Numeric, "segments time"]) -> Forcing:
+    def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
         """That of `forcing`: measurements are instants."""
-        return jax.tree.map(lambda leaf: leaf[place], self.forcing(inputs, parameters))
+        return self.forcing(inputs, parameters)
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
         """See `AbstractModel`."""

@@ -13,8 +13,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import RotorSpeeds, Scalar
 from .._registry import Registry
-from ..airframe import GRAVITY, Airframe
-from ..excitation import AXES
+from ..airframe import GRAVITY, MOTIONS, Airframe
 from .abstract import Contradiction, Parameter
 from .rotors import Batch, Commands, Grid, Motor, Speeds, delayed, driven
 from .state import Forcing, Rates, Vector
@@ -148,7 +147,7 @@ def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[
     """Adds to each axis its parameter of this name times a number; there is none for an axis without a parameter."""
 
     def add(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-        axes = zip(AXES, total, (*per_unit(rates, forcing), None), strict=False)
+        axes = zip(MOTIONS, total, (*per_unit(rates, forcing), None), strict=False)
         return Rates(*(old if x is None else old + values[f"{axis}_{name}"] * x for axis, old, x in axes))
 
     return add
@@ -198,13 +197,13 @@ _LAG = Parameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-0.
 _OWN: dict[str, Term] = {
     "offset": Term(
         "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
-        tuple(Parameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(AXES)),
+        tuple(Parameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(MOTIONS)),
         angular_acceleration=_torque("offset", lambda rates, forcing: (1.0, 1.0, 1.0)),
     ),
     "center_of_mass": Term(
         "a torque proportional to thrust above hover, from an offset centre of mass: roll_thrust, pitch_thrust [rad/m]",
         # The bracket is an offset of 10 % of the arm.
-        tuple(Parameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(AXES[:2])),
+        tuple(Parameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(MOTIONS[:2])),
         angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - GRAVITY,) * 2),
         quantity="center of mass",
     ),
@@ -213,7 +212,7 @@ _OWN: dict[str, Term] = {
         # By thrust about roll and pitch, by drag about yaw.
         tuple(
             Parameter(f"{x}_damping", "1/s", half_width, nonnegative=True, contradiction=_DAMPED)
-            for x, half_width in zip(AXES, (5.0, 5.0, 2.0), strict=True)
+            for x, half_width in zip(MOTIONS, (5.0, 5.0, 2.0), strict=True)
         ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
         quantity="damping",
@@ -221,7 +220,7 @@ _OWN: dict[str, Term] = {
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
         # The bracket reaches the authority at 2 m/s.
-        tuple(Parameter(f"{x}_velocity", "rad/(m s)", _authority(i, 2.0)) for i, x in enumerate(AXES[:2])),
+        tuple(Parameter(f"{x}_velocity", "rad/(m s)", _authority(i, 2.0)) for i, x in enumerate(MOTIONS[:2])),
         needs=frozenset({VELOCITY}),
         # Along y the vehicle rolls, along x it pitches.
         angular_acceleration=_torque("velocity", lambda rates, forcing: _velocity(forcing)[1::-1]),

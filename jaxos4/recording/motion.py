@@ -8,8 +8,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..airframe import GRAVITY, Airframe, rotation
-from ..excitation import AXES
+from ..airframe import GRAVITY, MOTIONS, Airframe, rotation
 from ..flight import ANGLES, RATES, VELOCITY, Flight
 from ..logs import Recording, as_recording
 from ..logs.sampling import averages, filled
@@ -86,7 +85,7 @@ def excitation(
     if airframe is not None:
         mixer = np.asarray(airframe.mixer, dtype=float)[:3]
         torque = (recording.omega[:-1] ** 2 @ mixer.T).std(axis=0)
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(MOTIONS):
         rate, angle = recording.states[:, RATES[i]], recording.states[:, ANGLES[i]]
         noise = white_noise(rate, 2)
         if np.count_nonzero(np.isfinite(rate)) < 3:
@@ -115,7 +114,7 @@ def opposite_axes(flown: Sequence[Recording], airframe: Airframe, *, signs: Sign
     hover = float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
     torques = [(each.omega[:-1] ** 2 @ mixer.T).std(axis=0) for each in flown]
     found = np.where(np.max(torques, axis=0, initial=0.0) < signs.torque * hover, np.nan, found)
-    ends = zip(AXES, signs.wrong, -found.min(axis=0), found.max(axis=0), strict=True)
+    ends = zip(MOTIONS, signs.wrong, -found.min(axis=0), found.max(axis=0), strict=True)
     return {axis: float(wrong) for axis, (least, times), wrong, right in ends if wrong > max(least, times * right)}
 
 
@@ -160,7 +159,7 @@ def _correlations(
     step = max([signs.step, *(each.dt for each in flown)])
     pairs = [_response(each, mixer, step, signs) for each in flown if np.ptp(each.time) > 2 * signs.slow * step]
     shifts = range(round(between[0] / step), round(between[1] / step) + 1)
-    found = np.full((len(shifts), mixer.shape[0], len(AXES)), np.nan)
+    found = np.full((len(shifts), mixer.shape[0], len(MOTIONS)), np.nan)
     for place, shift in enumerate(shifts if pairs else ()):
         early, late = max(-shift, 0), max(shift, 0)
         torque = np.concatenate([a[early : max(a.shape[0] - late, 0)] for a, _ in pairs])

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import Airframe
+from ..airframe import INERTIAS, Airframe
 from ..errors import InputError, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..logs import Recording
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
-from .checks import INERTIAS, Evidence, Finding, different_thrust, findings, opposite_yaw
+from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import Ups, in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
 from .stretches import Stretch, cut, nothing_usable
@@ -144,7 +144,7 @@ def prepare(
         smooth, noise, share = without_noise(each.stretches, airframe)
         stretched += [(number, stretch) for stretch in smooth]
         if share > rules.noisy:
-            how = f"white noise of {noise:.2g} rad/s, {share:.0%} of their changes from sample to sample"
+            how = f"white noise of {noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
             notes.append(f"{recording.name}: rotor speeds have {how}; their expected values are used")
     slowest = max(stretch.dt for _, stretch in stretched)
     steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted, rules=rules)

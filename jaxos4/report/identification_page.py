@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 
 from .._files import check_writable, write_file
+from ..airframe import INERTIAS
 from ..errors import printable
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification
-from ..identification.verdict import IDENTIFIED, RIGID_BODY, STATUSES, headline, reasons
+from ..identification.verdict import IDENTIFIED, RIGID_BODY, STATUSES, reason_lines, status_lines
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .identification_figures import (
-    INERTIAS,
     correlation_matrix,
     frequency_responses,
     inertias_by_sample_time,
@@ -67,7 +67,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         title=title or ", ".join(printable(Path(name).name) for name in found.logs),
         found=found,
         verdict=verdict(found),
-        headline=headline(found.verdicts, found.doubts),
+        verdict_lines=[*status_lines(found.verdicts), *reason_lines(found.verdicts, found.doubts)],
         center=[f"{x.axis} {plain(1e3 * x.value)} ± {plain(NINETY_FIVE * (1e3 * x.std), 2)} mm" for x in center],
         quantities=quantities(found),
         signals=identified_signals(found, look),
@@ -106,7 +106,7 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
 def identification_html(found: Identification) -> str:
     """Verdict, physical quantities and reservations, for a notebook."""
     rows = zip(*quantity_rows(physical_quantities(found)), strict=True)
-    lines = [*reasons(found.verdicts, found.doubts), *(f"note: {note}" for note in found.provenance.notes)]
+    lines = [*reason_lines(found.verdicts, found.doubts), *(f"note: {note}" for note in found.provenance.notes)]
     return render("summary.html.j2", verdict=verdict(found), rows=list(rows), lines=lines)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from .._files import check_writable, write_file
-from ..airframe import Airframe
+from ..airframe import MOTIONS, Airframe
 from ..errors import InputError, printable
 from ..flight import ANGLES, POSITION, RATES, VELOCITY, Flight
 from ..logs import Recording, Source, as_recording, read_recording
@@ -49,7 +49,7 @@ RULES = PageRules()
 _SIGNALS = (
     ("rate [rad/s]", RATES, ("p", "q", "r")),
     ("force [m/s²]", np.arange(12, 15), ("ax", "ay", "az")),
-    ("attitude [rad]", ANGLES, ("roll", "pitch", "yaw")),
+    ("attitude [rad]", ANGLES, MOTIONS),
     ("velocity [m/s]", VELOCITY, ("vx", "vy", "vz")),
     ("position [m]", POSITION, ("x", "y", "z")),
 )

@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..analysis.frequency_response import HIGHEST
+from ..airframe import INERTIAS
+from ..analysis.frequency_response import RESPONSE
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
 from ..identification.results import Identification
-from .identification_figures import GAINS, INERTIAS, draw_response, gain_band
+from .identification_figures import GAINS, draw_response, gain_band
 from .style import BOUND_DASHES, FAINT, INK, log_axis, styles
 
 _RATES = ("p", "q", "r")
@@ -68,7 +69,7 @@ class Plots(NamedTuple):
             raise InputError("the result has no frequency response: it is of an OS4, has no answer, or is older.")
         one, ax = response[_place("axis", axis, response._fields)], _axes(ax)
         draw_response(ax, one, one.gain, gain_band(one), 1.0, self._color)
-        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, HIGHEST), ylim=GAINS)
+        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, RESPONSE.highest), ylim=GAINS)
         for which in ("x", "y"):
             log_axis(ax, which)
         return ax

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 
+from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
 from ..identification.physical import PhysicalQuantity, physical_quantities
 from ..identification.results import COLOURED, Identification
-from ..identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED, reasons, statuses
+from ..identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED, reason_lines, status_lines
 from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
 from .text import Listing, say
@@ -67,7 +68,8 @@ def quantity_rows(rows: Sequence[PhysicalQuantity]) -> tuple[list[tuple[str, ...
 
 
 def _verdicts(found: Identification) -> Section:
-    yield from statuses(found.verdicts, {row.judged for row in physical_quantities(found)} if found.is_vehicle else ())
+    tabled = {row.judged for row in physical_quantities(found)} if found.is_vehicle else ()
+    yield from status_lines(found.verdicts, tabled)
 
 
 def _quantities(found: Identification) -> Section:
@@ -77,7 +79,7 @@ def _quantities(found: Identification) -> Section:
 
 
 def _reasons(found: Identification) -> Section:
-    yield from reasons(found.verdicts, found.doubts)
+    yield from reason_lines(found.verdicts, found.doubts)
 
 
 def _notes(found: Identification) -> Section:
@@ -151,7 +153,7 @@ def _fit(found: Identification) -> Section:
     for property_, p_values in tests.items() if found.fit else ():
         failed = [name for name, p_value in p_values.items() if p_value * len(p_values) < _SIGNIFICANCE]
         answer = f"not those of {', '.join(failed)}" if failed else "all"
-        yield f"residuals {property_}, tests at {_SIGNIFICANCE:.0%}: {answer}."
+        yield f"residuals {property_}, tests at {100 * _SIGNIFICANCE:.0f} %: {answer}."
 
 
 def _inertias(found: Identification) -> Section:
@@ -268,7 +270,7 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
     for part in sorted(shown, key=lambda part: part.begin):
         axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
         rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
-    headings, numbers = ("from [s]", "to [s]", "use", "roll", "pitch", "yaw"), ("from [s]", "to [s]")
+    headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
     Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
     if len(found.parts) > len(shown):
         console.print(f"and {len(found.parts) - len(shown)} shorter parts")

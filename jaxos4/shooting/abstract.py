@@ -197,11 +197,6 @@ class InitialGuess(NamedTuple):
     off: WindowUnknowns
     known: Float[Array, "windows known"]
 
-    @classmethod
-    def of_shared(cls, starts: Float[Array, "starts unknowns"], off: Values) -> "InitialGuess":
-        """The guess of a flight in one window, with nothing but shared unknowns."""
-        return cls(starts[:, None], off[None], jnp.zeros((1, 0), dtype=float))
-
 
 class Stage(NamedTuple):
     """One stage of a likelihood, see `Stages`."""

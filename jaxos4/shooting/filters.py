@@ -19,7 +19,7 @@ from .._custom_types import Count, Scalar
 from ..models.state import Forcing, Rates, State
 from .batching import with_batch
 from .gains import (
-    RATES,
+    RATE_COUNT,
     Channels,
     Covariance,
     Gains,
@@ -79,7 +79,7 @@ class _Feedback(NamedTuple):
     @classmethod
     def of(cls, gains: Gains, step: Step) -> "_Feedback":
         fields = gains.driven, gains.driven_later, gains.disturbance_later, step.driven_seen, step.seen
-        return cls(*map(tuple, (*fields, *step.moved)))
+        return cls(*map(tuple, (*fields, *step.transition)))
 
 
 def _advance(
@@ -88,16 +88,16 @@ def _advance(
     """The estimates one sample later, and the innovations of this sample."""
     move, average, observe = functions
     seen = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
-    mean = average(State(Rates(*known.driven[:RATES])), forcing, scalars).rates
+    mean = average(State(Rates(*known.driven[:RATE_COUNT])), forcing, scalars).rates
     rates = Rates(*(x + a for x, a in zip(mean, seen, strict=False)))
     outputs = observe(State(rates), forcing, scalars)
     forces = zip(outputs, feedback.driven_seen, known.driven, seen, strict=True)
-    outputs = (*outputs[:RATES], *(h + share * x + a for h, share, x, a in [*forces][RATES:]))
+    outputs = (*outputs[:RATE_COUNT], *(h + share * x + a for h, share, x, a in [*forces][RATE_COUNT:]))
     # What was not measured has no gain.
     errors = tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
     driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
-    rates = move(State(Rates(*driven[:RATES])), forcing, scalars).rates
-    driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATES:]))
+    rates = move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates
+    driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
     later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, strict=True)
     driven = tuple(x + a * d + gain * e for x, a, d, gain, e in later)
     faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, strict=True)
@@ -123,8 +123,15 @@ class _Carry(NamedTuple):
     sums: Innovations
 
 
-class _Segmented(NamedTuple):
-    """A flight in segments, see `innovate`."""
+class Segmented(NamedTuple):
+    """A flight in segments.
+
+    - `observed`: its number of rows is a multiple of `BLOCK`, of which `rows` are filtered; the others are padding.
+    - `inputs`: input innovations, see `jaxos4.shooting.feedthrough`.
+    - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
+      parameters on which they depend.
+    - `window`: what a measurement averages.
+    """
 
     observed: Observed
     inputs: Float[Array, "time feedthroughs channels segments"]
@@ -135,8 +142,13 @@ class _Segmented(NamedTuple):
     window: Window
 
 
-class _At(NamedTuple):
-    """The unknowns at which a flight is filtered, see `innovate`."""
+class Point(NamedTuple):
+    """The unknowns at which a flight is filtered.
+
+    - `parameters`: of all segments, or of each.
+    - `feedthrough`: what the input innovations explain of the innovations of the same samples. `passed`: feedthroughs
+      that were found before; what they explain counts as noise.
+    """
 
     parameters: Float[Array, "parameters *segments"]
     noise: LogNoise
@@ -144,39 +156,16 @@ class _At(NamedTuple):
     passed: tuple[Float[Array, " channels *segments"], ...]
 
 
-def innovate(
-    functions: Functions,
-    observed: Observed,
-    input_innovations: Float[Array, "time feedthroughs channels segments"],
-    forcing: Forcing,
-    parameters: Float[Array, "parameters *segments"],
-    noise: LogNoise,
-    feedthrough: tuple[Float[Array, " channels"], ...],
-    passed: tuple[Float[Array, " channels"], ...],
-    *,
-    dt: Scalar,
-    window: Window,
-    rows: Count | int,
-    forcing_tangents: Forcing | None,
-    forcing_parameters: tuple[int, ...],
-) -> Innovations:
+def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """Filter all segments. The likelihood of the innovations has derivatives in the parameters and in the noise.
 
     A change of one channel's noise is taken to change no other channel's innovations.
 
     - `functions`: of a state, the forcing and the parameters: the state one sample later, its mean over what a
       measurement averages, and the outputs of the sensors.
-    - `observed`: its number of rows is a multiple of `BLOCK`, of which `rows` are filtered; the others are padding.
-    - `input_innovations`, `feedthrough`: what they explain of the innovations of the same samples, see
-      `jaxos4.shooting.feedthrough`. `passed`: feedthroughs that were found before; what they explain counts as noise.
-    - `parameters`: of all segments, or of each.
-    - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
-      parameters at the positions `forcing_parameters`.
-    - `window`: what a measurement averages.
+    - `positions`: of the parameters on which the forcing depends.
     """
-    flight = _Segmented(observed, input_innovations, forcing, forcing_tangents, rows, dt, window)
-    at = _At(parameters, noise, feedthrough, passed)
-    return with_batch(_innovate, _innovate_lanes, functions, forcing_parameters, flight, at)
+    return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)
 
 
 def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
@@ -214,20 +203,20 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
     rows = fixed_flight.rows if flight.rows is None else flight.rows.max()  # in the rows of other lanes, nothing counts
     observed, inputs, forcing, tangents = lanes_before_last(flight[:4], fixed_flight[:4])
     dt, window = (of_each_segment(*pair) for pair in zip(flight[5:], fixed_flight[5:], strict=True))
-    flight = _Segmented(observed, inputs, forcing, tangents, rows, dt, window)
+    flight = Segmented(observed, inputs, forcing, tangents, rows, dt, window)
     functions = each(0), each(1), each(2)
     found = _filter(functions, positions, flight, in_each_segment(at, fixed_at))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
 
 
-def _innovate(functions: Functions, positions: tuple[int, ...], flight: _Segmented, at: _At) -> Innovations:
+def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """The innovations of one flight."""
     own = None if at.parameters.ndim == 1 else 0
     move, average, observe = (jax.vmap(function, in_axes=(0, 0, own)) for function in functions)
     return _filter((move, average, observe), positions, flight, at)
 
 
-def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: _Segmented, at: _At) -> Innovations:
+def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
     parameters, noise, feedthrough, passed = at
@@ -238,8 +227,8 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     steps = step, jax.vmap(push)(basis(noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
     zero = jnp.zeros(segments, dtype=float)
-    start = (zero,) * RATES if observed.known is None else observed.known
-    known = _Known((*start, *(zero,) * (channels - RATES)), (zero,) * channels)
+    start = (zero,) * RATE_COUNT if observed.known is None else observed.known
+    known = _Known((*start, *(zero,) * (channels - RATE_COUNT)), (zero,) * channels)
     known = _emptied(known, observed.restart[0])
     nothing = Innovations(
         cost=zero,
@@ -300,7 +289,7 @@ def _filter_rows(
     def body(carry, rows):
         (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry
         forcing, tangents, row = rows
-        for x in known.driven[:RATES]:
+        for x in known.driven[:RATE_COUNT]:
             feasible = feasible & (jnp.abs(x) < FASTEST)
         (covariance, gains), push = jax.linearize(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]

@@ -1,4 +1,4 @@
-"""The noise of filter error, its unknowns, and the gains of its Kalman filters, which depend on no parameter.
+"""The noise of filter error, and the gains of its Kalman filters, which depend on no parameter.
 
 A disturbance d acts in each channel. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise. On a body rate x
 it acts as an angular acceleration [rad/s^2], x' = d. On a specific force it acts through a low-pass filter, because
@@ -19,14 +19,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Numeric, Scalar
-from ..bracket import PROPER_PRIOR
 from ..models.state import CHANNELS
-from .abstract import Unknowns
 
 Channels = Float[Array, "channels segments"]
 Series = Float[Array, "time channels segments"]
 
-RATES = CHANNELS["rates"]
+RATE_COUNT = CHANNELS["rates"]
 """The number of body rates, which come first among the channels."""
 # Standard deviation of the rates before the first measurement of a segment [rad/s]: as good as unknown.
 _UNKNOWN_RATE = 1e3
@@ -100,7 +98,7 @@ class Covariance(NamedTuple):
     disturbance: Channels
 
 
-class Moved(NamedTuple):
+class Transition(NamedTuple):
     """d and x over one sample, without noise.
 
     - `kept`, `driven_kept`: the shares of d and of x that remain. `reach`: what a unit of d adds to x.
@@ -110,11 +108,17 @@ class Moved(NamedTuple):
     driven_kept: Channels
     reach: Channels
 
+    @classmethod
+    def of(cls, noise: LogNoise, dt: Float[Array, "..."]) -> "Transition":
+        """Over one sample of this length."""
+        response = _Response.of(noise)
+        return cls(response.fading(dt), response.driven_fading(dt), response.driven(dt))
+
 
 class Step(NamedTuple):
     """The disturbance over one sample, of each channel.
 
-    - `moved`: see there.
+    - `transition`: see there.
     - `driven_seen`, `seen`: what a unit of x and of d adds to the measurement.
     - `since_seen`: x at the end of the sample, for each unit of x in the measurement.
     - `added`: the covariance that its noise adds at the end of the sample.
@@ -123,7 +127,7 @@ class Step(NamedTuple):
     - `first`: the covariance before anything is measured; rates are known. `sensor`: the variance of its noise.
     """
 
-    moved: Moved
+    transition: Transition
     driven_seen: Channels
     seen: Channels
     since_seen: Channels
@@ -135,13 +139,9 @@ class Step(NamedTuple):
     sensor: Channels
 
 
-def is_rate(channels: int) -> Bool[np.ndarray, " channels"]:
-    """Which channels are body rates; the others are specific force."""
-    return np.arange(channels) < RATES
-
-
-def _is_rate(leaf: Array) -> Array:
-    return jnp.asarray(is_rate(len(leaf)).reshape(-1, *(1,) * (leaf.ndim - 1)))
+def is_rate(channels: Float[Numeric, "channels *rest"]) -> Bool[np.ndarray, "channels *ones"]:
+    """Which rows of an array are of body rates; the others are of specific force."""
+    return (np.arange(len(channels)) < RATE_COUNT).reshape(-1, *(1,) * (channels.ndim - 1))
 
 
 class _Response(NamedTuple):
@@ -155,7 +155,7 @@ class _Response(NamedTuple):
         tau = jnp.exp(noise.time_constant)
         if noise.smoothing is None:
             return cls(tau, jnp.full_like(tau, _NO_FILTER))
-        return cls(tau, jnp.where(_is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing)))
+        return cls(tau, jnp.where(is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing)))
 
     def fading(self, time: Array) -> Array:
         """Of d to d."""
@@ -163,25 +163,19 @@ class _Response(NamedTuple):
 
     def driven_fading(self, time: Array) -> Array:
         """Of x to x."""
-        return jnp.where(_is_rate(self.smoothing), 1.0, jnp.exp(-time / self.smoothing))
+        return jnp.where(is_rate(self.smoothing), 1.0, jnp.exp(-time / self.smoothing))
 
     def driven(self, time: Array) -> Array:
         """Of x to d."""
         tau = self.time_constant
         force = tau / (tau - self.smoothing) * (self.fading(time) - jnp.exp(-time / self.smoothing))
-        return jnp.where(_is_rate(tau), -tau * jnp.expm1(-time / tau), force)
+        return jnp.where(is_rate(tau), -tau * jnp.expm1(-time / tau), force)
 
     def driven_sum(self, time: Array) -> Array:
         """Of the integral of x to d."""
         tau, fast = self.time_constant, self.smoothing
         slow, quick = (-x * jnp.expm1(-time / x) for x in (tau, fast))
-        return jnp.where(_is_rate(tau), tau * (time - slow), tau * (slow - quick) / (tau - fast))
-
-
-def transition(noise: LogNoise, dt: Float[Array, "..."]) -> Moved:
-    """The disturbance over one sample."""
-    response = _Response.of(noise)
-    return Moved(response.fading(dt), response.driven_fading(dt), response.driven(dt))
+        return jnp.where(is_rate(tau), tau * (time - slow), tau * (slow - quick) / (tau - fast))
 
 
 def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) -> Step:
@@ -189,7 +183,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     noise = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1), noise)
     response, variance = _Response.of(noise), jnp.exp(2 * noise.strength)
     tau, fast = response
-    rate = _is_rate(tau)
+    rate = is_rate(tau)
     # A force has the standard deviation `strength`, and its disturbance a larger one.
     drive = jnp.where(rate, variance, variance * (tau + fast) / tau)
     begin, end = jnp.asarray(window.begin, dtype=float), jnp.asarray(window.begin + window.length, dtype=float)
@@ -215,7 +209,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     mean = jnp.where(in_window > 0, -jnp.expm1(-in_window) / jnp.where(in_window > 0, in_window, 1.0), 1.0)
     force = jnp.where(rate, 0.0, variance)
     return Step(
-        moved=transition(noise, dt),
+        transition=Transition.of(noise, dt),
         driven_seen=jnp.where(rate, 1.0, response.driven_fading(begin) * mean),
         seen=measured(jnp.zeros_like(begin)),
         since_seen=jnp.where(rate, 1.0, response.driven_fading(dt - begin) / mean),
@@ -239,9 +233,9 @@ def next_gains(
     """The covariance one sample later, and the gains of this sample, from the covariance at its beginning."""
     # After a restart the rates are unknown. XLA takes no longer than if this came before the loop.
     first = first_covariance(step, p.driven.shape[-1])
-    first = first._replace(driven=first.driven + _is_rate(first.driven) * _UNKNOWN_RATE**2)
+    first = first._replace(driven=first.driven + jnp.where(is_rate(first.driven), _UNKNOWN_RATE**2, 0.0))
     driven, cross, disturbance = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
-    (kept, _, reach), seen, since = step.moved, step.seen, step.since_seen
+    (kept, _, reach), seen, since = step.transition, step.seen, step.since_seen
     # Covariances with the measurement, and with `gap`: x at the end less what remains of the measurement. The gap does
     # not depend on x at the beginning, whose variance may be huge. So no difference of large numbers is computed.
     driven_seen = step.driven_seen * driven + seen * cross
@@ -272,119 +266,8 @@ def next_gains(
     return after, gains
 
 
-def gains_of(observed: Observed, noise: LogNoise, dt: Scalar, window: Window = INSTANT) -> Gains:
-    """The gains of the filters of all channels."""
-    step = step_of(noise, dt, window)
-    first = first_covariance(step, observed.measured.shape[-1])
-    return jax.lax.scan(
-        lambda p, row: next_gains(p, step, *row), first, (~jnp.isnan(observed.measured), observed.restart)
-    )[1]
-
-
 def basis(noise: LogNoise) -> LogNoise:
     """The directions of `noise`: in each, the same logarithm of all channels changes."""
     leaves, tree = jax.tree.flatten(noise)
     directions = np.eye(len(leaves))
     return tree.unflatten([np.multiply.outer(row, np.ones(noise.strength.shape)) for row in directions])
-
-
-@jax.jit  # traced once, although many ask for it
-def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_constant: Scalar) -> LogNoise:
-    """Rough noise levels from differences of the measurements. `time_constant`: of all disturbances [s]."""
-
-    def power(values: Float[Array, "rows channels"]) -> Float[Array, " channels"]:
-        known = ~jnp.isnan(values)
-        return jnp.where(known, jnp.square(values), 0.0).sum(axis=0) / jnp.maximum(known.sum(axis=0), 1)
-
-    def logarithm(values: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        return jnp.log(jnp.where((values > 0) & jnp.isfinite(values), values, 1.0))
-
-    # White noise has second differences of 6 times its variance.
-    sensor = jnp.sqrt(power(jnp.diff(measured, n=2, axis=0)) / 6)
-    change = jnp.sqrt(power(jnp.diff(measured, axis=0))) / dt / 2
-    mean = jnp.nansum(measured, axis=0) / jnp.maximum((~jnp.isnan(measured)).sum(axis=0), 1)
-    spread = jnp.sqrt(power(measured - mean)) / 2
-    strength = jnp.where(is_rate(measured.shape[1]), change, spread)
-    return LogNoise(logarithm(strength), jnp.full(strength.shape, jnp.log(time_constant)), logarithm(sensor))
-
-
-def levels(channels: int) -> int:
-    """The number of noise levels of each channel: one more if there are specific forces, see `LogNoise`."""
-    return 4 if channels > RATES else 3
-
-
-class NoiseUnknowns(NamedTuple):
-    """How the noise of each channel is looked for: the logarithms of `LogNoise`.
-
-    - `precision`: of a weak prior on each logarithm, as the reciprocal of a variance.
-    - `stride`: the cost is roughly quadratic in a logarithm over such a step.
-    - `reach`: factor to either side of the first noise levels; large, as simulated flights have no disturbance.
-    - `times`: time constants of the disturbance at which searches start [s]: the likelihood has several maxima.
-    - `shortest`, `longest`: of the time constants, in samples and in seconds.
-    - `shortest_of_force`: of a disturbance of specific force [s]: what is faster is vibration, a noise of the sensor.
-    - `smoothing`, `longest_smoothing`: where the search of a force's low-pass filter starts, and its largest time
-      constant [s], which is shorter than that of any disturbance. The shortest is `shortest`.
-    """
-
-    precision: float = 1e-2
-    stride: float = 1.0
-    reach: float = 1e8
-    times: tuple[float, ...] = (0.2, 0.03)
-    shortest: float = 0.25
-    longest: float = 3.0
-    shortest_of_force: float = 0.25
-    smoothing: float = 0.05
-    longest_smoothing: float = 0.2
-
-    def after(
-        self,
-        own: Unknowns,
-        channels: tuple[str, ...],
-        feedthroughs: int,
-        measured: Float[Array, "samples channels"],
-        dt: Scalar,
-        least_noise: Float[Array, " channels"],
-    ) -> Unknowns:
-        """The parameters, then noise and feedthroughs of each channel, in brackets from differences of measurements."""
-        if self.longest_smoothing >= self.shortest_of_force:
-            raise ValueError(
-                f"`longest_smoothing` must be shorter than `shortest_of_force`, {self.shortest_of_force} s, "
-                f"got {self.longest_smoothing} s."
-            )
-        first = jnp.stack(first_noise(measured, dt, self.times[0])[:3], axis=1)
-        count, rate, shortest = levels(first.shape[0]), is_rate(first.shape[0]), jnp.log(self.shortest * dt)
-        smoothing = jnp.full((first.shape[0], count - first.shape[1]), np.log(self.smoothing))
-        first = jnp.concatenate([first, jnp.maximum(smoothing, shortest)], axis=1)
-        lowest, highest = first - np.log(self.reach), first + np.log(self.reach)
-        lowest = lowest.at[:, 1].set(jnp.where(rate, shortest, np.log(self.shortest_of_force)))
-        highest = highest.at[:, 1].set(np.log(self.longest))
-        # A rate has no filter: its place stays where it is.
-        lowest = lowest.at[:, 3:].set(jnp.where(rate[:, None], first[:, 3:], shortest))
-        highest = highest.at[:, 3:].set(jnp.where(rate[:, None], first[:, 3:], np.log(self.longest_smoothing)))
-        lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))
-        free = jnp.ones(first.shape, dtype=bool).at[:, 3:].set(~rate[:, None])
-        first, lowest, highest, free = (
-            jnp.pad(x, ((0, 0), (0, feedthroughs)), constant_values=value)
-            for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf), (free, True))
-        )
-        names = tuple(each.format(name) for name in channels for each in own_names(count, feedthroughs))
-        precision = jnp.full(first.size, self.precision)
-        return Unknowns(
-            names=own.names + names,
-            units=own.units + tuple("1" if name.startswith("log") else "rad/s" for name in names),
-            parameters=own.count,
-            prior=PROPER_PRIOR,
-            center=jnp.concatenate([own.center, first.ravel()]),
-            half_width=jnp.concatenate([own.half_width, 1 / jnp.sqrt(precision)]),
-            free=jnp.concatenate([own.free, free.ravel()]),
-            precision=jnp.concatenate([1 / jnp.square(own.usable.half_width), precision]),
-            lowest=jnp.concatenate([own.lowest, lowest.ravel()]),
-            highest=jnp.concatenate([own.highest, highest.ravel()]),
-            stride=jnp.concatenate([own.stride, jnp.full(first.size, self.stride)]),
-        )
-
-
-def own_names(count: int, feedthroughs: int) -> tuple[str, ...]:
-    """The names of the unknowns of a channel, with its name to be filled in. `count`: of noise levels."""
-    noise = ("log_{}_strength", "log_{}_time", "log_{}_sensor", "log_{}_smoothing")
-    return (*noise[:count], *(f"{{}}_feedthrough_{i + 1}" for i in range(feedthroughs)))

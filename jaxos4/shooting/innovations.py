@@ -21,10 +21,12 @@ from .._custom_types import Numeric, Parameters, as_float
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel, ByRecording
-from ..models.state import Forcing
+from ..models.state import Forcing, State
+from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
-from .filters import innovate
-from .gains import INSTANT, LogNoise, NoiseUnknowns, Observed, Window, levels, own_names
+from .filters import Point, Segmented, innovate
+from .gains import INSTANT, LogNoise, Observed, Window
+from .noise_unknowns import NoiseUnknowns, levels, own_names
 from .problem import ShootingProblem
 from .scans import with_tangents
 from .segments import Segments, observe_in_segments
@@ -165,7 +167,7 @@ class InnovationsProblem(AbstractProblem):
         starts = jnp.where(is_time, times[:, None], unknowns.center)
         starts = jnp.clip(starts, unknowns.lowest, unknowns.highest)
         starts = jnp.where(jnp.isnan(self.start) | ~unknowns.free, starts, self.start)
-        return InitialGuess.of_shared(starts, unknowns.half_width)
+        return InitialGuess(starts[:, None], unknowns.half_width[None], jnp.zeros((1, 0), dtype=float))
 
     def starting_from(self, start: Float[ArrayLike, " unknowns"]) -> "InnovationsProblem":
         """The same problem, with another start."""
@@ -278,15 +280,15 @@ class InnovationsProblem(AbstractProblem):
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, problem.columns.size - inputs.shape[2]), (0, 0)))
-        settings = {"dt": self.flight.dt, "window": self.window, "rows": self.cut.rows}
-        settings |= {"forcing_parameters": model.forcing_parameters}
+        fixed = self.cut.rows, self.flight.dt, self.window
+        functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
         def at(parameters: Parameters, noise: LogNoise, feedthrough: Array, passed: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
-            data = observed, inputs, forcing, own, noise, tuple(feedthrough.T), tuple(passed.T)
-            functions = problem.advance, problem.average, model.observe
-            return innovate(functions, *data, forcing_tangents=tangents, **settings)
+            flight = Segmented(observed, inputs, forcing, tangents, *fixed)
+            point = Point(own, noise, tuple(feedthrough.T), tuple(passed.T))
+            return innovate(functions, model.forcing_parameters, flight, point)
 
         return at
 
@@ -299,7 +301,7 @@ class InnovationsProblem(AbstractProblem):
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
 
         def of(parameters: Parameters) -> Forcing:
-            return self.model.mean_forcing(inputs, parameters, samples)
+            return jax.tree.map(lambda leaf: leaf[samples], self.model.mean_forcing(inputs, parameters))
 
         if not self.model.forcing_parameters:
             known = segments_last(of(self.model.alpha))
@@ -310,3 +312,19 @@ class InnovationsProblem(AbstractProblem):
             return segments_last(forcing), segments_last(tangents)
 
         return forced
+
+
+def _move(problem: ShootingProblem, state: State, forcing: Forcing, parameters) -> State:
+    """The rates one sample later: by the midpoint rule if measurements are means, else by the problem's method."""
+    if forcing.early is None:
+        return problem.step(state, forcing, parameters)
+    return midpoint_step(problem.model, state, forcing, parameters, problem.flight.dt)
+
+
+def _average(problem: ShootingProblem, state: State, forcing: Forcing, parameters) -> State:
+    """The mean over what a measurement averages, from the rates at the beginning of a sample."""
+    if forcing.early is None:  # measured at the beginning
+        return state
+    early = forcing.early._replace(recording=forcing.recording, velocity=forcing.velocity)
+    slope = problem.model.angular_acceleration(state.rates, early, parameters)
+    return State(jax.tree.map(lambda x, dx: x + problem.flight.dt / 2 * dx, state.rates, slope))

@@ -17,7 +17,7 @@ from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
-from ..simulation import STEPPERS, midpoint_step
+from ..simulation import STEPPERS
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stages, Unknowns, WindowUnknowns
 from .scans import (
     Length,
@@ -328,20 +328,6 @@ class ShootingProblem(AbstractProblem):
     def step(self, state: State, forcing: Forcing, parameters) -> State:
         """The state one sample later, down to the same level of the cascade."""
         return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
-
-    def average(self, state: State, forcing: Forcing, parameters) -> State:
-        """The mean over what a measurement averages, from the rates at the beginning of a sample."""
-        if forcing.early is None:  # measured at the beginning
-            return state
-        early = forcing.early._replace(recording=forcing.recording, velocity=forcing.velocity)
-        slope = self.model.angular_acceleration(state.rates, early, parameters)
-        return State(jax.tree.map(lambda x, dx: x + self.flight.dt / 2 * dx, state.rates, slope))
-
-    def advance(self, state: State, forcing: Forcing, parameters) -> State:
-        """The rates one sample later: by the midpoint rule if measurements are means, else by the problem's method."""
-        if forcing.early is None:
-            return self.step(state, forcing, parameters)
-        return midpoint_step(self.model, state, forcing, parameters, self.flight.dt)
 
     def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
         """The samples of each window, and which of them belong to it."""

@@ -92,8 +92,6 @@ def _restarts(
     missing: Bool[Array, " samples"], flight: Flight, settling: int
 ) -> tuple[Bool[Array, " samples"], Bool[Array, " samples"]]:
     """Where a filter restarts, and where it has settled."""
-    samples = missing.shape[0]
-    stretch = jnp.zeros(samples, dtype=int) if flight.stretch is None else flight.stretch
 
     def follow(carry, row):
         gap, since = carry
@@ -103,7 +101,7 @@ def _restarts(
         since = jnp.where(restart, 0, since + 1)
         return (jnp.where(is_missing, gap + 1, 0), since), (restart, since >= settling)
 
-    another = jnp.concatenate([jnp.zeros(1, dtype=bool), jnp.diff(stretch) != 0])
+    another = jnp.concatenate([jnp.zeros(1, dtype=bool), jnp.diff(flight.stretch_numbers) != 0])
     first = jnp.zeros((), dtype=int), jnp.full((), settling if flight.stretch is None else -1, dtype=int)
     return jax.lax.scan(follow, first, (missing, another))[1]
 

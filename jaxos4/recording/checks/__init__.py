@@ -8,6 +8,7 @@ from ...airframe import Airframe
 from ...logs import Recording
 from .channels import (
     clipped_values,
+    constant_force,
     impossible_values,
     rare_motors,
     rare_speeds,
@@ -18,7 +19,7 @@ from .channels import (
     wrong_axes,
     wrong_scale,
 )
-from .evidence import INERTIAS as INERTIAS, LIMITS, Evidence as Evidence, Finding as Finding, Limits as Limits
+from .evidence import LIMITS, Evidence as Evidence, Finding as Finding, Limits as Limits
 from .mounting import (
     different_thrust as different_thrust,
     earth_axes,
@@ -40,6 +41,7 @@ CHECKS: tuple[Check, ...] = (
     thrust_direction,
     velocity_axes,
     clipped_values,
+    constant_force,
     rare_motors,
     rare_speeds,
     impossible_values,

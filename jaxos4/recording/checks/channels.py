@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...excitation import AXES
+from ...airframe import AXES, INERTIAS, MOTIONS
 from ...flight import FORCE_NAMES, RATES
 from ...logs.table import counted
 from ..motion import excitation
 from .estimates import scaled_angles
-from .evidence import INERTIAS, Evidence, Finding
+from .evidence import Evidence, Finding
 from .mounting import earth_axes
 
 _ATTITUDE = (*INERTIAS, "attitude")
@@ -22,7 +22,7 @@ _CLOCKS = {  # how to say that it is wrong, and what it concerns
 }
 _UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
 # Clipped thrust seems weaker, and moments of inertia are proportional to it.
-_CLIPPED = {"p": ("Ix",), "q": ("Iy",), "r": ("Iz",), "az": ("thrust", *INERTIAS)}
+_CLIPPED = {axis.rate: (axis.inertia,) for axis in AXES} | {"az": ("thrust", *INERTIAS)}
 
 
 def uneven_time(evidence: Evidence) -> Finding | None:
@@ -76,6 +76,23 @@ def clipped_values(evidence: Evidence) -> Finding | None:
         "fly gentler, or set a larger range of the sensor",
         tuple(dict.fromkeys(quantity for name in found for quantity in _CLIPPED.get(name, ()))),
         many,
+    )
+
+
+def constant_force(evidence: Evidence) -> Finding | None:
+    """A vertical specific force that never changes, although the rotors do."""
+    force = evidence.logged.specific_force
+    measured = np.empty(0) if force is None else force[np.isfinite(force[:, 2]), 2]
+    squares = np.square(evidence.logged.omega).sum(axis=1)
+    if len(set(measured.tolist())) != 1 or squares.std() < evidence.limits.thrust_moves * squares.mean():
+        return None
+    return Finding(
+        "constant_force",
+        "the vertical specific force never changes, although the rotors do",
+        f"{measured[0]:.4g} m/s^2 in all {measured.size} samples",
+        "log what the accelerometer measures, or leave its columns out",
+        ("thrust", *INERTIAS),
+        True,
     )
 
 
@@ -166,8 +183,8 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
     for factor, unit in ((degrees, "the angles may be in degrees"), (1 / degrees, "the gyro may be in degrees/s")):
         if abs(mean / factor - 1) < 0.05:
             cause += f"; {unit}"
-    which = "" if far.sum() == judged.sum() else f" in {' and '.join(np.array(AXES)[far])}"
-    axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(AXES, scale, error, judged, strict=True) if j]
+    which = "" if far.sum() == judged.sum() else f" in {' and '.join(np.array(MOTIONS)[far])}"
+    axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(MOTIONS, scale, error, judged, strict=True) if j]
     cause = f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}"
     return Finding(name, cause, ", ".join(axes), remedy, quantities, True)
 
@@ -189,20 +206,20 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     if turns is None:
         return None
     matrix, error = turns.matrix.value, limits.standard_errors * turns.matrix.error
-    opposite = [axis for axis, m, e in zip(AXES, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
+    opposite = [axis for axis, m, e in zip(MOTIONS, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
     tilts = matrix[:2, :2]
     follows = float(turns.explained[:2].max())
-    excited = (excitation(each)[axis].verdict for each in evidence.stretches for axis in AXES[:2])
+    excited = (excitation(each)[axis].verdict for each in evidence.stretches for axis in MOTIONS[:2])
     unrelated = follows < limits.unrelated and "good" in excited
     if not unrelated and (error[:2, :2] >= np.hypot(*tilts)).any():
         return None
-    if np.linalg.det(tilts) > 0 and not unrelated and opposite in ([], ["roll", "pitch"]):
+    if np.linalg.det(tilts) > 0 and not unrelated and opposite in ([], [*MOTIONS[:2]]):
         return None
     if unrelated:
         cause = "the attitude does not turn as the gyro says"
         size = f"the gyro explains {100 * follows:.0f} % of its turns"
     elif opposite:
-        slope = np.diagonal(matrix)[AXES.index(opposite[0])]
+        slope = np.diagonal(matrix)[MOTIONS.index(opposite[0])]
         cause, size = f"attitude and gyro have opposite signs in {' and '.join(opposite)}", f"slope {slope:.2f}"
     else:
         cause, size = "roll and pitch of attitude and gyro are exchanged", f"slope {matrix[0, 1]:.2f}"

@@ -20,8 +20,6 @@ from ..stretches import RULES, Stretch, cut, stretches
 from .estimates import Measured, Turns, attitude_turns, tilt_slopes, velocity_slopes
 from .response import Response, rotor_response
 
-INERTIAS = ("Ix", "Iy", "Iz")
-
 
 class Finding(msgspec.Struct, frozen=True):
     """A fault that a log shows.
@@ -81,7 +79,7 @@ class Limits(msgspec.Struct, frozen=True):
       another airframe. A rotation turns roll and pitch by the same angle, up to the second.
     - `along_earth`: slope of the horizontal force on the tilt: 1 along the earth's axes, 0 or less along the body's.
     - `steady`: in a hand or in rolls, the mean vector of the force is shorter than this share of its mean size.
-    - `moves`: standard deviation of the rates of a vehicle that moves [rad/s].
+    - `moves`: standard deviation of the rates of a vehicle that moves [rad/s]. `thrust_moves`: of its thrust, relative.
     - `coherent`: the shares of roll or pitch acceleration, and of vertical force, that the rotors explain before their
       delays count. The first one counts for the sum of roll and pitch before axes are judged.
     - `filters`, `gusts`, `lags`: standard deviations of delays that are no error of a clock [s]: filters, gusts that a
@@ -114,6 +112,7 @@ class Limits(msgspec.Struct, frozen=True):
     along_earth: float = 0.6
     steady: float = 0.9
     moves: float = 0.05
+    thrust_moves: float = 0.01
     coherent: tuple[float, float] = (0.2, 0.03)
     filters: float = 0.003
     gusts: float = 0.004

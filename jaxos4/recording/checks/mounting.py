@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ...airframe import GRAVITY
+from ...airframe import GRAVITY, INERTIAS, YAW
 from .estimates import BATCHES, Measured, batched
-from .evidence import INERTIAS, Evidence, Finding
+from .evidence import Evidence, Finding
 
 
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
@@ -72,7 +72,7 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
         f"torque and angular acceleration correlate by {-correlation:.2f}",
         "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
         "all four signs",
-        ("Iz",),
+        (YAW.inertia,),
         True,
     )
 
@@ -194,7 +194,7 @@ def different_thrust(every: Sequence[Evidence]) -> Finding | None:
     return Finding(
         "different_vehicles",
         "the logs are of vehicles of different mass or thrust" + (", or of different batteries" if commanded else ""),
-        f"the same rotors lift {apart:.0%} more in one log than in another",
+        f"the same rotors lift {100 * apart:.0f} % more in one log than in another",
         "fit them separately, each with its own mass" + ("; log the battery's voltage" if commanded else ""),
         ("thrust", *INERTIAS),
         bool(not commanded or apart > limits.commanded_vehicles),

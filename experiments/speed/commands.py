@@ -1,0 +1,79 @@
+"""How long do whole commands take, with an empty cache of compiled programs, and once more?
+
+Each command runs in a process of its own, as a user runs it. `--flights` adds a log of a real vehicle.
+"""
+
+import os
+import shlex
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments.monte_carlo import print_table
+from experiments.shared import flight_files
+
+REAL = "arpl_crazyflie_rollpitch.csv"
+PREPARED = {
+    "flight.csv": "simulate --out flight.csv",
+    "log.csv": "simulate --closed-loop --airframe crazyflie --out log.csv",
+}
+COMMANDS = (
+    "--help",
+    "estimate flight.csv",
+    "identifiability flight.csv",
+    "train flight.csv --out flight.net",
+    "estimate flight.csv --estimator hybrid --network flight.net",
+    "estimate log.csv --airframe crazyflie --report page.html",
+    "inspect log.csv",
+    "compare --quick",
+    "compare",
+    "design --out speeds.csv",
+    "design --closed-loop --airframe crazyflie --out references.csv",
+)
+
+
+def seconds_of(command: str, folder: Path, cache: Path) -> float:
+    """The wall time of a command. Ends the script if the command fails by an exception or a user's mistake."""
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
+    begin = time.perf_counter()
+    ended = subprocess.run(
+        [sys.executable, "-m", "jaxos4", *shlex.split(command)],
+        cwd=folder, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if ended.returncode > 1:
+        raise SystemExit(f"jaxos4 {command}: {ended.stderr}")
+    return time.perf_counter() - begin
+
+
+def main(
+    repeats: Annotated[int, typer.Option(help="Number of runs once more.")] = 3,
+    commands: Annotated[list[str], typer.Option(help="The commands.")] = COMMANDS,
+    flights: Annotated[Path | None, typer.Option(help="Folder of real flights; $JAXOS4_FLIGHTS by default.")] = None,
+) -> None:
+    """Time commands in processes of their own."""
+    real = flight_files(flights, [REAL])[0] if flights or os.environ.get("JAXOS4_FLIGHTS") else None
+    chosen = [*commands, *([f"estimate {REAL} --airframe crazyflie --report real.html"] if real else [])]
+
+    def rows(folder: Path) -> Iterator[tuple[str, ...]]:
+        if real is not None:
+            (folder / REAL).symlink_to(real.resolve())
+        for name, command in PREPARED.items():
+            if any(name in each.split() for each in chosen):
+                seconds_of(command, folder, folder / "prepared")
+        for number, command in enumerate(chosen):
+            cache = folder / f"cache{number}"
+            cold = seconds_of(command, folder, cache)
+            again = [seconds_of(command, folder, cache) for _ in range(repeats)]
+            spread = f"{statistics.median(again):.1f} ({min(again):.1f} to {max(again):.1f})"
+            yield f"jaxos4 {command}", f"{cold:.1f}", spread
+
+    with tempfile.TemporaryDirectory() as folder:
+        headings = "command", "cold [s]", "again [s]"
+        print_table(f"times of commands, median of {repeats} (least to most)", headings, rows(Path(folder)), width=140)

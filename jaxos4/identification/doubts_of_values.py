@@ -1,0 +1,247 @@
+"""Doubts that the estimated values raise: physics or the airframe forbids them."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ..airframe import AXES, INERTIAS, YAW, Airframe
+from ..analysis.inertia import fit_inertia
+from ..estimators import FilterError
+from ..models.abstract import PARAMETER_NAMES, AbstractModel, Parameter
+from ..models.os4 import CorrectedOS4
+from .answers import Answer
+from .results import Constant, ParameterEstimate, RigidBody
+from .search import Optimum, deviations
+from .uncertainty import PROFILE
+from .verdict import RIGID_BODY, TOLERANCE, Doubt, Move, Moves, contradiction, refusal
+
+Estimated = Mapping[str, tuple[float, float]]
+"""Value and standard deviation of each parameter that has an estimate."""
+Consequences = Callable[[str, float], Mapping[str, Move | None]]
+"""The changes of quantities if a parameter has another value; see `consequences`."""
+
+
+class Plausible(NamedTuple):
+    """Limits of what is physically plausible for a vehicle.
+
+    - `heaviest`, `lightest`: the squared radius of gyration, as a share of that of all mass at the rotors; the second
+      is that of a heavy centre.
+    - `coupling`: aerodynamic moments may look like a gyroscopic coupling (alpha1, alpha4, alpha7) of this size.
+    - `vibration`: innovations that correlate more bias filter error more than its intervals say.
+    - `longest_sample`: longer ones [s] would hide the motion with the vibration.
+    - `hopeless`: standard errors below 0 of a skill at the shortest horizon from which on an inertia is not identified.
+    - `longest_delay`: of rotors [s]; more is an error of clocks.
+    """
+
+    heaviest: float = 1.5
+    lightest: float = 0.01
+    coupling: float = 0.25
+    vibration: float = 0.4
+    longest_sample: float = 0.008
+    hopeless: float = 2.0
+    longest_delay: float = 0.04
+
+
+PLAUSIBLE = Plausible()
+ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
+
+
+def doubts_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) -> Iterator[Doubt]:
+    """The alphas of an OS4 that no rigid body has."""
+    gyro, moves = "check the scale, the axes and the signs of the gyro, and the time stamps", {RIGID_BODY: None}
+    for name in (axis.coupling for axis in AXES):
+        row = table[name]
+        if row.estimate is not None and row.std is not None and abs(row.estimate) - TOLERANCE.sure * row.std > 1:
+            cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as that of every rigid body"
+            yield contradiction(cause, gyro, {name: None, RIGID_BODY: None})
+    rotor = body.constants.get("J_R")
+    if rotor is not None and rotor.estimate + TOLERANCE.sure * rotor.std < 0:
+        cause = f"J_R = {rotor.estimate:.3g} kg m^2 is negative"
+        yield contradiction(cause, "check `rotor_spins`, and which rotor is which", moves)
+    if body.consistency_p is not None and body.consistency_p < TOLERANCE.consistent:
+        cause = f"the alphas are not those of one rigid body (p = {body.consistency_p:.1g})"
+        yield contradiction(cause, f"{gyro}; or use another `subject`", moves)
+    elif body.is_rigid_body is False:
+        cause = "one moment of inertia exceeds the sum of the other two, which no rigid body allows"
+        yield contradiction(cause, "check `rotor_positions` and `drag_coefficient`", moves)
+
+
+def doubts_of_values(
+    model: AbstractModel,
+    parameters: Mapping[str, ParameterEstimate],
+    constants: Mapping[str, Constant],
+    fixed: Mapping[str, tuple[float, float]] = {},
+    log_step: float = 0.0,
+    follow: Consequences = lambda name, value: {},
+) -> Iterator[Doubt]:
+    """The doubts about the parameters and moments of inertia of a vehicle.
+
+    `fixed`: parameters that are not estimated. `log_step`: the longest sample of the logs [s]. `follow`: how far the
+    quantities move if a parameter has another value.
+
+    The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
+    """
+    estimated, stds = {}, {}
+    for name, row in parameters.items():
+        if row.estimate is not None and row.std is not None:
+            estimated[name], stds[name] = (row.estimate, row.std if row.bound is None else row.bound), row.std
+    yield from (doubt for _, doubt in contradicted(model, fixed))
+    wrong = dict(contradicted(model, estimated, follow))
+    yield from wrong.values()
+    if not any(parameter.scales_torque for parameter in wrong):
+        yield from _impossible_inertias(constants, model.airframe)
+    yield from _turns(estimated, stds, model.airframe)
+    yield from _unseen(estimated, log_step, follow)
+
+
+def contradicted(
+    model: AbstractModel, estimated: Estimated, follow: Consequences = lambda name, value: {}
+) -> Iterator[tuple[Parameter, Doubt]]:
+    """The parameters whose values physics or the airframe forbid.
+
+    The doubt moves other quantities as if the parameter had the value that the airframe lets expect.
+    """
+    owner = {name: quantity for quantity, names in model.quantities.items() for name in names}
+    for parameter, usual in zip(model.parameters, np.asarray(model.alpha).tolist(), strict=True):
+        if parameter.contradiction is None or parameter.name not in estimated:
+            continue
+        value, std = estimated[parameter.name]
+        why = parameter.contradiction(value, TOLERANCE.sure * std)
+        if why is not None:
+            own: Moves = dict.fromkeys([owner[parameter.name]] if parameter.name in owner else [])
+            others = dict.fromkeys((*INERTIAS, "thrust")) if parameter.scales_torque else follow(parameter.name, usual)
+            yield parameter, contradiction(f"{parameter.name} = {value:.2g} {why[0]}", why[1], {**others, **own})
+
+
+def consequences(
+    answer: Answer, optimum: Optimum, constants: Mapping[str, Constant], name: str, value: float
+) -> dict[str, Move | None]:
+    """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
+
+    Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
+    moves if the search did not find this parameter. `None`: there is no such fit.
+    """
+    model, own, values = answer.problem.model, optimum.likelihood.problem.unknowns, optimum.values
+    if not np.asarray(own.free)[own.names.index(name)]:
+        return {}
+    other = optimum.restricted(FilterError(tolerance=PROFILE.tolerance), {name: value})
+    others = {each: names for each, names in model.quantities.items() if name not in names}
+    if not other.converged:
+        return dict.fromkeys((*constants, *others))
+    moved, std = other.values, deviations(answer.estimate.covariance)
+    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
+    factor = np.prod(moved[gains] / values[gains])
+    moves: dict[str, Move | None] = {}
+    for axis in AXES:
+        if (row := constants.get(axis.inertia)) is not None:
+            share = abs(factor * values[axis.place] / moved[axis.place] - 1)
+            moves[axis.inertia] = Move(float(share), float(share * row.estimate / row.std))
+    for quantity, names in others.items():
+        places = [i for i in map(own.names.index, names) if std[i] > 0]
+        if places:
+            change, width = np.abs(moved - values)[places], np.asarray(own.half_width)[places]
+            moves[quantity] = Move(float((change / width).max()), float((change / std[places]).max()))
+    return moves
+
+
+def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) -> Iterator[Doubt]:
+    radius_squared = np.square(np.asarray(airframe.rotor_positions)).sum(axis=1).max()
+    limit = float(airframe.mass) * radius_squared
+    for name, row in constants.items():
+        largest, least = PLAUSIBLE.heaviest * limit * (2 if name == YAW.inertia else 1), PLAUSIBLE.lightest * limit
+        beyond = row.estimate - TOLERANCE.sure * row.std > largest
+        if beyond or row.estimate + TOLERANCE.sure * row.std < least:
+            compared = f"more than the {largest:.2g}" if beyond else f"less than the {least:.2g}"
+            scale = "`drag_coefficient`" if name == YAW.inertia else "`thrust_coefficient`, `max_rotor_speed`"
+            yield contradiction(
+                f"{name} = {row.estimate:.3g} kg m^2 is {compared} of a vehicle with this mass and arms",
+                f"check `mass`, `rotor_positions` and {scale} in the airframe, and which rotor is which",
+                {name: None},
+            )
+    for name, one in constants.items() if len(constants) == len(INERTIAS) else ():
+        (second, two), (third, three) = (each for each in constants.items() if each[0] != name)
+        excess = one.estimate - two.estimate - three.estimate
+        if excess > TOLERANCE.sure * np.sqrt(one.std**2 + two.std**2 + three.std**2) + 0.05 * one.estimate:
+            remedy = (
+                "if `drag_coefficient` is a guess, measure it; else fly more yaw"
+                if name == YAW.inertia
+                else "check `rotor_positions`"
+            )
+            yield contradiction(
+                f"{name} = {one.estimate:.3g} exceeds {second} + {third} = {two.estimate + three.estimate:.3g} "
+                "kg m^2, which no rigid body allows",
+                remedy,
+                {name: None} if name == YAW.inertia else ALL_INERTIAS,
+            )
+
+
+def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) -> Iterator[Doubt]:
+    """Roll and pitch must answer the rotors, and no axis with the opposite sign; else nothing was identified.
+
+    If none has, gyroscopic couplings must be those of a rigid body with these inertias.
+    """
+    opposite = False
+    for axis in AXES:
+        name, moves = axis.inverse, {axis.inertia: None}
+        value, std = estimated.get(name, (0.0, 0.0))
+        if value + TOLERANCE.sure * std < 0:
+            opposite = True
+            yield contradiction(
+                f"{name} = {value:.3g} is negative: {axis.motion} answers the rotors with the opposite sign",
+                "check `rotor_positions` and `rotor_spins`, and the axes of the log",
+                moves,
+            )
+        elif value <= TOLERANCE.sure * std and axis != YAW:
+            yield refusal(
+                "unidentifiable",
+                f"{axis.motion} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
+                f"fly more {axis.motion}, or check `rotor_positions` in the airframe, and which rotor is which",
+                moves,
+            )
+    couplings, inverses = [axis.coupling for axis in AXES], [axis.inverse for axis in AXES]
+    if opposite or not estimated.keys() >= {*couplings, *inverses}:
+        return
+    model = CorrectedOS4(airframe)
+    alpha, variance = np.array(model.alpha, dtype=float), np.full(8, np.inf)
+    for i, name in enumerate(PARAMETER_NAMES):
+        if name in estimated:
+            alpha[i] = estimated[name][0]
+        if name in couplings:
+            variance[i] = stds[name] ** 2 + PLAUSIBLE.coupling**2
+        elif name in inverses:  # the others need the inertia of the rotors too
+            variance[i] = stds[name] ** 2
+    p_value, without_yaw = (_p_value(model, alpha, variance, unknown) for unknown in ([], [YAW.place]))
+    if p_value < TOLERANCE.consistent:
+        yield contradiction(
+            f"alpha1, alpha4 and alpha7 contradict the inertias of alpha3, alpha6 and alpha8 (p = {p_value:.1g})",
+            "check the axes and signs of the gyro, `rotor_positions` and `drag_coefficient`",
+            ALL_INERTIAS if without_yaw < TOLERANCE.consistent else {YAW.inertia: None},
+        )
+
+
+def _p_value(model: CorrectedOS4, alpha: np.ndarray, variance: np.ndarray, unknown: list[int]) -> float:
+    """The probability that alphas of a rigid body disagree this much or more. `unknown`: places that do not count."""
+    variance = variance.copy()
+    variance[unknown] = np.inf
+    variance = np.where(np.isfinite(variance), variance, (1e3 * np.asarray(model.half_width)) ** 2)
+    return float(fit_inertia(model, alpha, np.diag(variance)).p_value)
+
+
+def _unseen(estimated: Estimated, log_step: float, follow: Consequences) -> Iterator[Doubt]:
+    """A lag or delay of the rotors that the log is too slow to show. `log_step`: its longest sample [s]."""
+    lag, error = estimated.get("rotor_lag", (np.inf, 0.0))
+    if -TOLERANCE.sure * error <= lag < log_step - TOLERANCE.sure * error:
+        yield contradiction(
+            f"rotor_lag = {lag:.2g} s is shorter than a sample of the log, {log_step:.2g} s",
+            "log faster, or leave out the term `motor` or `lag`",
+            {**follow("rotor_lag", log_step), "motors": None},
+        )
+    delay, error = estimated.get("rotor_delay", (0.0, 0.0))
+    if abs(delay) - TOLERANCE.sure * error > PLAUSIBLE.longest_delay:
+        how = "late" if delay < 0 else "early"
+        yield contradiction(
+            f"rotor_delay = {delay:.2g} s: motors are recorded {1e3 * abs(delay):.0f} ms {how}, more than any rotor",
+            "check the time stamps of motors and gyro",
+            {**follow("rotor_delay", float(np.copysign(PLAUSIBLE.longest_delay, delay))), "motors": None},
+        )
