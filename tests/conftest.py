@@ -1,5 +1,6 @@
 """Settings and fixtures of all tests: precision, platform, runtime shape checks, property tests, real flights."""
 
+import gc
 import os
 import pathlib
 import sys
@@ -42,6 +43,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests start first, so that the workers end together."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+
+
+def pytest_collection_finish() -> None:
+    """Tracing makes few cycles and much else: the garbage collector comes rarely, and skips what was imported."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 @pytest.hookimpl(optionalhook=True)

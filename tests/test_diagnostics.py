@@ -89,6 +89,7 @@ def test_missing_samples_do_not_look_like_colour(kept):
     assert abs(float((found.white_p < 0.05).mean()) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / found.white_p.size)
 
 
+@pytest.mark.slow
 def test_coloured_noise_and_a_wrong_size_are_seen():
     found = judged(coloured_states(jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.05)))
     assert (found.white_p < 1e-6).all()

@@ -1,7 +1,6 @@
 """The documentation agrees with the code, and the type checker of the tests sees every call."""
 
 import json
-import pathlib
 import re
 import shutil
 import subprocess
@@ -12,7 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import COMMAND, CRAZYFLIE, documented_class, how_we_compile, standard_flight, standard_problem, start
+from helpers import (
+    CRAZYFLIE,
+    EACH,
+    ROOT,
+    blocks,
+    documented_class,
+    how_we_compile,
+    standard_flight,
+    standard_problem,
+    start,
+)
 from jaxtyping import Array, Float, TypeCheckError, jaxtyped
 from synthetic_identification import identified_flight, identified_vehicle
 from typechecker import check
@@ -25,13 +34,7 @@ from jaxos4.estimators import ESTIMATORS
 from jaxos4.noise import NOISES
 from jaxos4.study import load_study
 
-ROOT = pathlib.Path(__file__).resolve().parents[1]
 EXTEND = ROOT / "docs" / "extend"
-
-
-def blocks(page: pathlib.Path, language: str) -> list[str]:
-    """The blocks of code in a page."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
 
 
 def run_blocks(page: str, **given) -> dict:
@@ -234,25 +237,24 @@ def test_another_package_adds_an_estimator_a_term_and_a_log_format(tmp_path):
     (packages / "mylog.py").write_text(*blocks(EXTEND / "log_format.md", "python"))
     rows = "".join(f"{10 * i};{i};0;0;500;500;500;500\n" for i in range(50))
     (tmp_path / "flight.log").write_text("# mylog\n" + rows)
-    process = start(code="import sys; sys.path.append('.')\n" + FAKE, cwd=tmp_path, **how_we_compile())
+    jaxos4.write_flight(standard_flight(duration=1.0), tmp_path / "flight.csv")
+    (tmp_path / "study.toml").write_text('estimators = ["gauss-newton"]\nflights = 2\n')
+    known = "--channels rates --initial-state known --out found.json"
+    expected = {
+        "estimate x --estimator nothing": (2, "ant-colony, gauss-newton"),
+        f"estimate flight.csv --estimator gauss-newton {known}": (0, "gauss-newton, published model"),
+        "study study.toml --out study --dry-run": (0, "gauss-newton"),
+    }
+    settings = {"JAX_NUM_CPU_DEVICES": "1", **how_we_compile()}  # the first line fixes the devices of the process
+    process = start(*expected, code="import sys; sys.path.append('.')\n" + FAKE + EACH, cwd=tmp_path, **settings)
     assert process.returncode == 0, process.stderr
-    used, rates, notes, looks_at, last, names, by_default = json.loads(process.stdout)
+    (used, rates, notes, looks_at, last, names, by_default), *answers = map(json.loads, process.stdout.splitlines())
     assert (used, looks_at, last, by_default) == ([], "rates", "gauss-newton", False)
     np.testing.assert_allclose(rates, np.radians(np.arange(50)))
     assert notes[0] == "commands are shares of full scale"
     assert names == ["roll_offset", "pitch_offset", "yaw_offset", "yaw_friction"]
-    jaxos4.write_flight(standard_flight(duration=1.0), tmp_path / "flight.csv")
-    (tmp_path / "study.toml").write_text('estimators = ["gauss-newton"]\nflights = 2\n')
-    known = "--channels rates --initial-state known --out found.json"
-    for line, code, said in (
-        ("estimate x --estimator nothing", 2, "ant-colony, gauss-newton"),
-        (f"estimate flight.csv --estimator gauss-newton {known}", 0, "gauss-newton, published model"),
-        ("study study.toml --out study --dry-run", 0, "gauss-newton"),
-    ):
-        process = start(
-            *line.split(), code=f"import sys; sys.path.append('.'); {COMMAND}", cwd=tmp_path, **how_we_compile()
-        )
-        assert (process.returncode, said in process.stdout + process.stderr) == (code, True), process.stderr
+    for (line, (code, said)), (answered, ended, printed, _) in zip(expected.items(), answers, strict=True):
+        assert (answered, ended, said in printed) == (line, code, True), printed
 
 
 def test_a_package_that_cannot_be_imported_is_named_and_replaces_nothing(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ import tomllib
 
 import pytest
 import typer
-from helpers import ROOT
+from helpers import ROOT, blocks
 from small_experiments import load
 from typer.main import get_command
 
@@ -49,14 +49,17 @@ def commands(text: str) -> list[str]:
     return list(dict.fromkeys(" ".join(line.split("#")[0].split()) for line in lines))
 
 
-def blocks(text: str, language: str = "") -> list[str]:
-    """The blocks of a page in this language."""
-    every = re.findall(r"^```(\w*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
-    return [block for name, block in every if name == language]
-
-
 def in_blocks(page: str) -> list[str]:
-    return commands("\n".join(blocks(PAGES[page])))
+    return commands("\n".join(blocks(ROOT / page)))
+
+
+def merged(lines: list[str]) -> list[str]:
+    """Estimates that differ only in the files that they write are one, which writes all of them."""
+    found: dict[str, dict[str, None]] = {}
+    for line in lines:
+        options = r" --(?:out|report) \S+" if " estimate " in line else "$^"
+        found.setdefault(re.sub(options, "", line), {}).update(dict.fromkeys(re.findall(options, line)))
+    return [line + "".join(files) for line, files in found.items()]
 
 
 def parser(line: str):
@@ -102,7 +105,7 @@ def filled_in(airframe: str, vehicle: dict) -> str:
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("story", STORIES)
 def test_the_commands_of_pages_run(story, run, tmp_path, request):
-    complete, (own,) = blocks(PAGES["docs/index.md"], "toml"), blocks(PAGES["docs/drone.md"], "toml")[-1:]
+    complete, (own,) = blocks(ROOT / "docs/index.md", "toml"), blocks(ROOT / "docs/drone.md", "toml")[-1:]
     (tmp_path / "vehicle.toml").write_text(own)
     mine, vehicle = tmp_path / "mine.toml", tomllib.loads(own)
     if story == "study":
@@ -110,13 +113,12 @@ def test_the_commands_of_pages_run(story, run, tmp_path, request):
     if story == "real":
         log, vehicle = request.getfixturevalue("shared_flights") / "cinerat/cinerat_281.csv", airframe_table(CINERAT)
         shutil.copy(log, tmp_path / "mylog.bbl")
-    every = dict.fromkeys(line for page in STORIES[story] for line in in_blocks(page))
+    every = [line for page in STORIES[story] for line in in_blocks(page)]
+    here = [re.sub(SHORTER, "15", line) for line in every if not any(re.match(each, line) for each in ELSEWHERE)]
     said = ""
     # A page shows what comes of a simulated flight before it says how to simulate one.
-    for line in sorted(every, key=lambda line: "simulate --closed-loop" not in line):
-        if any(re.match(pattern, line) for pattern in ELSEWHERE):
-            continue
-        code, out, err = run(*shlex.split(re.sub(SHORTER, "15", line))[1:])
+    for line in sorted(merged(here), key=lambda line: "simulate --closed-loop" not in line):
+        code, out, err = run(*shlex.split(line)[1:])
         assert code == next((code for option, code in EXIT_CODES.items() if option in line), 0), (line, err)
         said += " ".join(out.split())
         if "--airframe-out" in line:

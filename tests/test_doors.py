@@ -85,6 +85,7 @@ DOORS = {
 LITERALS = ["1e308", "1e999", "nan", "inf", "-1", "0", "0x" + 5000 * "f", '"\\u0007"', "[]", "{}", NESTED, "1979-05-27"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DOORS)
 def test_a_damaged_file_ends_in_one_line(name, tmp_path):
     door, text = DOORS[name]

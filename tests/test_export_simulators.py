@@ -2,13 +2,12 @@
 
 import importlib
 import json
-import pathlib
-import re
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import ROOT, blocks
 from scipy.spatial.transform import Rotation
 from synthetic_results import AIRFRAME, VALUES, provenance, vehicle_result
 
@@ -17,7 +16,7 @@ from jaxos4.airframe import airframe_from_table, airframe_table, alpha_from_iner
 from jaxos4.export import export_vehicle, read_result
 from jaxos4.forecast.motion import departures
 
-PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "into_your_simulator.md"
+PAGE = ROOT / "docs" / "into_your_simulator.md"
 # The simulators of the programs of the page, in their order.
 PROGRAMS = ("mujoco", "mujoco", "mujoco", "rotorpy")
 STATES = 1000
@@ -39,13 +38,8 @@ def mujoco_model(found):
 
     mujoco.set_mjcb_passive(None)
     model = mujoco.MjModel.from_xml_string(export_vehicle(found, "mujoco").text)
-    exec(programs()[2], {})  # noqa: S102
+    exec(blocks(PAGE, "python")[2], {})  # noqa: S102
     return model
-
-
-def programs():
-    """The programs that the page prints."""
-    return re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def read(tmp_path, result):
@@ -254,7 +248,7 @@ def test_the_programs_of_the_page_run(run, mujoco, monkeypatch, tmp_path, target
     read(tmp_path, vehicle_result())
     code, _, err = run("export", "found.json", "--to", target, "--out", f"vehicle.{suffix}", "--samples", "3")
     assert code == 0, err
-    mine = [program for name, program in zip(PROGRAMS, programs(), strict=True) if name == target]
+    mine = [program for name, program in zip(PROGRAMS, blocks(PAGE, "python"), strict=True) if name == target]
     monkeypatch.syspath_prepend(tmp_path)
     defined = {}
     for program in mine:

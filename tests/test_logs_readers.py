@@ -188,13 +188,13 @@ COSTLY["empty events"] = crazyflie.EMPTY_EVENTS
 def test_a_few_bytes_cost_little_whatever_they_announce(name, save):
     path = save(COSTLY[name])
     tracemalloc.start()
-    begin = time.perf_counter()
+    begin = time.process_time()
     result = outcome(read_log, path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert isinstance(result, str)
     assert peak < (100e6 if name == "empty events" else 20e6)
-    assert time.perf_counter() - begin < 10
+    assert time.process_time() - begin < 10
 
 
 def test_each_format_is_a_subject():

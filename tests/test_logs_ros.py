@@ -322,6 +322,7 @@ def test_an_mcap_that_is_compressed_as_a_whole_is_decompressed_once(tmp_path, mo
             check_sizes(tmp_path, limits=limits)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_bag(kind, bagged, tmp_path):
     content = bag(tmp_path / f"short.{kind}", kind, topics(T[:25], T[:25])).read_bytes()

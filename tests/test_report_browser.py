@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from pages import CARDS, CUT, TEXTS, WIDE, WIDTHS, overlapping
+from pages import CARDS, CUT, DRAWN, TEXTS, WIDE, WIDTHS, overlapping
 from sign_flights import flown
 from synthetic_identification import (
     SAMPLE_TIMES,
@@ -117,6 +117,18 @@ def opened(browser, addresses):
     assert said == []
 
 
+@pytest.fixture
+def drawn(opened):
+    """Opens a page that keeps the texts that it draws on canvases, each with the place of its canvas."""
+
+    def open_page(name):
+        page = opened(name)
+        page.evaluate(DRAWN)
+        return page
+
+    return open_page
+
+
 @pytest.mark.parametrize("width", [390, 720, 768, 1280])  # 720: a sheet of paper
 @pytest.mark.parametrize("name", ["study", "one flight", "vehicle", "os4", "log", "comparison", *DESIGNS])
 def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
@@ -219,18 +231,10 @@ def test_signals_zoom_together_and_stay_so(opened):
     assert page.evaluate(drawn) == before
 
 
-def test_only_logs_in_sight_have_their_names(opened):
+def test_only_logs_in_sight_have_their_names(drawn):
     """The second of two logs is in sight: the name of the first is not drawn over its own."""
-    page = opened("two logs")
-    page.evaluate("""() => {
-        const draw = CanvasRenderingContext2D.prototype.fillText;
-        window.drawn = [];
-        CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
-            window.drawn.push(text);
-            return draw.call(this, text, ...place);
-        };
-    }""")
-    names = "() => window.drawn.splice(0).filter((text) => text.endsWith('.csv'))"
+    page = drawn("two logs")
+    names = "() => window.drawn.splice(0).map(each => each[1]).filter(text => text.endsWith('.csv'))"
     for clicks, shown in ((["Zoom in"] * 2 + ["Later"] * 3, {"other.csv"}), (["All"], {"first.csv", "other.csv"})):
         for name in clicks:
             page.wait_for_timeout(200)
@@ -292,16 +296,8 @@ def test_a_range_of_a_log_is_ready_to_copy_and_a_finger_moves_it(opened):
     assert end - begin == pytest.approx(after - before, abs=0.02)
 
 
-def test_labels_of_the_time_axis_differ_late_in_a_log(opened):
-    page = opened("late")
-    page.evaluate("""() => {
-        const draw = CanvasRenderingContext2D.prototype.fillText;
-        window.drawn = [];
-        CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
-            window.drawn.push([String(this.canvas.getBoundingClientRect().top), text]);
-            return draw.call(this, text, ...place);
-        };
-    }""")
+def test_labels_of_the_time_axis_differ_late_in_a_log(drawn):
+    page = drawn("late")
     for _ in range(3):
         page.get_by_role("button", name="Zoom in").click()
         page.wait_for_timeout(200)

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from helpers import CRAZYFLIE, refused
 from matplotlib.figure import Figure
-from pages import stands_alone, words
+from pages import printed, stands_alone, words
 from rich.console import Console
 from strange import survives_strange_values
 from synthetic_identification import (
     SAMPLE_TIMES,
+    WRONG,
     behind_an_estimate,
     identified_flight,
     identified_vehicle,
@@ -43,19 +44,9 @@ FULL = {
 }
 
 
-def write(found, path):
-    path.write_text(json.dumps(found.to_dict()))
-
-
 def written(found, path):
-    write(found, path)
+    path.write_text(json.dumps(found.to_dict()))
     return jaxos4.read_result(path)
-
-
-def text_of(found):
-    console = Console(width=80, file=io.StringIO())
-    print_identification(console, found, verbose=True)
-    return console.file.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -65,7 +56,7 @@ def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
     again = written(found, tmp_path / "found.json")
     assert (again.estimate, again.problem) == (None, None)
     assert again.to_dict() == found.to_dict()
-    assert text_of(again) == text_of(found)
+    assert printed(again) == printed(found)
     assert written(again, tmp_path / "again.json").to_dict() == found.to_dict()
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "found.json").read_bytes()
 
@@ -73,17 +64,15 @@ def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
 def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path):
     found = identified_vehicle(**FULL)
     write_flight_page(tmp_path / "fresh.html", found)
-    write(found, tmp_path / "found.json")
+    written(found, tmp_path / "found.json")
     code, out, err = run("report", "found.json")
     assert (code, err) == (0, "")
     assert out.startswith("found.html: ")
     assert (tmp_path / "found.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
-    assert run("report", "found.json", "--out", "other.html")[0] == 0
-    assert (tmp_path / "other.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
     refused(run("report", "found.json", "--out", "found.json"), "would overwrite an input")
-    write(identified_flight(), tmp_path / "os4.json")
-    assert run("report", "os4.json")[0] == 0
-    assert "<title>flight.csv</title>" in (tmp_path / "os4.html").read_text(encoding="utf-8")
+    written(identified_flight(), tmp_path / "os4.json")
+    assert run("report", "os4.json", "--out", "other.html")[0] == 0
+    assert "<title>flight.csv</title>" in (tmp_path / "other.html").read_text(encoding="utf-8")
     (tmp_path / "study").mkdir()
     refused(run("report", "study", "--out", "page.html"), "--out: study is a folder")
 
@@ -136,14 +125,14 @@ def test_channels_that_are_logged_rarely_stay_in_thinned_traces():
 def shown(path):
     """All that is made of a result's file."""
     found = jaxos4.read_result(path)
-    text_of(found)
+    printed(found)
     assert found._repr_html_()
     assert len(found.to_dataframe()) >= len(found.to_dataset()["parameter"])
     print_comparison(Console(file=io.StringIO()), jaxos4.compare_results([found, path]))
     write_flight_page(path.with_suffix(".html"), found)
 
 
-WRONG = [
+DAMAGES = [
     (("predictions", "start", 1), 5, "`predictions`: starts must increase"),
     (("predictions", "start", 0), -1, "`predictions`: starts must increase"),
     (("predictions", "horizons", 0), -1.0, "`predictions`"),
@@ -177,7 +166,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "said"), WRONG, ids=lambda x: ".".join(map(str, x)) if isinstance(x, tuple) else ""
+    ("place", "value", "said"), DAMAGES, ids=lambda x: ".".join(map(str, x)) if isinstance(x, tuple) else ""
 )
 def test_what_no_result_has_is_named(run, tmp_path, place, value, said):
     table = identified_vehicle(**FULL).to_dict()
@@ -288,7 +277,7 @@ AGREE = (1.66e-5, 1.69e-5, 1.64e-5)
 @pytest.fixture
 def files(tmp_path):
     for i, ix in enumerate((*AGREE, 1.9e-5)):
-        write(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}), tmp_path / f"{i}.json")
+        written(of_inertias(ix, provenance={"flights": [f"{i}.csv"]}), tmp_path / f"{i}.json")
     return [f"{i}.json" for i in range(4)]
 
 
@@ -319,9 +308,8 @@ def test_three_results_that_agree_are_pooled_and_one_that_does_not_is_named(run,
 
 
 def test_what_a_verdict_refuses_is_shown_and_does_not_count(tmp_path):
-    refusing = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
     results = [of_inertias(ix) for ix in AGREE]
-    wrong = msgspec.structs.replace(of_inertias(9e-5), verdicts=refusing, result="implausible")
+    wrong = msgspec.structs.replace(of_inertias(9e-5), verdicts=WRONG, result="implausible")
     found = jaxos4.compare_results([*results, wrong])
     assert found.quantities[0].used == (True, True, True, False)
     assert found.quantities[0].value == pytest.approx(np.mean(AGREE))
@@ -335,7 +323,7 @@ def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):
     refused(run("compare", "0.json"), "two results or more")
     refused(run("compare", "--report", "page.html"), "--report: is for a comparison of results")
     refused(run("compare", *files, "--quick"), "--quick: is for a comparison of estimators")
-    write(identified_flight(), tmp_path / "os4.json")
+    written(identified_flight(), tmp_path / "os4.json")
     refused(run("compare", "0.json", "os4.json"), "os4.json: is of the published model")
     heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, jnp.asarray(0.03))
     other = of_inertias(1.66e-5, airframe=heavy)

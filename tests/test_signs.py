@@ -26,6 +26,7 @@ def parts_of(path, airframe=CRAZYFLIE):
     return [cut(flight, stretch) for stretch in usable_stretches(flight, airframe)]
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 999), gust=st.sampled_from([0.0, 5.0, 40.0]), lag=st.floats(0.02, 0.07))
 @settings(max_examples=12, deadline=None)
 def test_wrong_signs_are_found_and_right_ones_never(seed, gust, lag):

@@ -8,7 +8,7 @@ from typing import get_args
 
 import jax
 import pytest
-from helpers import COMMAND, how_we_compile, start
+from helpers import COMMAND, EACH, how_we_compile, start
 
 import jaxos4
 from jaxos4.cli import _shared, estimate
@@ -58,20 +58,6 @@ LINES = (
     ("estimate flight.csv --model none", 2, "corrected"),
     ("simulate --out flight.csv --excitation none", 2, "multisine"),
 )
-# Runs each line of its arguments. Prints its code, what it printed, and the packages that are loaded after it.
-EACH = """
-import contextlib, io, json, sys
-from jaxos4.cli import main
-for line in sys.argv[1:]:
-    sys.argv, printed = ["jaxos4", *line.split()], io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        try:
-            main()
-        except SystemExit as stop:
-            code = stop.code or 0
-    packages = sorted({name.split(".")[0] for name in sys.modules})
-    sys.__stdout__.write(json.dumps([line, code, printed.getvalue(), packages]) + "\\n")
-"""
 
 
 def test_help_and_mistakes_import_no_library():

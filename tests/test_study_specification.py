@@ -92,6 +92,7 @@ def toml(value) -> str:
     return str(value).lower()
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(st.one_of(st.dictionaries(_KEYS, _VALUES, max_size=5), _LIKELY))
 def test_any_specification_is_a_study_or_an_input_error_of_one_line(table):

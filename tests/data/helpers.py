@@ -265,6 +265,12 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
         assert fragment in err
 
 
+def blocks(page: pathlib.Path, language: str = "") -> list[str]:
+    """The blocks of a page in this language."""
+    every = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return [block for name, block in every if name == language]
+
+
 def documented_class(page: str) -> str:
     """The class that a page of `docs/extend` shows, as a file of its own has it."""
     text = (ROOT / "docs" / "extend" / page).read_text(encoding="utf-8")
@@ -273,6 +279,20 @@ def documented_class(page: str) -> str:
 
 
 COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
+# Runs each line of its arguments. Prints its code, what it printed, and the packages that are loaded after it.
+EACH = """
+import contextlib, io, json, sys
+from jaxos4.cli import main
+for line in sys.argv[1:]:
+    sys.argv, printed = ["jaxos4", *line.split()], io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+    packages = sorted({name.split(".")[0] for name in sys.modules})
+    sys.__stdout__.write(json.dumps([line, code, printed.getvalue(), packages]) + "\\n")
+"""
 
 
 def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) -> subprocess.CompletedProcess[str]:

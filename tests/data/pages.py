@@ -1,12 +1,29 @@
-"""What the tests read off a page."""
+"""What the tests read off a page, and off a terminal."""
 
 import html
+import io
 import re
+
+from rich.console import Console
+
+from jaxos4.report import print_identification
 
 
 def words(text):
     """The words that a page shows."""
     return " ".join(html.unescape(re.sub(r"<(script|style).*?</\1>|<[^>]+>", " ", text, flags=re.DOTALL)).split())
+
+
+def printed(found, *, verbose=True, width=100):
+    """The words that an identification is on a terminal."""
+    console = Console(width=width, file=io.StringIO())
+    print_identification(console, found, verbose=verbose)
+    return " ".join(console.file.getvalue().split())
+
+
+def says(text, *parts):
+    """Asserts that a text has these parts."""
+    assert [part for part in parts if part not in text] == []
 
 
 def stands_alone(text):
@@ -54,6 +71,15 @@ CARDS = r"""() => [...document.querySelectorAll("figure.table table")].flatMap(t
 WIDE = """() => [...document.querySelectorAll("*")]
   .filter(element => element.checkVisibility() && element.scrollWidth > element.clientWidth + 1
     && /auto|scroll/.test(getComputedStyle(element).overflowX)).map(element => element.outerHTML.slice(0, 80))"""
+
+DRAWN = """() => {
+  const draw = CanvasRenderingContext2D.prototype.fillText;
+  window.drawn = [];
+  CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+    window.drawn.push([String(this.canvas.getBoundingClientRect().top), text]);
+    return draw.call(this, text, ...place);
+  };
+}"""
 
 
 def overlapping(texts, *, by=1.0):

@@ -38,6 +38,7 @@ VERDICTS = {
     "Ix": Verdict("identified", "1.73e-05 +- 2.9e-07 kg m^2 (95 %), if arms and mass are right"),
     "Iz": Verdict("not identified", "", ("the flights say less about alpha8 than its bracket; fly more yaw",)),
 }
+WRONG = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
 SAMPLE_TIMES = tuple(
     SampleTime(step, {"Ix": Constant(ix, 2e-7, "kg m^2"), "Iy": Constant(1.8e-5, 3e-7, "kg m^2")}, 0.1, samples=1000)
     for step, ix in ((0.004, 1.64e-5), (0.008, 1.78e-5), (0.016, 1.8e-5))

@@ -1,0 +1,118 @@
+"""An identification as text; numbers and tables as text: no digit and no cell is lost."""
+
+import io
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from matplotlib.figure import Figure
+from pages import printed, says, words
+from rich.console import Console
+from synthetic_identification import COLOURED, CONSTANTS, WHITE, WRONG, identified_flight, identified_vehicle
+
+from jaxos4.identification.results import Disturbance, ParameterEstimate, RigidBody, Validation
+from jaxos4.report import write_flight_page
+from jaxos4.report.style import drawing, svg
+from jaxos4.report.text import MISSING, Listing, plain
+
+
+def test_the_text_of_a_flight():
+    white, free = "residuals white (Ljung-Box)", "residuals free of the inputs (cross-correlation)"
+    says(
+        printed(identified_flight()),
+        *("alpha3 1/(kg m^2) 57712 [56709, 58716] 1.3e+02", "alpha6 1/(kg m^2) - - - not identifiable: not excited"),
+        *("cannot be distinguished from 0.", "multiple of the noise: alpha2 0.25.", "p 97.5, q 81.3"),
+        "The residuals of q are not white noise: the model does not explain",
+        *(f"{test}, tests at 1 %: not those of q." for test in (white, free)),
+        "Ix 1.733e-05 +- 2.9e-07, J_R below noise; the alphas agree with one rigid body, p = 0.21.",
+        "validation on other.csv [%] (residuals in multiples of the noise): p 81.3 (2).",
+        "ibss, published model, rates channels: successful, 812 rollouts, 35.4 s",
+    )
+    clean = printed(identified_flight(fit={"p": WHITE}, validation=None, provenance={"windows": 4}))
+    assert not any(said in clean for said in ("white noise", "Ljung-Box", "validation"))
+    says(clean, "tests at 1 %: all.")
+
+
+DIVERGED = {"result": "nonfinite_trajectory"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"estimator": "network", "fit": {"q": COLOURED}}, "The hybrid continues the search"),
+        ({"rigid_body": RigidBody(CONSTANTS, 1e-4, True)}, "not those of one rigid body"),
+        ({"rigid_body": RigidBody(CONSTANTS, 0.5, False)}, "no rigid body has such"),
+        ({"validation": Validation("other.csv", None, None)}, "trajectory diverges before the flight ends"),
+        (DIVERGED, "No estimate: the model's trajectory diverged"),
+        (DIVERGED, "(try --window"),
+    ],
+)
+def test_the_text_of_a_flight_warns_and_is_short_without_an_answer(changes, said):
+    says(printed(identified_flight(**changes)), said)
+    assert "--window" not in printed(identified_flight(**DIVERGED, estimator="rls"))
+    assert printed(identified_flight(result="bracket_invalid")) == ""
+    assert printed(identified_vehicle(verdicts={}, **DIVERGED)) == "note: t is not uniform"
+
+
+def test_the_text_of_a_vehicle(tmp_path):
+    says(
+        printed(identified_vehicle()),
+        *("alpha3 1/(kg m^2) 5.771e+04 [5.671e+04, 5.872e+04]", "held, not identifiable: alpha1 -0.8125."),
+        *("Ix 1.733e-05 +- 2.9e-07 (if arms and mass are right)", "(377 starts)", "0.50 s - +- -"),
+        "0.25 s 0.73 +- 0.14 0.73 +- 0.14 0.73 +- 0.14 0.41, 0.41, 0.41",
+        "flight model (offset, damping), 32 s, a sample every 4 ms: successful, 812 rollouts",
+    )
+    gusts = {"p": Disturbance(1.2, "rad/s^2", 0.1, 0.02, 0.01)}
+    doubtful = printed(identified_vehicle(disturbances=gusts, widened={"alpha3": 1.7}, verdicts=WRONG, skill=None))
+    says(
+        doubtful,
+        *("contradicted: Ix.", "Ix: Ix is negative; check the arms.", "by the factor: alpha3 1.7."),
+        *("their correlation time: p 1.2 rad/s^2 over 0.1 s.", "white noise of the sensors [rad/s; m/s^2]: p 0.02."),
+    )
+    assert "Predictions" not in doubtful
+    late = {"rotor_delay": ParameterEstimate(-0.02, 0.001, 0.001, (-0.022, -0.018), "s", "")}
+    says(printed(identified_vehicle(parameters=late)), "note: motors are recorded 20 ms late (rotor_delay)")
+    write_flight_page(tmp_path / "flight.html", identified_vehicle(parameters=late))
+    says(words((tmp_path / "flight.html").read_text(encoding="utf-8")), "motors are recorded 20 ms late")
+    small = {"rotor_delay": msgspec.structs.replace(late["rotor_delay"], estimate=-0.004)}
+    assert "late" not in printed(identified_vehicle(parameters=small))
+
+
+def test_small_numbers_keep_their_digits_and_a_figure_its_bytes():
+    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: MISSING}
+    assert {x: plain(x) for x in known | {1.234e300: ""}} == known | {1.234e300: "1.23e300"}
+    with drawing():
+        figure = Figure()
+        figure.add_subplot().imshow(np.arange(16.0).reshape(4, 4))
+        assert svg(figure) == svg(figure)
+
+
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: f"{x:.5g}")
+NOTES = st.sampled_from(["", "not excited", "below noise: cannot be distinguished from 0, or at the bracket's edge"])
+
+
+def listed(listing, width):
+    console = Console(width=width, file=io.StringIO())
+    listing.print_on(console)
+    assert console.width == width
+    return console.file.getvalue()
+
+
+@given(rows=st.lists(st.tuples(NUMBERS, NUMBERS, NOTES), min_size=1, max_size=4), width=st.integers(20, 120))
+def test_no_cell_is_cut_and_a_wide_table_stays_as_wide_as_the_terminal_if_it_fits(rows, width):
+    names = [f"thrust_gain_{i}" for i in range(len(rows))]
+    cells = [(name, low, f"[{low}, {high}]") for name, (low, high, _) in zip(names, rows, strict=True)]
+    notes = [note for *_, note in rows]
+    text = listed(Listing(("parameter", "estimate", "95 % interval"), cells, ("estimate",), notes), width)
+    assert "…" not in text
+    assert all(cell in text for row in cells for cell in row)
+    assert all(word in text for note in notes for word in note.split())
+    use = "rotor 1, 2, 3, 4 at rest or idle, for a long time, in the air"
+    lines = listed(Listing(("name", "use"), [("a", use)], wraps=("use",)), 40).splitlines()
+    assert max(map(len, lines)) <= 40
+    assert len(lines) > 3
+    listing = Listing(("name",), [("a",)], notes=["not excited"])
+    assert listed(listing, 40).splitlines()[-1].split() == ["a", "not", "excited"]
+    assert "a: not" in listed(listing, 12)
