@@ -156,7 +156,6 @@ def test_a_log_that_holds_every_run_of_the_controller_has_no_feedthrough():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
 def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias():
     """Commands every 4 ms, samples of 8 ms, a gyro with a noise of 0.05 rad/s.
 

@@ -187,7 +187,6 @@ def test_identify_takes_paths(tmp_path):
         jaxos4.identify(tmp_path / "none.csv", model)
 
 
-@pytest.mark.usefixtures("optimised")
 def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_path, vehicle, monkeypatch):
     monkeypatch.chdir(vehicle)
     files = ("--out", str(tmp_path / "found.json"), "--report", str(tmp_path / "found.html"))

@@ -76,7 +76,6 @@ def test_every_tutorial_is_run():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("name", CLAIMS)
 def test_a_tutorial_runs(name, monkeypatch):
     monkeypatch.setitem(jaxos4.TERMS.data, "friction", None)
