@@ -111,7 +111,10 @@ def main(
     """Identify each flight and all together; identify some together, and predict the others."""
     names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
     paths = flight_files(flights, [f"nanobench/{name}.csv" for name in names])
-    recordings = {name: aligned(read_recording(path, AIRFRAME)) for name, path in zip(names, paths, strict=True)}
+    recordings = {
+        name: aligned(read_recording(path, AIRFRAME))._replace(name=name)
+        for name, path in zip(names, paths, strict=True)
+    }
     settings = jaxos4.VehicleSettings(sample_time=STEP, end=end)
     found = jaxos4.identify([recordings[name] for name in fitted], AIRFRAME, settings=settings)
     print(f"{', '.join(fitted)}: {found.result}, {found.seconds:.0f} s", flush=True)
