@@ -20,7 +20,7 @@ def is_identifiable(
 ) -> Bool[Numeric, "*parameters"]:
     """The rule: a parameter is identifiable if its standard deviation is at most `prior` half-widths of its bracket.
 
-    `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
+    `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR`, `UNIFORM_PRIOR` or `PROPER_PRIOR`.
     """
     return std <= prior * half_width  # type: ignore[return-value]
 
