@@ -50,7 +50,7 @@ class Traces(NamedTuple):
         return self._replace(**fewer | times)
 
 
-def flight_traces(found: Evaluation) -> Traces:
+def os4_traces(found: Evaluation) -> Traces:
     """The traces of a flight that was simulated at an answer."""
     flight, channels = found.problem.flight, found.problem.size
     time, omega = np.asarray(flight.time, float), np.asarray(flight.omega, float)
