@@ -37,7 +37,7 @@ from jaxos4.report.identification_figures import frequency_responses, inertias_b
 from jaxos4.report.identification_page import verdict
 from jaxos4.report.identification_signals import identified_signals, prediction_band
 from jaxos4.report.style import drawing, styles, svg
-from jaxos4.report.text import MISSING, Listing, plain
+from jaxos4.report.text import DASH, Listing, plain
 
 EVIL = "</script><script>alert(1)</script>"
 
@@ -338,7 +338,7 @@ def test_the_text_of_a_vehicle(tmp_path):
 
 
 def test_small_numbers_keep_their_digits_and_a_figure_its_bytes():
-    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: MISSING}
+    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: DASH}
     assert {x: plain(x) for x in known | {1.234e300: ""}} == known | {1.234e300: "1.23e300"}
     with drawing():
         figure = Figure()

@@ -132,7 +132,7 @@ def search(
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
     optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
-    optimum = optimum._replace(likelihood=likelihood.passing(optimum.by_segment.passed))
+    optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_plain_values(estimator, optimum, progress)
 

@@ -16,7 +16,7 @@ from .checks import Evidence, Finding, findings as findings_of, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
 from .stretches import cut, nothing_usable, usable
 
-FULL_SCALE = 1000.0
+ASSUMED_FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
 
 
@@ -118,7 +118,7 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
 
     **Returns:** the text, in which what must be weighed or measured is a comment, and the keys that are missing.
     """
-    facts, full = recording.facts, FULL_SCALE if recording.commanded else 1.0
+    facts, full = recording.facts, ASSUMED_FULL_SCALE if recording.commanded else 1.0
     flown = usable(recording)
     signs, hover = None if facts.too_slow else rotor_signs(flown), _hover(flown)
     forward, left, spins = signs or ((), (), None)
