@@ -12,7 +12,7 @@ from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
 from ..flight import CHANNEL_NAMES
 from ..logs import Recording
-from .checks import Evidence, Finding, findings as findings_of, opposite_yaw
+from .checks import Evidence, Finding, findings, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
 from .stretches import cut, nothing_usable, usable
 
@@ -45,8 +45,8 @@ class Inspection(msgspec.Struct, frozen=True):
     - `log`, `format`: the file, and the `name` of its `LogFormat`.
     - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
     - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
-    - `findings`: why no vehicle can be identified from the log, and what to do, most important first.
-    - `checks`: faults that the log shows, see `jaxos4.recording.checks`.
+    - `refusals`: why no vehicle can be identified, and what to do, most important first. In JSON: `findings`.
+    - `findings`: faults that the log shows, see `jaxos4.recording.checks`. In JSON: `checks`.
     - `notes`: remarks of the reader.
     - `parts`: the stretches in order of time.
     """
@@ -58,8 +58,8 @@ class Inspection(msgspec.Struct, frozen=True):
     end: float
     sample_time: float
     measured: dict[str, Channel]
-    findings: tuple[str, ...]
-    checks: tuple[Finding, ...]
+    refusals: tuple[str, ...] = msgspec.field(name="findings")
+    findings: tuple[Finding, ...] = msgspec.field(name="checks")
     notes: tuple[str, ...]
     parts: tuple[InspectedStretch, ...]
 
@@ -79,7 +79,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     nothing = "" if flown else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(flown, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))
-    findings = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
+    refusals = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
         format=recording.facts.format.name if recording.facts.format else "",
@@ -88,8 +88,8 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         end=float(recording.time[-1]),
         sample_time=recording.dt,
         measured=_measured(recording),
-        findings=findings,
-        checks=findings_of(evidence),
+        refusals=refusals,
+        findings=findings(evidence),
         notes=recording.notes if yaw is None else (*recording.notes, str(yaw)),
         parts=tuple(parts),
     )

@@ -65,7 +65,7 @@ class Prepared(NamedTuple):
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
-    - `doubts`: what the logs show that concerns moments of inertia.
+    - `findings`: what the logs show that concerns moments of inertia.
     - `log_step`: the longest sample of the logs [s].
     """
 
@@ -79,7 +79,7 @@ class Prepared(NamedTuple):
     force_noise: Float[np.ndarray, "3"]
     seconds: tuple[float, float]
     notes: tuple[str, ...] = ()
-    doubts: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
 
     @property
@@ -98,7 +98,7 @@ class _Cleaned(NamedTuple):
 
     stretches: list[Recording]
     notes: list[str]
-    doubts: list[Finding]
+    findings: list[Finding]
     evidence: Evidence
 
 
@@ -138,7 +138,7 @@ def prepare(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
     different = different_thrust([each.evidence for each in every])
-    doubts = [*(doubt for each in every for doubt in each.doubts), *([] if different is None else [different])]
+    found = [*(one for each in every for one in each.findings), *([] if different is None else [different])]
     notes, stretched = [note for each in every for note in each.notes], []
     for number, (recording, each) in enumerate(zip(recordings, every, strict=True)):
         smooth, noise, share = without_noise(each.stretches, airframe)
@@ -152,7 +152,7 @@ def prepare(
     numbers = [number for number, _ in stretched]
     return tuple(
         _sampled(recordings, numbers, flown, airframe, step, holdout, rules)._replace(
-            notes=tuple(notes), doubts=tuple(doubts), log_step=slowest
+            notes=tuple(notes), findings=tuple(found), log_step=slowest
         )
         for step, flown in zip(steps, coarse, strict=True)
     )

@@ -247,9 +247,9 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
         f"one every {1e3 * found.sample_time:.4g} ms",
         soft_wrap=True,
     )
-    for finding in found.findings:
-        console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
-    for each in found.checks:
+    for refusal in found.refusals:
+        console.print(f"cannot identify a vehicle: {refusal}.", soft_wrap=True)
+    for each in found.findings:
         verb = "contradicts" if each.contradicted else "concerns"
         console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
     for names, unit in _UNITS.items():
