@@ -33,7 +33,7 @@ class Traces(NamedTuple):
     start_log: Int[np.ndarray, " starts"]
 
     def thinned(self, most: int = 1200, *, digits: int = 5) -> "Traces":
-        """At most `most` samples, each the first finite value of its block, with so many significant `digits`."""
+        """At most `most` samples, each the first finite value of its block, with this many significant `digits`."""
         every = -(-self.time.size // most)
         blocks = np.arange(self.time.size) // every
         apart = self.log != self.log[::every][blocks]  # a block has the values of one log

@@ -245,7 +245,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def successful(self) -> bool:
-        """Whether what was asked can be trusted: Ix and Iy of a vehicle; of an OS4, all that was identified."""
+        """Whether the requested quantities can be trusted: Ix and Iy of a vehicle; all identified ones of an OS4."""
         return self.result == "successful"
 
     @property

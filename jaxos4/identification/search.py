@@ -25,7 +25,7 @@ class Pretests(NamedTuple):
     - `negative`: a parameter that must not be negative is fixed at 0 if it is so by this many standard deviations.
     - `rise`: parameters near their plain values are fixed there unless that raises the cost, prior included, by more:
       near it, a cost with kinks is not quadratic, and standard deviations are too small.
-    - `near`: a plain value that is further off than so many standard deviations is never tried.
+    - `near`: a plain value that is further off than this many standard deviations is never tried.
     """
 
     negative: float = 2.0

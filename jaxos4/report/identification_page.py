@@ -120,7 +120,7 @@ def verdict(found: Identification) -> str:
             f"{status}: {_joined(name for name, each in found.verdicts.items() if each.status == status)}"
             for status in sorted(named, key=STATUSES.index)
         )
-        return f"What was asked is {'; '.join(said) or IDENTIFIED}."
+        return f"All requested quantities are {'; '.join(said) or IDENTIFIED}."
     refused = _joined(f"{name} is {each.status}" for name, each in found.verdicts.items() if not each.trusted)
     return f"Not to be trusted: {refused or meaning(found.result)}."
 

@@ -33,7 +33,7 @@ from .segments import Segments, observe_in_segments
 from .sums import Innovations, joined, placed
 
 SETTLING = 128
-"""After so many samples a filter has settled, by default."""
+"""After this many samples a filter has settled, by default."""
 
 
 class InnovationsProblem(AbstractProblem):
@@ -50,7 +50,7 @@ class InnovationsProblem(AbstractProblem):
     - `segments`: the number of parts of the flight that are filtered in parallel; by default one for about 384 samples.
       Short ones lose information, because a filter begins without memory. Padded flights with equal numbers of segments
       and equal room share a program.
-    - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
+    - `settling`: after this many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
     - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample, see
       `jaxos4.shooting.feedthrough`; by default nothing: the controller answers no measurement within its sample.
