@@ -140,7 +140,7 @@ def print_table(
     *,
     tables: list[Published] = RECORDER.tables,
 ) -> None:
-    """Prints a table of so many columns of the terminal. Only the cells of `results` are of several lines.
+    """Prints a table of this many columns of the terminal. Only the cells of `results` are of several lines.
 
     `tables`: gets the table too, to be published, see `published.py`.
     """

@@ -29,7 +29,7 @@ def shortened(text: str, most: int) -> str:
 
 
 def in_words(error: Exception, most: int = 120) -> str:
-    """The message of an error on one line, at most so many characters; the name of its type if it has none."""
+    """The message of an error on one line, at most this many characters; the name of its type if it has none."""
     return " ".join(str(error).split())[:most] or type(error).__name__
 
 

@@ -116,7 +116,7 @@ def as_estimate(
     - The others are fields of an `Estimate`.
     """
     unknowns = problem.unknowns
-    own = unknowns.parameters
+    own = unknowns.parameter_count
     valid, free = unknowns.valid, unknowns.free
     center, half_width = jnp.where(valid, unknowns.center, 0.0), jnp.where(valid, unknowns.half_width, 1.0)
     covariance = jnp.where(free & free[:, None], covariance, 0.0)

@@ -132,14 +132,14 @@ def test_a_search_counts_as_noise_what_the_feedthroughs_that_it_found_explain(rn
     """A second search, in the likelihood with these feedthroughs, begins at its end."""
     problem, search = standard(rng, passed=1), jaxos4.FilterError()
     found = search(problem)
-    passed, nothing = found.parts.passed, np.zeros((3, 1))
+    passed, nothing = found.parts.noise_feedthrough, np.zeros((3, 1))
     std = found.std[-1]
     assert 0 < np.abs(passed).max() < 5 * std  # noise, as there is no feedthrough
-    again = search(problem.passing(passed).starting_from(found.parameters))
+    again = search(problem.with_noise_feedthrough(passed).starting_from(found.parameters))
     assert again.sweeps < found.sweeps
-    np.testing.assert_array_equal(again.parts.passed, passed)
+    np.testing.assert_array_equal(again.parts.noise_feedthrough, passed)
     np.testing.assert_allclose(again.cost, found.cost, atol=3e-3)
-    assert search(problem.passing(nothing)).cost < found.cost
+    assert search(problem.with_noise_feedthrough(nothing)).cost < found.cost
 
 
 def test_a_log_that_holds_every_run_of_the_controller_has_no_feedthrough():

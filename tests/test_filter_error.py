@@ -32,7 +32,7 @@ NOISE = LogNoise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 
 def observed_in(problem, segments=1):
     """The measurements in segments of about this many samples, by default in one."""
     found = InnovationsProblem(problem, segments=segments)
-    rows, (measured, restart, counts, known) = found.cut.rows, found.observed()
+    rows, (measured, restart, counts, known) = found.segmentation.rows, found.observed()
     return Observed(measured[:rows], restart[:rows], counts[:rows], known)
 
 

@@ -176,7 +176,7 @@ def test_gradient_and_information_are_the_residuals_derivatives(terms, recording
     own = problem.size
     for w in range(4):
         columns = np.r_[:count, count + w * own : count + (w + 1) * own]
-        rows = np.repeat(np.nonzero(problem.cut()[1])[0] == w, problem.columns.size)
+        rows = np.repeat(np.nonzero(problem.window_samples()[1])[0] == w, problem.columns.size)
         expected = jacobian[rows][:, columns]
         size = np.outer(scale[columns], scale[columns])
         np.testing.assert_allclose(found.information[w] / size, expected.T @ expected / size, atol=1e-10)

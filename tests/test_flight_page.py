@@ -44,7 +44,7 @@ def written(path, title="A flight", **changes):
 
 def test_the_page_says_what_was_found(tmp_path):
     text, shown = written(tmp_path / "flight.html")
-    assert text.index("What was asked is identified: Ix") < text.index("<main>")
+    assert text.index("All requested quantities are identified: Ix") < text.index("<main>")
     says(shown, "identified: Ix 1.73e-05 +- 2.9e-07 kg m^2 (95 %), if", "Iz: the flights say less about alpha8 than")
     says(
         shown,
@@ -201,12 +201,12 @@ CAREFUL = Verdict("identified with a reservation", "", ("it is known to 20 % onl
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, "What was asked is identified: Ix."),
+        ({}, "All requested quantities are identified: Ix."),
         (
             {"verdicts": {"Ix": CAREFUL, "Iy": Verdict("identified"), "Iz": CAREFUL}},
-            "What was asked is identified: Iy; identified with a reservation: Ix and Iz.",
+            "All requested quantities are identified: Iy; identified with a reservation: Ix and Iz.",
         ),
-        ({"verdicts": {}}, "What was asked is identified."),
+        ({"verdicts": {}}, "All requested quantities are identified."),
         ({"result": "implausible", "verdicts": WRONG}, "Not to be trusted: Ix is contradicted."),
         ({"result": "max_sweeps", "verdicts": {}}, "Not to be trusted: the search did not converge"),
         ({"result": "nonfinite_trajectory"}, "There is no answer: "),

@@ -19,7 +19,7 @@ from sign_flights import flown, turned
 import jaxos4
 from jaxos4.flight import RATES
 from jaxos4.logs import LogFacts
-from jaxos4.recording.inspection import FULL_SCALE, airframe_draft, inspect_log
+from jaxos4.recording.inspection import ASSUMED_FULL_SCALE, airframe_draft, inspect_log
 from jaxos4.recording.motion import rotor_signs
 from jaxos4.report import write_log_page
 from jaxos4.report.log_page import amplitude_density, fitted, logged
@@ -145,8 +145,8 @@ def test_the_median_thrust_carries_the_mass(commanded, felt, tmp_path):
     assert ("Without an accelerometer this must be right" in text) == (not felt)
     (tmp_path / "mine.toml").write_text(filled(text))
     airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
-    assert float(airframe.max_rotor_speed) == (FULL_SCALE if commanded else np.inf)
-    scale = float(CRAZYFLIE.max_rotor_speed) / FULL_SCALE if commanded else 1.0
+    assert float(airframe.max_rotor_speed) == (ASSUMED_FULL_SCALE if commanded else np.inf)
+    scale = float(CRAZYFLIE.max_rotor_speed) / ASSUMED_FULL_SCALE if commanded else 1.0
     thrust = float(CRAZYFLIE.thrust_coefficient) * scale**2
     assert float(airframe.thrust_coefficient) == pytest.approx(thrust, rel=1e-3 if felt else 0.05)
     np.testing.assert_array_equal(airframe.rotor_spins, CRAZYFLIE.rotor_spins)

@@ -50,7 +50,7 @@ def test_no_window_reaches_from_one_stretch_into_the_next(lengths, length, force
     assert float(joined.dt) == pytest.approx(0.01, rel=1e-9)
     settings = {"sigma": jaxos4.SENSOR_SIGMA, "channels": "rates", "windows": windows}
     problem = jaxos4.ShootingProblem(jaxos4.CorrectedOS4(), joined, **settings)
-    np.testing.assert_array_equal(np.nonzero(problem.cut()[1])[0], np.repeat(np.arange(windows), length))
+    np.testing.assert_array_equal(np.nonzero(problem.window_samples()[1])[0], np.repeat(np.arange(windows), length))
     for name in ("omega", "states", "channels"):
         parts = [np.asarray(getattr(flight, name))[: n * length] for flight, n in whole]
         np.testing.assert_array_equal(getattr(joined, name), np.concatenate(parts))

@@ -112,7 +112,7 @@ ROWS, COMMANDS = 1000, [f"command{i}" for i in range(1, 5)]
 
 
 def repeating(tmp_path, held, *, stagger=0, lost=0.0):
-    """250 rows a second, with commands that are held for so many rows: each motor `stagger` rows after the last."""
+    """250 rows a second, with commands that are held for this many rows: each motor `stagger` rows after the last."""
     rng = np.random.default_rng(0)
     commands = np.repeat(rng.uniform(0.4, 0.6, (ROWS // held + 9, 4)), held, axis=0)
     commands = np.stack([commands[stagger * i :, i][:ROWS] for i in range(4)], axis=1)

@@ -22,7 +22,7 @@ from jaxos4.estimators import ESTIMATORS as REGISTRY
 from jaxos4.report import error_table, study_page, write_report
 from jaxos4.report.study_tables import scenarios
 from jaxos4.report.style import drawing, log_axis, styles
-from jaxos4.report.text import MISSING, percent, plain
+from jaxos4.report.text import DASH, percent, plain
 from jaxos4.study import metrics, read_results
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
@@ -163,8 +163,8 @@ def test_a_study_of_one_flight_shows_the_answer_and_no_statistics(tmp_path):
         value = float(one["estimate"][k])
         ends = f"{plain(value - half[k], 4)} to {plain(value + half[k], 4)}"
         assert row == {"truth": plain(float(one["truth"][k]), 4), "estimate": plain(value, 4), "interval": ends}
-        assert cells["noise x 0, svsf", name, "estimate"][0] == MISSING
-        assert cells["noise x 0, svsf", name, "interval"][0] == MISSING
+        assert cells["noise x 0, svsf", name, "estimate"][0] == DASH
+        assert cells["noise x 0, svsf", name, "interval"][0] == DASH
     single = study.isel(scale=[1], estimator=[0])
     assert '<p class="verdict">ibss at noise x 1: successful, ' in write_report(single, tmp_path)[0].read_text()
 

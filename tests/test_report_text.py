@@ -15,7 +15,7 @@ from synthetic_identification import COLOURED, CONSTANTS, WHITE, WRONG, identifi
 from jaxos4.identification.results import Disturbance, ParameterEstimate, RigidBody, Validation
 from jaxos4.report import write_flight_page
 from jaxos4.report.style import drawing, svg
-from jaxos4.report.text import MISSING, Listing, plain
+from jaxos4.report.text import DASH, Listing, plain
 
 
 def test_the_text_of_a_flight():
@@ -81,7 +81,7 @@ def test_the_text_of_a_vehicle(tmp_path):
 
 
 def test_small_numbers_keep_their_digits_and_a_figure_its_bytes():
-    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: MISSING}
+    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: DASH}
     assert {x: plain(x) for x in known | {1.234e300: ""}} == known | {1.234e300: "1.23e300"}
     with drawing():
         figure = Figure()

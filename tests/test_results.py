@@ -197,7 +197,7 @@ def test_a_result_shows_itself(tmp_path):
     assert "alpha3" in found.summary(verbose=True)
     assert any(line.startswith("Ix") and line.endswith("if arms and mass are right") for line in wide(found))
     shown = found._repr_html_()
-    assert "What was asked is identified: Ix." in shown
+    assert "All requested quantities are identified: Ix." in shown
     assert "1.733e-05" in shown
     evil = identified_vehicle(verdicts={"Ix": Verdict("contradicted", "", ("<script>",))})
     assert "<script>" not in evil._repr_html_()

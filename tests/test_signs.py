@@ -45,7 +45,7 @@ def test_wrong_signs_are_found_and_right_ones_never(seed, gust, lag):
 def test_a_fit_is_refused_with_the_remedy_unless_the_vehicle_does_not_turn():
     recording = flown(CRAZYFLIE, 0)
     # Opposite yaw is only doubted.
-    (found,) = prepare([recording], turned(CRAZYFLIE, "rotor_spins"))[0].doubts
+    (found,) = prepare([recording], turned(CRAZYFLIE, "rotor_spins"))[0].findings
     assert str(found).startswith(
         "a.bbl: yaw answers the rotors with the opposite sign (torque and angular acceleration "
     )
@@ -54,7 +54,7 @@ def test_a_fit_is_refused_with_the_remedy_unless_the_vehicle_does_not_turn():
     with pytest.raises(InputError, match=r"a.bbl: roll and pitch answer .* in another order .* correct one of them"):
         prepare([recording], turned(CRAZYFLIE, "rotor_positions"))
     prepared, *_ = prepare([recording], CRAZYFLIE)
-    assert (prepared.windows > 0, prepared.doubts) == (True, ())
+    assert (prepared.windows > 0, prepared.findings) == (True, ())
     still = recording._replace(states=0.001 * recording.states)
     assert opposite_axes([still], turned(CRAZYFLIE, "rotor_spins")) == opposite_axes([], CRAZYFLIE) == []
     brief = cut(averaged(recording, [0.02])[0], Stretch(0.0, 1.5))  # too short for signals from 2 Hz on

@@ -296,7 +296,7 @@ def heavier():
 @pytest.mark.parametrize("fault", SPOILED)
 def test_what_the_log_shows_counts_against_the_inertias_before_a_fit(fault):
     spoil, status, cause = SPOILED[fault]
-    findings = prepare(spoil(flown(duration=12.0)), CRAZYFLIE, sample_time=0.016, holdout=0.0)[0].doubts
+    findings = prepare(spoil(flown(duration=12.0)), CRAZYFLIE, sample_time=0.016, holdout=0.0)[0].findings
     doubts = list(doubts_of_log(findings))
     for name in ("Ix", "Iy"):
         found = verdict_of(name, Quantity("1e-5 kg m^2"), doubts)
@@ -307,9 +307,9 @@ def test_what_the_log_shows_counts_against_the_inertias_before_a_fit(fault):
 
 def test_a_contradiction_of_another_quantity_counts_against_that_quantity_alone():
     """Motors that were logged rarely contradict the damping; the attitude alone is no quantity of the vehicle."""
-    rare = prepare([thinned(flown(duration=12.0), 5)], CRAZYFLIE, sample_time=0.016, holdout=0.0)[0].doubts
+    rare = prepare([thinned(flown(duration=12.0), 5)], CRAZYFLIE, sample_time=0.016, holdout=0.0)[0].findings
     assert [finding.name for finding in rare] == ["rare_motors"]
     assert verdict_of("damping", Quantity(), list(doubts_of_log(rare))).status == CONTRADICTED
     assert verdict_of("Ix", Quantity("1e-5 kg m^2"), list(doubts_of_log(rare))).status == IDENTIFIED
     turned = prepare([scaled(ANGLES)(flown(duration=12.0), 0.5)], CRAZYFLIE, sample_time=0.016, holdout=0.0)[0]
-    assert (turned.doubts, len(turned.notes)) == ((), 1)
+    assert (turned.findings, len(turned.notes)) == ((), 1)

@@ -23,7 +23,7 @@ SHOWN = {"roll_damping": 1.0, "pitch_damping": 1.0, "Ix": 1e5, "Iy": 1e5}
 def main(
     out: Annotated[Path, typer.Option(help="JSON file for the results.")],
     flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
-    every: Annotated[list[int], typer.Option(help="Keep one command of so many.")] = (1, 10, 20, 40),
+    every: Annotated[list[int], typer.Option(help="Keep one command in this many.")] = (1, 10, 20, 40),
     end: Annotated[float | None, typer.Option(help="Identify with the flight up to this time [s].")] = None,
 ) -> None:
     """Identify a flight with all of its commands, and with some."""

@@ -102,7 +102,7 @@ def without_rows(recording: Recording, lost: float) -> Recording:
 
 
 def two_vehicles(recording: Recording, size: float) -> list[Recording]:
-    """Two halves; the second is of a vehicle whose mass and moments of inertia are so many times smaller.
+    """Two halves; the second is of a vehicle whose mass and moments of inertia are this many times smaller.
 
     With rotor speeds that are smaller by the root, it flies the same path.
     """
@@ -112,7 +112,7 @@ def two_vehicles(recording: Recording, size: float) -> list[Recording]:
 
 
 def thinned(recording: Recording, every: float) -> Recording:
-    """Motors are logged once in so many samples."""
+    """Motors are logged once in this many samples."""
     rows = np.arange(len(recording.omega)) // int(every) * int(every)
     return recording._replace(omega=recording.omega[rows])
 

@@ -109,7 +109,7 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
 def residual_correlations(
     errors: Float[np.ndarray, "samples channels"], torques: Float[np.ndarray, "samples 3"], lags: int = 25
 ) -> Correlations:
-    """The correlations of residuals up to so many samples apart. NaN: not measured."""
+    """The correlations of residuals up to this many samples apart. NaN: not measured."""
     measured = np.isfinite(errors)
     errors = np.where(measured, errors, 0.0)
     own, pairs = (x[:, lags + 1 :] for x in _correlations(errors, errors, measured, measured, lags))

@@ -65,7 +65,7 @@ class Evaluation(NamedTuple):
     @property
     def jacobian(self) -> Float[np.ndarray, "windows unknowns residuals"]:
         """The weighted `slopes` of each window; 0 for a missing measurement, and after the end of a shorter window."""
-        index, within = self.problem.cut()
+        index, within = self.problem.window_samples()
         weighted = np.where(np.isnan(self.measured), 0.0, self.slopes / self.sigma)
         cut = weighted[:, index] * within[:, :, None]
         return np.swapaxes(cut, 0, 1).reshape(len(index), len(weighted), -1)
@@ -175,7 +175,7 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     )
     # The change of each estimated parameter with each weighted residual.
     moves = np.swapaxes(jacobian, 1, 2) @ sensitivity
-    index, within = evaluation.problem.cut()
+    index, within = evaluation.problem.window_samples()
     errors, measured = (x[index] * within[:, :, None] for x in (evaluation.errors, measured.astype(float)))
     if len(index) >= 20 and moves.shape[1] <= 4000:
         return _window_by_window(errors.reshape(len(index), -1), measured.reshape(len(index), -1), moves)

@@ -26,7 +26,7 @@ class ResponseSettings(NamedTuple):
     - `resolution`, `highest`: how far apart frequencies are, and the highest [Hz]: few vehicles move faster.
     - `memory`: of the regression [s], as long as the flight controller's answer. A longer one finds the same, less
       precisely. `fewest_lags`: of a memory that is shorter than this in samples.
-    - `samples`: the regression needs so many for each of its coefficients.
+    - `samples`: the regression needs this many for each of its coefficients.
     - `low`, `high`: the band in which the model is compared [Hz].
     - `unclear`: the standard deviation of a gain, as a share of the model's, from which on the gain does not count.
     """
@@ -104,7 +104,7 @@ class AxisResponse(NamedTuple):
         return Agreement(math.exp(weight @ np.log(gain)), deviation, float(frequency[0]), float(frequency[-1]))
 
     def rounded(self, digits: int = 4) -> "AxisResponse":
-        """The same with so many significant digits, which is what files keep."""
+        """The same with this many significant digits, which is what files keep."""
         return self._replace(
             **{name: significant(each, digits) for name, each in zip(self._fields, self[:-1], strict=False)}
         )
@@ -161,7 +161,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
 
 
 def significant(values: Float[np.ndarray, "..."], digits: int) -> Float[np.ndarray, "..."]:
-    """Numbers with so many significant digits."""
+    """Numbers with this many significant digits."""
     return np.array([float(f"{x:.{digits - 1}e}") for x in values.ravel()]).reshape(values.shape)
 
 

@@ -98,7 +98,7 @@ def predictions(
 
 
 def trajectory_horizons(dt: float, longest: float = max(HORIZONS), *, every: float = 0.02) -> tuple[float, ...]:
-    """Horizons `every` so many seconds, in whole samples, which draw a trajectory up to the `longest`."""
+    """Horizons each `every` seconds, in whole samples, which draw a trajectory up to the `longest`."""
     step = max(round(every / dt), 1)
     return tuple(dt * np.arange(step, max(round(longest / dt), 1) + 1, step))
 
@@ -108,9 +108,9 @@ def starts(
 ) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 3"]]:
     """The samples at which `predictions` starts, and the rates there [rad/s]. Raises the same errors.
 
-    Starts are `every` so many seconds. The rates are the mean of those measured up to `near` [s] around the start: less
-    noise than one sample. A start is omitted if one of these rates is missing, or if the longest horizon reaches beyond
-    the stretch.
+    There is a start each `every` seconds. The rates are the mean of those measured up to `near` [s] around the start:
+    less noise than one sample. A start is omitted if one of these rates is missing, or if the longest horizon reaches
+    beyond the stretch.
     """
     dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
     around = int(near / dt)

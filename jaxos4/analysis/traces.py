@@ -33,7 +33,7 @@ class Traces(NamedTuple):
     start_log: Int[np.ndarray, " starts"]
 
     def thinned(self, most: int = 1200, *, digits: int = 5) -> "Traces":
-        """At most `most` samples, each the first finite value of its block, with so many significant `digits`."""
+        """At most `most` samples, each the first finite value of its block, with this many significant `digits`."""
         every = -(-self.time.size // most)
         blocks = np.arange(self.time.size) // every
         apart = self.log != self.log[::every][blocks]  # a block has the values of one log
@@ -50,7 +50,7 @@ class Traces(NamedTuple):
         return self._replace(**fewer | times)
 
 
-def flight_traces(found: Evaluation) -> Traces:
+def os4_traces(found: Evaluation) -> Traces:
     """The traces of a flight that was simulated at an answer."""
     flight, channels = found.problem.flight, found.problem.size
     time, omega = np.asarray(flight.time, float), np.asarray(flight.omega, float)

@@ -145,7 +145,7 @@ class _Carry(NamedTuple):
 
 
 def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Drawn:
-    """The random numbers of so many runs of the controller, each with `steps` of length `h`."""
+    """The random numbers of this many runs of the controller, each with `steps` of length `h`."""
     (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
     shape, rows = (runs * steps + 1, 4), steps * np.arange(runs)[:, None] + np.arange(steps + 1)
     gusts = jnp.append(loop.gust, loop.thrust_gust) * coloured(jax.random.normal(gust_key, shape), h / loop.gust_time)

@@ -117,7 +117,7 @@ class ClosedLoop(eqx.Module):
 
     - `attitude_gain` [1/s], `rate_gain` [1/s], `integral_gain` [1/s^2]: for each axis.
     - `controller_inertia`: Ix, Iy, Iz that the controller knows [kg m^2]; the true ones by default.
-    - `log_every`: the controller runs so many times in each sample of the log.
+    - `log_every`: the controller runs this many times in each sample of the log.
     - `logged`: `"commands"`, or `"speeds"` for measured rotor speeds.
 
     **Raises:** `ValueError` that names the setting.

@@ -86,7 +86,7 @@ class Fleet(eqx.Module):
 
     The same for all fleets:
 
-    - `still`: so many vehicles fly in still air, and show velocity and distance: gusts carry the others away.
+    - `still`: this many vehicles fly in still air, and show velocity and distance: gusts carry the others away.
     - `least_gust`: disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2].
     - `slowest`: rotors turn at least with this share of the speed in hover. `fastest`: and at most with this multiple,
       if no maximum is known.

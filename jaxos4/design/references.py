@@ -101,7 +101,7 @@ class ReferenceTask(task.AbstractTask):
 
     The same for all tasks:
 
-    - `target`: references that need too much are reduced to about this share of a limit, with at most so many
+    - `target`: references that need too much are reduced to about this share of a limit, with at most this many
       `reductions`, each by a factor that is at least `least_step`.
     - `little`: a parameter counts as excited if its bound is below this share of the bracket's standard deviation.
     """

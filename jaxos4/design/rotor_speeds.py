@@ -27,7 +27,7 @@ from . import task
 from .envelope import Envelope, Uses, hover_squares
 from .task import Coefficients, Designed, Flown, Search, Series
 
-# At the end, vehicles are flown with so many steps in a sample.
+# At the end, vehicles are flown with this many steps in a sample.
 _FINER = 10
 
 
@@ -53,7 +53,7 @@ class RotorSpeedTask(task.AbstractTask):
     - `limited`: the number of vehicles that keep the limits during the search; at the end all of them do.
     - `averaged`: the number of vehicles over which the criterion is averaged.
     - `target`: the share of a limit that an input uses at most, because other vehicles from the bracket may need a
-      little more. It is met to the relative `precision` of the amplitude, with at most so many `corrections`.
+      little more. It is met to the relative `precision` of the amplitude, with at most this many `corrections`.
     - `amplified`: an input is multiplied by at most about this. `far`: the largest share of a limit that counts.
     - `slowest_tone`: tones of a lower frequency [Hz] have the amplitude of this one: angles would allow almost none.
     - `least`: squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].

@@ -1,4 +1,4 @@
-"""Estimators: from a `ShootingProblem` and a `Bracket` to an `Estimate`. Each algorithm has its own file.
+"""Estimators: from a likelihood, with the bracket of its unknowns, to an `Estimate`. Each algorithm has its own file.
 
 `__init__.pyi` names them; each is imported when it is first used.
 """

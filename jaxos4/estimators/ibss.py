@@ -64,7 +64,7 @@ class IBSS(AbstractSolver[State]):
     - `coarse`: every stage but the last ends when the minimum is at most so far away.
     - `opening`: the longest step of the first sweep of a stage, in standard deviations of the stage's start.
     - `narrow`: half-width of the first brackets, as a share of that.
-    - `safety`: half-width of later brackets: so many times the relative error of the last predictions, as a share of
+    - `safety`: half-width of later brackets: this many times the relative error of the last predictions, as a share of
       the longest step. It is at least `least` and at most 1.
     - `widening`: if the last shot was at an end of its bracket, the next is wider by this factor, again and again, up
       to `widest`.

@@ -154,7 +154,7 @@ class OutputError(AbstractEstimator):
 
     - `tolerance`: the search ends with a step that changes no unknown by more, in half-widths of the bracket.
     - `max_steps`: for each stage.
-    - `long`: a flight of so many samples is long: the rates are fitted to its first 10 %, then to all of it. Errors
+    - `long`: a flight of this many samples is long: the rates are fitted to its first 10 %, then to all of it. Errors
       grow with time, so that a search of all of it from a wide bracket takes many short steps.
     """
 

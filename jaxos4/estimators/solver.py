@@ -111,7 +111,7 @@ def solve(
     def search(place: Count, best: Found) -> Found:
         """From a start in the first stage, or from the best answer in a later one."""
         from_start = place < count
-        own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameters) & (place > 0)
+        own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameter_count) & (place > 0)
         own &= jnp.isfinite(cost_of(best.model))
         first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
         before = chosen(from_start, first, best)

@@ -295,7 +295,7 @@ def _past(values: Array, kept: Scalar) -> Float[Array, "samples columns"]:
 
 @eqx.filter_jit
 def settled(noise: LogNoise, dt: Scalar, rows: int) -> tuple[Covariance, Covariance, Float[Array, " channels"]]:
-    """The state of each channel's filter when its gains no longer change, after so many `rows`.
+    """The state of each channel's filter when its gains no longer change, after this many `rows`.
 
     **Returns:** the covariance of a rate or force and its disturbance after a measurement; what a step adds to it; and
     the share of a constant acceleration that the disturbance absorbs.

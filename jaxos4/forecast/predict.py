@@ -230,7 +230,7 @@ def _problem(vehicle: Vehicle, prepared: Prepared) -> ShootingProblem:
 def _starts(
     measured: Measured, name: str, steps: int, every: int, missing: tuple[str, ...]
 ) -> Int[np.ndarray, " starts"]:
-    """The samples at which the state is measured, and that have so many samples after them."""
+    """The samples at which the state is measured, and that have this many samples after them."""
     start = np.arange(0, len(measured.stretch) - steps, every)
     start = start[measured.stretch[start] == measured.stretch[start + steps]]
     if not start.size:

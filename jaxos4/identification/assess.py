@@ -12,8 +12,8 @@ from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
-from .os4 import fit_flight
-from .problem import Intervals, bracket_of, flight_problem
+from .os4 import fit_os4
+from .problem import Intervals, bracket_of, os4_problem
 from .results import finite_or_none
 
 
@@ -81,8 +81,8 @@ def assess(
     (recording,) = as_recordings(flight)
     where = bracket_of(bracket, model)
     settings = {"channels": channels, "initial_state": initial_state, "window": window}
-    problem = flight_problem(recording, model, where, **settings)
-    answer = fit_flight(IBSS(), problem, progress=progress)
+    problem = os4_problem(recording, model, where, **settings)
+    answer = fit_os4(IBSS(), problem, progress=progress)
     known = identifiability(answer.evaluation or evaluate(answer.problem, answer.estimate.parameters), where)
     notes = known.notes(model.parameter_names)
     return FlightInformation(

@@ -12,16 +12,16 @@ from ..analysis.diagnostics import Correlations, residual_correlations, residual
 from ..analysis.frequency_response import FrequencyResponse, frequency_response
 from ..analysis.identifiability import identifiability
 from ..analysis.prediction import Predictions
-from ..analysis.traces import Traces, flight_traces
+from ..analysis.traces import Traces, os4_traces
 from ..bracket import GAUSSIAN_PRIOR
 from ..recording.motion import EXCITED
 from ..results import result_names
 from ..shooting import with_room
 from .answers import Answer, channel_fits, overwhelmed, parameter_table, rigid_body, vehicle_constants
 from .data import Data, Progress
-from .doubts import doubts_of_flight, doubts_of_log, doubts_of_vehicle
+from .doubts import doubts_of_log, doubts_of_os4, doubts_of_vehicle
 from .held_out import predict_held_out, validate_on, vehicle_traces
-from .quantities import flight_quantities, vehicle_quantities
+from .quantities import os4_quantities, vehicle_quantities
 from .results import (
     ChannelFit,
     ParameterEstimate,
@@ -59,7 +59,7 @@ class Checked(NamedTuple):
     correlations: Correlations | None = None
 
 
-def check_flight(data: Data, answer: Answer, prior: float) -> Checked:
+def check_os4(data: Data, answer: Answer, prior: float) -> Checked:
     """The checks of a flight of an OS4. `prior`: how the estimator uses the bracket."""
     names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
     missing, limits, fit, traces, correlations = {}, dict.fromkeys(names), {}, None, None
@@ -71,7 +71,7 @@ def check_flight(data: Data, answer: Answer, prior: float) -> Checked:
         limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
         if found.feasible:
             errors = np.where(np.isnan(found.measured), np.nan, found.errors)[:, : found.problem.size]
-            traces, correlations = flight_traces(found), residual_correlations(errors, found.torques)
+            traces, correlations = os4_traces(found), residual_correlations(errors, found.torques)
     table = {
         name: msgspec.structs.replace(row, noise_limit=limits[name])
         for name, row in parameter_table(answer, prior, missing).items()
@@ -79,8 +79,8 @@ def check_flight(data: Data, answer: Answer, prior: float) -> Checked:
     if not answer.answered:
         return Checked(table, search, doubts=tuple(doubts_of_log(data.findings)))
     body = rigid_body(answer)
-    doubts = doubts_of_flight(data, search, table, body)
-    judged = judge(flight_quantities(table, body), doubts)
+    doubts = doubts_of_os4(data, search, table, body)
+    judged = judge(os4_quantities(table, body), doubts)
     # What an OS4 flight does not show is no fault of the answer.
     wrong = [name for name, verdict in judged.verdicts.items() if verdict.status == CONTRADICTED]
     return Checked(

@@ -19,7 +19,7 @@ L = TypeVar("L", ShootingProblem, InnovationsProblem)
 
 
 def silent(stage: str) -> None:
-    """Tells nobody about a stage."""
+    """Ignores progress."""
 
 
 class Clock(NamedTuple):

@@ -27,7 +27,7 @@ _NOT_LOWEST = (
 )
 
 
-def doubts_of_flight(data: Data, search: str, table: Mapping[str, ParameterEstimate], body: RigidBody) -> list[Doubt]:
+def doubts_of_os4(data: Data, search: str, table: Mapping[str, ParameterEstimate], body: RigidBody) -> list[Doubt]:
     """The doubts about the alphas of an OS4. `search`: the name of the result code of the search."""
     every = (*table, RIGID_BODY)
     return [*doubts_of_log(data.findings, every), *doubts_of_alphas(table, body), *_doubts_of_search(search, every)]

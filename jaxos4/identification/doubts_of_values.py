@@ -30,7 +30,8 @@ class Plausible(NamedTuple):
     - `coupling`: aerodynamic moments may look like a gyroscopic coupling (alpha1, alpha4, alpha7) of this size.
     - `vibration`: innovations that correlate more bias filter error more than its intervals say.
     - `longest_sample`: longer ones [s] would hide the motion with the vibration.
-    - `hopeless`: standard errors below 0 of a skill at the shortest horizon from which on an inertia is not identified.
+    - `hopeless`: an inertia is not identified if its skill at the shortest horizon is this many standard errors
+      below 0.
     - `longest_delay`: of rotors [s]; more is an error of clocks.
     """
 
@@ -100,7 +101,7 @@ def contradicted(
 ) -> Iterator[tuple[Parameter, Doubt]]:
     """The parameters whose values physics or the airframe forbid.
 
-    The doubt moves other quantities as if the parameter had the value that the airframe lets expect.
+    The doubt moves other quantities as if the parameter had the value expected from the airframe.
     """
     owner = {name: quantity for quantity, names in model.quantities.items() for name in names}
     for parameter, usual in zip(model.parameters, np.asarray(model.alpha).tolist(), strict=True):

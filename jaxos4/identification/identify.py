@@ -1,6 +1,6 @@
 """`jaxos4.identify`: from recorded flights to parameters with intervals.
 
-- recordings -> `Data`, with a likelihood: `prepare_flight` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
+- recordings -> `Data`, with a likelihood: `prepare_os4` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
   case, which knows the other steps.
 - `Data` -> `Solution`, the data with their `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
 - `Solution` -> `Checked`: `case.check`, by checks.py with quantities.py, doubts.py and verdict.py.
@@ -24,7 +24,7 @@ from ..networks import TrainedNetwork
 from .answers import Solution
 from .checks import Checked
 from .data import silent
-from .os4 import FlightCase, prepare_flight
+from .os4 import OS4Case, prepare_os4
 from .problem import Intervals
 from .results import Identification, finite_or_none
 from .settings import FlightSettings, VehicleSettings, own_settings
@@ -81,16 +81,14 @@ def identify(
     if isinstance(subject, Airframe):
         case = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **options)
     else:
-        flight_settings = own_settings(FlightSettings, settings)
-        case = prepare_flight(recordings, subject, flight_settings, progress=progress, **options)
+        os4_settings = own_settings(FlightSettings, settings)
+        case = prepare_os4(recordings, subject, os4_settings, progress=progress, **options)
     solution = case.solve(progress)
     checked = case.check(solution, progress)
     return describe(case, solution, checked, time.perf_counter() - begin)
 
 
-def describe(
-    case: FlightCase | VehicleCase, solution: Solution, checked: Checked, seconds: float = 0.0
-) -> Identification:
+def describe(case: OS4Case | VehicleCase, solution: Solution, checked: Checked, seconds: float = 0.0) -> Identification:
     """Everything about an answer, in the fields that pages and files show. `seconds`: the time that it took [s]."""
     (data, answer, sample_times), free = solution, solution.answer.free
     covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]

@@ -26,9 +26,9 @@ from ..recording.checks import KINEMATIC, self_checks
 from ..results import RESULTS
 from ..shooting import ShootingProblem, padded
 from .answers import Answer, Solution
-from .checks import Checked, check_flight
+from .checks import Checked, check_os4
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, silent, versions
-from .problem import Intervals, bracket_of, flight_problem
+from .problem import Intervals, bracket_of, os4_problem
 from .results import COLOURED, has_answer
 from .settings import FlightSettings, class_name, name_and_class
 
@@ -49,7 +49,7 @@ NOISE_LEVELS = NoiseLevels()
 
 
 @dataclasses.dataclass(frozen=True)
-class FlightCase:
+class OS4Case:
     """A flight of an OS4, and how it is identified.
 
     - `data`: with the likelihood of a simulation, which has noise of the sensors only.
@@ -65,15 +65,15 @@ class FlightCase:
 
     def solve(self, progress: Progress) -> Solution:
         """The parameters and the noise levels."""
-        return Solution(self.data, fit_flight(self.estimator, self.data.likelihood, progress=progress))
+        return Solution(self.data, fit_os4(self.estimator, self.data.likelihood, progress=progress))
 
     def check(self, solution: Solution, progress: Progress) -> Checked:
         """The estimate of each quantity, and the doubts about it."""
         del progress
-        return check_flight(solution.data, solution.answer, self.estimator.prior)
+        return check_os4(solution.data, solution.answer, self.estimator.prior)
 
 
-def prepare_flight(
+def prepare_os4(
     recordings: Sequence[Recording],
     model: AbstractModel,
     settings: FlightSettings,
@@ -84,7 +84,7 @@ def prepare_flight(
     validate: Recording | None,
     seed: int,
     progress: Progress,
-) -> FlightCase:
+) -> OS4Case:
     """A flight of an OS4. Arguments as of `identify`."""
     recording, *others = recordings
     subject = class_name(model, MODELS)
@@ -96,8 +96,8 @@ def prepare_flight(
     if trained is not None and not kind.shoots and bracket is not None:
         raise InputError("`bracket`: a network searches the bracket that it was trained in; leave one of them out.")
     where, shooting = bracket_of(bracket, model), {"initial_state": settings.initial_state, "window": settings.window}
-    problem = flight_problem(recording, model, where, channels=settings.channels, **shooting)
-    other = None if validate is None else flight_problem(validate, model, where, **shooting)
+    problem = os4_problem(recording, model, where, channels=settings.channels, **shooting)
+    other = None if validate is None else os4_problem(validate, model, where, **shooting)
     if _has_own_channels(kind):
         problem = _restricted(problem, kind.looks_at, name, recording)
     if kind.needs_network and trained is None:
@@ -130,7 +130,7 @@ def prepare_flight(
     findings = self_checks(recording, model.airframe, checks=KINEMATIC)
     data = Data(problem, problem, Clock(), provenance, held_out=held_out, findings=findings)
     method = estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
-    return FlightCase(data, method, name, subject)
+    return OS4Case(data, method, name, subject)
 
 
 def _method(
@@ -183,7 +183,7 @@ def _has_own_channels(kind: type[AbstractEstimator]) -> bool:
     return kind.looks_at != "all" and not kind.needs_network
 
 
-def fit_flight(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> Answer:
+def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> Answer:
     """Estimate the parameters and the noise levels of one flight.
 
     The noise levels follow from the residuals, and the fit is repeated with them. The covariance of an estimator that

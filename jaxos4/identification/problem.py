@@ -55,7 +55,7 @@ def _interval(name: str, value: Any) -> list[float]:
     return numbers
 
 
-def flight_problem(
+def os4_problem(
     recording: Recording,
     model: AbstractModel,
     bracket: Bracket,
@@ -145,7 +145,7 @@ def train_network(
     - `channels`: what the network looks at; by default the rates, and the attitude if a rate was not measured.
     """
     where = bracket_of(bracket, model)
-    problem = flight_problem(recording, model, where, channels=channels, initial_state=initial_state)
+    problem = os4_problem(recording, model, where, channels=channels, initial_state=initial_state)
     settings = dataclasses.replace(settings, channels=channels or seen_channels(problem))
     with named(recording.name):
         return settings.fit(problem, where, key=jax.random.key(seed))

@@ -74,7 +74,7 @@ def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> 
     return Quantity(f"better than constant rates up to {', '.join(ahead)} ahead" * bool(ahead), reservations=unseen)
 
 
-def flight_quantities(table: dict[str, ParameterEstimate], body: RigidBody) -> dict[str, Quantity]:
+def os4_quantities(table: dict[str, ParameterEstimate], body: RigidBody) -> dict[str, Quantity]:
     """The alphas of an OS4, and its rigid body."""
     found = {}
     for name, row in table.items():

@@ -245,7 +245,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def successful(self) -> bool:
-        """Whether what was asked can be trusted: Ix and Iy of a vehicle; of an OS4, all that was identified."""
+        """Whether the requested quantities can be trusted: Ix and Iy of a vehicle; all identified ones of an OS4."""
         return self.result == "successful"
 
     @property
@@ -277,7 +277,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
         `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`.
         """
-        apart = APART | (_OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES)
+        apart = APART | (_OF_OS4 if self.is_vehicle else _OF_VEHICLES)
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
         fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
         arrays = (*ARRAYS[:2], *ARRAYS[2:] * self.is_vehicle)
@@ -332,5 +332,5 @@ ARRAYS = ("traces", "correlations", "predictions", "trajectories", "response")
 """Fields that are arrays by name; those after the second of a vehicle only."""
 APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", *ARRAYS}
 """Fields that a file holds in another form, or not at all."""
-_OF_FLIGHTS = {"fit", "validation"}  # and those of a vehicle: written of this kind only
+_OF_OS4 = {"fit", "validation"}  # and those of a vehicle: written of this kind only
 _OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}

@@ -25,7 +25,7 @@ class Pretests(NamedTuple):
     - `negative`: a parameter that must not be negative is fixed at 0 if it is so by this many standard deviations.
     - `rise`: parameters near their plain values are fixed there unless that raises the cost, prior included, by more:
       near it, a cost with kinks is not quadratic, and standard deviations are too small.
-    - `near`: a plain value that is further off than so many standard deviations is never tried.
+    - `near`: a plain value that is further off than this many standard deviations is never tried.
     """
 
     negative: float = 2.0
@@ -132,7 +132,7 @@ def search(
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
     optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
-    optimum = optimum._replace(likelihood=likelihood.passing(optimum.by_segment.passed))
+    optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_plain_values(estimator, optimum, progress)
 

@@ -136,7 +136,8 @@ def at_lowest(
         if not left:
             break
         progress("fitting again where the cost is lower")
-        same = data.likelihood.passing(optimum.likelihood.passed)  # costs compare in the same likelihood only
+        counted = optimum.likelihood.noise_feedthrough
+        same = data.likelihood.with_noise_feedthrough(counted)  # costs compare in the same likelihood only
         other = search(estimator, same, start=lower, progress=progress)
         rollouts, is_lower = optimum.rollouts + other.rollouts, has_answer(other.estimate) and other.cost < optimum.cost
         optimum = other._replace(restarts=optimum.restarts + 1) if is_lower else optimum
@@ -177,7 +178,7 @@ def _widening(
     optimum: Optimum, free: Int[np.ndarray, " free"], recording: Int[np.ndarray, " samples"]
 ) -> Float[np.ndarray, " free"]:
     """The factors of the jackknife for the parameters in the places `free`. `recording`: of each sample."""
-    index, owned = map(np.asarray, optimum.likelihood.cut[:2])
+    index, owned = map(np.asarray, optimum.likelihood.segmentation[:2])
     middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
     segments = optimum.by_segment
     # In a segment of padding nothing was measured.

@@ -187,7 +187,7 @@ def _data(
         provenance=provenance,
         seconds=prepared.seconds[0],
         held_out=held_out,
-        findings=prepared.doubts,
+        findings=prepared.findings,
         log_step=prepared.log_step,
         clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),
     )
@@ -263,7 +263,7 @@ def _held_out(
         own = dataclasses.replace(model, recordings=other.recordings)
         clock = Clock(np.full(other.time.size, len(recordings)), other.time)
         held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, clock), other.seconds[0]
-        name, remedy, notes = validate.name, "give another flight", (*notes, *other.notes, *map(str, other.doubts))
+        name, remedy, notes = validate.name, "give another flight", (*notes, *other.notes, *map(str, other.findings))
     elif prepared.tested is not None:
         held_out = HeldOut(dataclasses.replace(fitted, flight=prepared.tested))
     else:

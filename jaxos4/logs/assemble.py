@@ -162,7 +162,7 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
             notes.append(f"{name}: {counted(jumps, 'jump')} of 2 pi removed")
     force = channels[:, len(STATE_NAMES) :]
     measured = force[:, np.isfinite(force).any(axis=0)]
-    # No accelerometer lies still to the last bit for so many samples.
+    # No accelerometer lies still to the last bit for this many samples.
     if len(measured) >= 100 and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
         notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
         force[:] = np.nan

@@ -103,7 +103,7 @@ def _ros1_parts(path: Path, file: IO[bytes], limits: Limits) -> Iterator[tuple[s
 
 
 def _exceeds(kind: str, content: bytes, largest: int) -> bool:
-    """Whether a compressed content makes more than so many bytes."""
+    """Whether a compressed content makes more than this many bytes."""
     made = _decompressor(kind)
     if made is None:
         return False

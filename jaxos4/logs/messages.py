@@ -86,7 +86,7 @@ class Messages:
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
 
     def fastest(self, columns: Sequence[str], sources: Iterable[Source], *, faster: float = 1.1) -> Series | None:
-        """The source that was logged most often in our units and frame; a later one must be so many times `faster`."""
+        """The source that was logged most often in our units and frame; a later one must be `faster` by this factor."""
         best, found = 0.0, None
         for kind, fields, factor in sources:
             for instance in self.fields.get(kind, ()):

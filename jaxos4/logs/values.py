@@ -57,7 +57,7 @@ def without_impossible(
     """The table without the values outside of `limits`: they count as not measured.
 
     - `most`: the share of the values of a column that can be impossible. More are a wrong unit: `InputError`.
-    - `farthest`: a rotor turns at most so many times as fast as in all but this share of its flight.
+    - `farthest`: a rotor turns at most this many times as fast as in all but this share of its flight.
     """
     columns, impossible = dict(table.columns), dict(table.impossible)
     for name, limit in limits.items():
@@ -97,9 +97,9 @@ class Rules(NamedTuple):
     """The implausible values of a channel, by its usual range, from the quantile 0.005 to 0.995.
 
     - `fewest`: values; fewer have no usual range.
-    - `spread`: a value is impossible if it lies so many times further from the median than the end of the range, and
+    - `spread`: a value is impossible if it lies this many times further from the median than the end of the range, and
       most of the six `neighbours` around it do not. Fast manoeuvres last for more than three samples.
-    - `times`, `equal`: values are clipped if so many are equal to the largest one, and so many times more than lie
+    - `times`, `equal`: values are clipped if this many are equal to the largest one, and this many times more than lie
       just below, within a share `near` of the range. A signal without limits has a single largest value. A value that
       is held counts once.
     - `levels`: with more repeated values than this, a signal is coarse, and the level below the largest counts as near.

@@ -52,7 +52,7 @@ class FlightModel(AbstractModel):
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0; the last number holds
       for all stretches that follow. Each recording has its own offsets and gyro biases.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
-    - `batch`: so many samples of a padded flight are computed together.
+    - `batch`: this many samples of a padded flight are computed together.
 
     **Raises:** `ValueError` for terms that do not exist, are given twice or exclude each other, recordings that are not
     counted from 0, or a term that needs an unknown `airframe.max_rotor_speed` or `battery_voltage`.

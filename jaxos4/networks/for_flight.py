@@ -21,7 +21,7 @@ class Training(NamedTuple):
     """Settings with which networks are trained for a flight that is identified.
 
     - `seed_steps`: of a network that only gives a search its start.
-    - `vehicle`: of a network for a vehicle. `windows`: so many of the flight it sees, however long that is.
+    - `vehicle`: of a network for a vehicle. `windows`: this many of the flight it sees, however long that is.
     - `flyable`: the share of a vehicle's bracket in which nearly all simulated flights can be flown.
     """
 

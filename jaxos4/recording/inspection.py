@@ -12,11 +12,11 @@ from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
 from ..flight import CHANNEL_NAMES
 from ..logs import Recording
-from .checks import Evidence, Finding, findings as findings_of, opposite_yaw
+from .checks import Evidence, Finding, findings, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
 from .stretches import cut, nothing_usable, usable
 
-FULL_SCALE = 1000.0
+ASSUMED_FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
 
 
@@ -45,8 +45,8 @@ class Inspection(msgspec.Struct, frozen=True):
     - `log`, `format`: the file, and the `name` of its `LogFormat`.
     - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
     - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
-    - `findings`: why no vehicle can be identified from the log, and what to do, most important first.
-    - `checks`: faults that the log shows, see `jaxos4.recording.checks`.
+    - `refusals`: why no vehicle can be identified, and what to do, most important first. In JSON: `findings`.
+    - `findings`: faults that the log shows, see `jaxos4.recording.checks`. In JSON: `checks`.
     - `notes`: remarks of the reader.
     - `parts`: the stretches in order of time.
     """
@@ -58,8 +58,8 @@ class Inspection(msgspec.Struct, frozen=True):
     end: float
     sample_time: float
     measured: dict[str, Channel]
-    findings: tuple[str, ...]
-    checks: tuple[Finding, ...]
+    refusals: tuple[str, ...] = msgspec.field(name="findings")
+    findings: tuple[Finding, ...] = msgspec.field(name="checks")
     notes: tuple[str, ...]
     parts: tuple[InspectedStretch, ...]
 
@@ -79,7 +79,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     nothing = "" if flown else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(flown, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))
-    findings = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
+    refusals = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
         format=recording.facts.format.name if recording.facts.format else "",
@@ -88,8 +88,8 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         end=float(recording.time[-1]),
         sample_time=recording.dt,
         measured=_measured(recording),
-        findings=findings,
-        checks=findings_of(evidence),
+        refusals=refusals,
+        findings=findings(evidence),
         notes=recording.notes if yaw is None else (*recording.notes, str(yaw)),
         parts=tuple(parts),
     )
@@ -118,7 +118,7 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
 
     **Returns:** the text, in which what must be weighed or measured is a comment, and the keys that are missing.
     """
-    facts, full = recording.facts, FULL_SCALE if recording.commanded else 1.0
+    facts, full = recording.facts, ASSUMED_FULL_SCALE if recording.commanded else 1.0
     flown = usable(recording)
     signs, hover = None if facts.too_slow else rotor_signs(flown), _hover(flown)
     forward, left, spins = signs or ((), (), None)

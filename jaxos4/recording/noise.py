@@ -52,7 +52,7 @@ class SpeedNoise(NamedTuple):
     """Settings with which the noise of rotor speeds is found.
 
     - `seconds`, `fewest`: how long the samples of one spectrum last [s], and how many they are at least.
-    - `neighbours`: spectra are averaged over so many neighbouring frequencies to either side.
+    - `neighbours`: spectra are averaged over this many neighbouring frequencies to either side.
     - `band`: in which changes of speeds are divided into motion and noise, as shares of the highest frequency.
     - `written`: rates at which the speeds may have been written before they were interpolated, of which one is chosen,
       in units of the highest frequency.

@@ -65,7 +65,7 @@ class Prepared(NamedTuple):
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
-    - `doubts`: what the logs show that concerns moments of inertia, or contradicts another quantity.
+    - `findings`: what the logs show that concerns moments of inertia, or contradicts another quantity.
     - `log_step`: the longest sample of the logs [s].
     """
 
@@ -79,7 +79,7 @@ class Prepared(NamedTuple):
     force_noise: Float[np.ndarray, "3"]
     seconds: tuple[float, float]
     notes: tuple[str, ...] = ()
-    doubts: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
 
     @property
@@ -98,7 +98,7 @@ class _Cleaned(NamedTuple):
 
     stretches: list[Recording]
     notes: list[str]
-    doubts: list[Finding]
+    findings: list[Finding]
     evidence: Evidence
 
 
@@ -138,7 +138,7 @@ def prepare(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
     different = different_thrust([each.evidence for each in every])
-    doubts = [*(doubt for each in every for doubt in each.doubts), *([] if different is None else [different])]
+    found = [*(one for each in every for one in each.findings), *([] if different is None else [different])]
     notes, stretched = [note for each in every for note in each.notes], []
     for number, (recording, each) in enumerate(zip(recordings, every, strict=True)):
         smooth, noise, share = without_noise(each.stretches, airframe)
@@ -152,7 +152,7 @@ def prepare(
     numbers = [number for number, _ in stretched]
     return tuple(
         _sampled(recordings, numbers, flown, airframe, step, holdout, rules)._replace(
-            notes=tuple(notes), doubts=tuple(doubts), log_step=slowest
+            notes=tuple(notes), findings=tuple(found), log_step=slowest
         )
         for step, flown in zip(steps, coarse, strict=True)
     )
@@ -173,8 +173,8 @@ def _cleaned(
         raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
     evidence = Evidence(recording, airframe)
     found = [msgspec.structs.replace(each, cause=f"{name}: {each.cause}") for each in findings(evidence)]
-    doubts = [each for each in found if _is_doubt(each)]
-    notes = [str(each) for each in found if each not in doubts]
+    judged = [each for each in found if _is_judged(each)]
+    notes = [str(each) for each in found if each not in judged]
     slow = (facts._replace(gyro=None) if predicted else facts).too_slow
     usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
     if slow:
@@ -185,11 +185,11 @@ def _cleaned(
     if refused := refused_note(opposite):
         raise InputError(f"{name}: {refused}.")
     if yaw := opposite_yaw(opposite.get("yaw")):
-        doubts.append(msgspec.structs.replace(yaw, cause=f"{name}: {yaw.cause}"))
-    return _Cleaned(usable, [*notes, *recording.named_notes, *note], doubts, evidence)
+        judged.append(msgspec.structs.replace(yaw, cause=f"{name}: {yaw.cause}"))
+    return _Cleaned(usable, [*notes, *recording.named_notes, *note], judged, evidence)
 
 
-def _is_doubt(finding: Finding) -> bool:
+def _is_judged(finding: Finding) -> bool:
     """Whether it concerns a moment of inertia, or contradicts another quantity of the vehicle."""
     return bool({*finding.quantities} & {*INERTIAS}) or (finding.contradicted and finding.quantities != ("attitude",))
 
@@ -202,7 +202,7 @@ def at_limit(recording: Recording, airframe: Airframe, rules: Preparation = RULE
         for i, share in enumerate(shares)
         if share > rules.often
     ]
-    return (f"{recording.name}: {', '.join(often)}", "fly gentler, or with a fuller battery") if often else None
+    return (f"{recording.name}: {', '.join(often)}", "fly more gently, or with a fuller battery") if often else None
 
 
 def _usable(

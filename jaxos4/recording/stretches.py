@@ -293,7 +293,7 @@ def _unfelt(means: Float[np.ndarray, "bins 5"], step: float, rules: StretchRules
 
 
 def _lasting(where: Samples, most: float) -> Samples:
-    """`where`, without runs of at most so many samples."""
+    """`where`, without runs of at most this many samples."""
     out = np.zeros_like(where)
     for begin, end in _runs(where):
         out[begin:end] = end - begin > most

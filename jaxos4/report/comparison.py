@@ -13,7 +13,7 @@ from .._files import check_writable, write_file
 from ..comparison import ComparedQuantity, Comparison
 from .html import draw, render
 from .style import FAINT, INK, Style, drawing, grid, style
-from .text import MISSING, Listing, plain, say
+from .text import DASH, Listing, plain, say
 
 
 def print_comparison(console: Console, found: Comparison) -> None:
@@ -25,8 +25,8 @@ def print_comparison(console: Console, found: Comparison) -> None:
     count, rows = len(found.names), []
     for each in found.quantities:
         low, high = map(plain, each.ci95)
-        p = MISSING if math.isnan(each.p) else "differ" if each in found.different else "agree"
-        interval = MISSING if math.isnan(each.value) else f"{low} to {high}"
+        p = DASH if math.isnan(each.p) else "differ" if each in found.different else "agree"
+        interval = DASH if math.isnan(each.value) else f"{low} to {high}"
         unit = "" if each.unit == "1" else each.unit
         rows.append((each.name, f"{sum(each.used)} of {count}", plain(each.value), interval, unit, plain(each.p, 2), p))
     headings = ("quantity", "results", "pooled", "95 % interval", "unit", "p", "")
@@ -60,7 +60,7 @@ def quantity_cells(found: Comparison, each: ComparedQuantity) -> Iterator[tuple[
     """The name of each result, its estimate, its interval, and why it does not count."""
     for name, answer, used in zip(found.names, each.answers, each.used, strict=True):
         if answer is None:
-            yield name, MISSING, "", "not estimated"
+            yield name, DASH, "", "not estimated"
             continue
         low, high = map(plain, answer.ci95)
         status = "" if used else answer.verdict.status if answer.verdict and not answer.trusted else "no interval"

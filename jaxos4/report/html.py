@@ -11,7 +11,7 @@ from matplotlib.markers import MarkerStyle
 
 from .._templates import templates
 from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
-from .text import MISSING, plain
+from .text import DASH, plain
 
 _THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)", PAPER: "none"}
 
@@ -34,12 +34,12 @@ def render(template: str, **values: Any) -> str:
     environment = templates("jaxos4.report")
     environment.filters |= {"inline": inline, "plain": plain, "number": _number}
     environment.filters["interval"] = lambda ends: "" if ends is None else " to ".join(map(_number, ends))
-    environment.filters["share"] = lambda value: MISSING if value is None else f"{value:.2f}"
+    environment.filters["share"] = lambda value: DASH if value is None else f"{value:.2f}"
     return environment.get_template(template).render(**values)
 
 
 def _number(value: float | None, digits: int = 4) -> str:
-    return MISSING if value is None else plain(value, digits)
+    return DASH if value is None else plain(value, digits)
 
 
 def inline(drawing: Drawing, description: str, estimators: Sequence[str] = ()) -> Markup:

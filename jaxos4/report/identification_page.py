@@ -30,7 +30,7 @@ from .identification_figures import (
 from .identification_signals import BAND, identified_signals
 from .style import drawing, styles
 from .terminal import quantity_rows
-from .text import MISSING, plain
+from .text import DASH, plain
 
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
@@ -99,7 +99,7 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
     for name in INERTIAS:
         if name in found.verdicts and name not in listed:
             why = found.verdicts[name]
-            rows.append(((name, MISSING, "", "kg m^2"), "; ".join((why.status, *why.reasons))))
+            rows.append(((name, DASH, "", "kg m^2"), "; ".join((why.status, *why.reasons))))
     return sorted(rows, key=lambda row: INERTIAS.index(row[0][0]) if row[0][0] in INERTIAS else len(INERTIAS))
 
 
@@ -120,7 +120,7 @@ def verdict(found: Identification) -> str:
             f"{status}: {_joined(name for name, each in found.verdicts.items() if each.status == status)}"
             for status in sorted(named, key=STATUSES.index)
         )
-        return f"What was asked is {'; '.join(said) or IDENTIFIED}."
+        return f"All requested quantities are {'; '.join(said) or IDENTIFIED}."
     refused = _joined(f"{name} is {each.status}" for name, each in found.verdicts.items() if not each.trusted)
     return f"Not to be trusted: {refused or meaning(found.result)}."
 
@@ -131,4 +131,4 @@ def _joined(words: Iterable[str]) -> str:
 
 
 def _text(x: Any) -> str:
-    return x if isinstance(x, str) else MISSING if x is None else json.dumps(x, ensure_ascii=False)
+    return x if isinstance(x, str) else DASH if x is None else json.dumps(x, ensure_ascii=False)

@@ -151,7 +151,7 @@ def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) ->
 def bridged(
     time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"], *, steps: float = 3.0
 ) -> Float[np.ndarray, " samples"]:
-    """A signal with straight lines between its samples, unless they are apart by more than so many usual steps."""
+    """A signal with straight lines between its samples, unless they are apart by more than this many usual steps."""
     at = np.flatnonzero(np.isfinite(values))
     if at.size < 2 or at.size == values.size:
         return values

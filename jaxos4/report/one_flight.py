@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from ..study import metrics
 from .study_tables import Entry, Table, names, positive_scales, scale_labels, shown_level
 from .style import INK, estimator_gid, grid, label, legend, styles
-from .text import MISSING, plain
+from .text import DASH, plain
 
 _HEADINGS = ("unit", "truth", "estimate", "interval", "bound", "error / bound")
 
@@ -28,7 +28,7 @@ def estimates(data: xr.Dataset) -> Table:
             rows = []
             for k, name in enumerate(names(data, "parameter")):
                 truth, value, low, high, bound = (plain(float(each.isel(parameter=k)), 4) for each in shown)
-                ends = MISSING if np.isnan(half.values[k]) else f"{low} to {high}"
+                ends = DASH if np.isnan(half.values[k]) else f"{low} to {high}"
                 cells = (units[k], truth, value, ends, bound, plain(float(error.isel(at | {"parameter": k})), 2))
                 rows.append((name, tuple(map(Entry, cells)), j))
             groups.append((f"{scale}, {estimator}", rows))

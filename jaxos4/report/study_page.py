@@ -18,7 +18,7 @@ from .style import BOUND_DASHES, INK, Style, drawing, estimator_gid, grid, label
 from .text import plain
 
 MOST_DRAWN = 12
-"""At most so many scenarios have figures. All scenarios have tables."""
+"""At most this many scenarios have figures. All scenarios have tables."""
 
 # Attributes of the Dataset, and their labels on the page.
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}

@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..study import OUTCOMES, metrics
-from .text import MISSING, Listing, percent, plain
+from .text import DASH, Listing, percent, plain
 
 _PHRASES = {
     "model": "{} model",
@@ -215,7 +215,7 @@ def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[s
 
 def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Entry, ...]:
     rows = (map(text, row) for row in zip(*(one[part].values for part in (measure, "low", "high")), strict=True))
-    return tuple(Entry(value, "" if MISSING in (low, high) else f"{low} to {high}") for value, low, high in rows)
+    return tuple(Entry(value, "" if DASH in (low, high) else f"{low} to {high}") for value, low, high in rows)
 
 
 def count_outcomes(dataset: xr.Dataset) -> str:

@@ -100,8 +100,8 @@ def _failure(found: Identification) -> Section:
 
 
 def _parameters(found: Identification) -> Section:
-    of_flight = not found.is_vehicle
-    digits = 5 if of_flight else 4
+    of_os4 = not found.is_vehicle
+    digits = 5 if of_os4 else 4
     rows = []
     for name, row in found.parameters.items():
         cells = ["-", "-", "-"]
@@ -109,8 +109,8 @@ def _parameters(found: Identification) -> Section:
             low, high = row.ci95
             bound = "-" if row.bound is None else f"{row.bound:.2g}"
             cells = [f"{row.estimate:.{digits}g}", f"[{low:.{digits}g}, {high:.{digits}g}]", bound]
-        rows.append((name, row.unit, *cells[: 2 + of_flight]))
-    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_flight)
+        rows.append((name, row.unit, *cells[: 2 + of_os4]))
+    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_os4)
     yield Listing(headings, rows, ("estimate", "bound"), [row.note for row in found.parameters.values()])
     limits = [
         f"{name} {row.noise_limit:.2g}"
@@ -122,7 +122,7 @@ def _parameters(found: Identification) -> Section:
             "below noise: cannot be distinguished from 0. The airframe's values could be distinguished at this "
             f"multiple of the noise: {', '.join(limits)}."
         )
-    if of_flight:
+    if of_os4:
         yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
 
 
@@ -247,9 +247,9 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
         f"one every {1e3 * found.sample_time:.4g} ms",
         soft_wrap=True,
     )
-    for finding in found.findings:
-        console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
-    for each in found.checks:
+    for refusal in found.refusals:
+        console.print(f"cannot identify a vehicle: {refusal}.", soft_wrap=True)
+    for each in found.findings:
         verb = "contradicts" if each.contradicted else "concerns"
         console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
     for names, unit in _UNITS.items():

@@ -10,13 +10,13 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-MISSING = "–"
+DASH = "–"
 
 
 def plain(value: float, digits: int = 3) -> str:
     """A number with `digits` significant digits, and a power of ten if it is very small or large. NaN is a dash."""
     if not math.isfinite(value):
-        return MISSING if math.isnan(value) else f"{value:g}"
+        return DASH if math.isnan(value) else f"{value:g}"
     if value == 0:
         return "0"
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
@@ -28,7 +28,7 @@ def plain(value: float, digits: int = 3) -> str:
 
 def percent(share: float) -> str:
     """A share in percent, without the sign %. NaN is a dash."""
-    return MISSING if math.isnan(share) else f"{100 * share:.1f}"
+    return DASH if math.isnan(share) else f"{100 * share:.1f}"
 
 
 class Listing(NamedTuple):

@@ -32,7 +32,7 @@ class Unknowns(eqx.Module):
     The model's parameters come first. A likelihood may add unknowns of its own, such as the levels of the noise.
 
     - `names`, `units`: of each unknown.
-    - `parameters`: how many of them, the first, are the model's parameters.
+    - `parameter_count`: how many of them, the first, are the model's parameters.
     - `prior`: how the cost uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
     - `center`, `half_width`: of the bracket in which each is looked for.
     - `free`: whether it is searched. The others are fixed at `center`.
@@ -43,7 +43,7 @@ class Unknowns(eqx.Module):
 
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
-    parameters: int = eqx.field(static=True)
+    parameter_count: int = eqx.field(static=True)
     prior: float = eqx.field(static=True)
     center: Values = eqx.field(converter=as_float)
     half_width: Values = eqx.field(converter=as_float)
@@ -61,7 +61,7 @@ class Unknowns(eqx.Module):
         unknowns = cls(
             names=model.parameter_names,
             units=model.parameter_units,
-            parameters=count,
+            parameter_count=count,
             prior=NO_PRIOR,
             center=nothing,
             half_width=infinite,
@@ -154,13 +154,13 @@ class Parts(NamedTuple):
 
     - `gradient`, `information`: about all unknowns.
     - `products`: for each channel, sums of the products of standardised innovations 0, 1, 2, ... samples apart.
-    - `passed`: the feedthroughs of the whole flight, whose share of the innovations counts as noise.
+    - `noise_feedthrough`: the feedthroughs of the whole flight, whose share of the innovations counts as noise.
     """
 
     gradient: Float[Array, "parts unknowns"]
     information: Float[Array, "parts unknowns unknowns"]
     products: Float[Array, "parts channels lags"]
-    passed: Float[Array, "channels feedthroughs"]
+    noise_feedthrough: Float[Array, "channels feedthroughs"]
 
 
 class LocalModel(NamedTuple):

@@ -146,14 +146,14 @@ class Point(NamedTuple):
     """The unknowns at which a flight is filtered.
 
     - `parameters`: of all segments, or of each.
-    - `feedthrough`: what the input innovations explain of the innovations of the same samples. `passed`: feedthroughs
-      that were found before; what they explain counts as noise.
+    - `feedthrough`: what the input innovations explain of the innovations of the same samples.
+    - `noise_feedthrough`: feedthroughs that were found before; what they explain counts as noise.
     """
 
     parameters: Float[Array, "parameters *segments"]
     noise: LogNoise
     feedthrough: tuple[Float[Array, " channels *segments"], ...]
-    passed: tuple[Float[Array, " channels *segments"], ...]
+    noise_feedthrough: tuple[Float[Array, " channels *segments"], ...]
 
 
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
@@ -219,7 +219,7 @@ def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmente
 def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
-    parameters, noise, feedthrough, passed = at
+    parameters, noise, feedthrough, noise_feedthrough = at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
     levels = len(jax.tree.leaves(noise))
     unknowns = count + levels + len(feedthrough)
@@ -255,7 +255,7 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         each = (v * (k if k.ndim > 1 else k[:, None]) for v, k in zip(jnp.moveaxis(inputs, 1, 0), by, strict=True))
         return sum(each, jnp.zeros(observed.measured.shape, dtype=float))
 
-    fed = explained(feedthrough), jnp.square(explained(passed)), jnp.moveaxis(inputs, 2, 1)
+    fed = explained(feedthrough), jnp.square(explained(noise_feedthrough)), jnp.moveaxis(inputs, 2, 1)
     data = row, observed.counts, fed, forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 

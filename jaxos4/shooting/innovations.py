@@ -33,7 +33,7 @@ from .segments import Segments, observe_in_segments
 from .sums import Innovations, joined, placed
 
 SETTLING = 128
-"""After so many samples a filter has settled, by default."""
+"""After this many samples a filter has settled, by default."""
 
 
 class InnovationsProblem(AbstractProblem):
@@ -50,12 +50,12 @@ class InnovationsProblem(AbstractProblem):
     - `segments`: the number of parts of the flight that are filtered in parallel; by default one for about 384 samples.
       Short ones lose information, because a filter begins without memory. Padded flights with equal numbers of segments
       and equal room share a program.
-    - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
+    - `settling`: after this many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
     - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample, see
       `jaxos4.shooting.feedthrough`; by default nothing: the controller answers no measurement within its sample.
-    - `passed`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default: not known,
-      so that a search has two stages. The first finds them, the second counts them.
+    - `noise_feedthrough`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default:
+      not known, so that a search has two stages. The first finds them, the second counts them.
     - `noise_unknowns`: how the noise is looked for.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants.
     """
@@ -64,7 +64,7 @@ class InnovationsProblem(AbstractProblem):
     start: Values = eqx.field(converter=as_float)
     least_noise: Float[Array, " channels"] = eqx.field(converter=as_float)
     input_innovations: Float[Array, "samples feedthroughs 3"] = eqx.field(converter=as_float)
-    passed: Float[Array, "channels feedthroughs"] = eqx.field(converter=as_float)
+    noise_feedthrough: Float[Array, "channels feedthroughs"] = eqx.field(converter=as_float)
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
     noise_unknowns: NoiseUnknowns = eqx.field(static=True, default=NoiseUnknowns())
@@ -78,7 +78,7 @@ class InnovationsProblem(AbstractProblem):
         start: Float[ArrayLike, " unknowns"] | None = None,
         least_noise: Float[ArrayLike, " channels"] | None = None,
         input_innovations: Float[ArrayLike, "samples feedthroughs 3"] | None = None,
-        passed: Float[ArrayLike, "channels feedthroughs"] | None = None,
+        noise_feedthrough: Float[ArrayLike, "channels feedthroughs"] | None = None,
         noise_unknowns: NoiseUnknowns | None = None,
     ):
         if segments is None:
@@ -98,7 +98,7 @@ class InnovationsProblem(AbstractProblem):
                 f"`input_innovations` must have shape ({samples}, feedthroughs, 3), got {self.input_innovations.shape}."
             )
         unknown = np.full((channels, self.input_innovations.shape[1]), np.nan)
-        self.passed = as_float(unknown if passed is None else passed)
+        self.noise_feedthrough = as_float(unknown if noise_feedthrough is None else noise_feedthrough)
         self.noise_unknowns = NoiseUnknowns() if noise_unknowns is None else noise_unknowns
         unknowns = problem.unknowns.count + len(self._own) * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
@@ -132,7 +132,7 @@ class InnovationsProblem(AbstractProblem):
         return Window((self.flight.dt - length) / 2, length)
 
     @property
-    def cut(self) -> Segments:
+    def segmentation(self) -> Segments:
         """The samples of each segment."""
         room, length, each = self.flight.time.shape[0], self.problem.length, self._by_recording
         begins = np.zeros(1, int)
@@ -173,9 +173,9 @@ class InnovationsProblem(AbstractProblem):
         """The same problem, with another start."""
         return dataclasses.replace(self, start=start)
 
-    def passing(self, passed: Float[ArrayLike, "channels feedthroughs"]) -> "InnovationsProblem":
+    def with_noise_feedthrough(self, found: Float[ArrayLike, "channels feedthroughs"]) -> "InnovationsProblem":
         """The same problem, with what these feedthroughs explain counted as noise."""
-        return dataclasses.replace(self, passed=passed)
+        return dataclasses.replace(self, noise_feedthrough=found)
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> "InnovationsProblem":
         """See `AbstractProblem`. Only parameters can be fixed."""
@@ -200,17 +200,17 @@ class InnovationsProblem(AbstractProblem):
     @property
     def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """See `AbstractProblem`. `parts` are the segments."""
-        at, passed = self._local_model(), jnp.nan_to_num(self.passed)
-        return lambda unknowns: at(unknowns, passed)
+        at, noise_feedthrough = self._local_model(), jnp.nan_to_num(self.noise_feedthrough)
+        return lambda unknowns: at(unknowns, noise_feedthrough)
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The whole problem; in a second stage, what feedthroughs that were found before explain counts as noise."""
         del shares
-        number, at = 2 if self.passed.size else 1, self._local_model()
-        is_known = ~jnp.isnan(self.passed).any()
+        number, at = 2 if self.noise_feedthrough.size else 1, self._local_model()
+        is_known = ~jnp.isnan(self.noise_feedthrough).any()
 
         def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
-            found = jnp.where(is_known, self.passed, self._of_channels(before[0])[:, self._levels :])
+            found = jnp.where(is_known, self.noise_feedthrough, self._of_channels(before[0])[:, self._levels :])
             return at(unknowns, jnp.where(is_known | (stage > 0), found, 0.0))
 
         unknowns, none = self.unknowns, jnp.zeros(number, dtype=float)
@@ -228,18 +228,18 @@ class InnovationsProblem(AbstractProblem):
         )
 
     def _local_model(self) -> Callable[[WindowUnknowns, Float[Array, "channels feedthroughs"]], LocalModel]:
-        """`local_model` as a function of the unknowns and of `passed`."""
+        """`local_model` as a function of the unknowns and of `noise_feedthrough`."""
         unknowns, innovations = self.unknowns.usable, self._innovations()
         count, free = self.problem.unknowns.count, unknowns.free
         both, places = free & free[:, None], None
         if (each := self._by_recording) is not None:  # of the unknowns of each segment
             others = np.broadcast_to(np.arange(count, free.size), (self.segments, free.size - count))
-            places = jnp.concatenate([jnp.asarray(each.places)[self.cut.recording], others], axis=1)
+            places = jnp.concatenate([jnp.asarray(each.places)[self.segmentation.recording], others], axis=1)
 
-        def at(row: WindowUnknowns, passed: Float[Array, "channels feedthroughs"]) -> LocalModel:
+        def at(row: WindowUnknowns, noise_feedthrough: Float[Array, "channels feedthroughs"]) -> LocalModel:
             values = row[0]
             feedthrough = self._of_channels(values)[:, self._levels :]
-            found = innovations(values[:count], self.noise(values), feedthrough, passed)
+            found = innovations(values[:count], self.noise(values), feedthrough, noise_feedthrough)
             shared = found.gradient.shape[1] - len(self._own)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, shared)
             if places is not None:
@@ -248,7 +248,7 @@ class InnovationsProblem(AbstractProblem):
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
             slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
             whole = jnp.where(both, information.sum(axis=0), 0.0) + jnp.diag(unknowns.precision)
-            parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0), passed)
+            parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0), noise_feedthrough)
             return LocalModel(cost[None], found.feasible.all()[None], slope[None], whole[None], parts)
 
         return at
@@ -256,19 +256,20 @@ class InnovationsProblem(AbstractProblem):
     @property
     def _place(self) -> Int[Array, "segments time"]:
         """The samples of each segment; the last one instead of those that do not exist."""
-        return jnp.minimum(jnp.asarray(self.cut.place), self.flight.time.shape[0] - 1)
+        return jnp.minimum(jnp.asarray(self.segmentation.place), self.flight.time.shape[0] - 1)
 
     def observed(self) -> Observed:
         """The measurements in segments, see `observe_in_segments`."""
-        return observe_in_segments(self.problem, self.cut, self.settling)
+        return observe_in_segments(self.problem, self.segmentation, self.settling)
 
     def innovations(
         self, parameters: Parameters, noise: LogNoise, feedthrough: Float[Array, "channels feedthroughs"] | None = None
     ) -> Innovations:
         """The innovations of all segments, with derivatives in the parameters of its recording. `feedthrough`: or 0."""
         nothing = jnp.zeros((self.problem.columns.size, self.input_innovations.shape[-2]))
-        feedthrough, passed = nothing if feedthrough is None else feedthrough, jnp.nan_to_num(self.passed)
-        return self._innovations()(parameters, noise, feedthrough, passed)
+        feedthrough = nothing if feedthrough is None else feedthrough
+        noise_feedthrough = jnp.nan_to_num(self.noise_feedthrough)
+        return self._innovations()(parameters, noise, feedthrough, noise_feedthrough)
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
         """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
@@ -276,18 +277,18 @@ class InnovationsProblem(AbstractProblem):
         places = None
         if each is not None:
             problem = dataclasses.replace(problem, model=each.model)
-            places = jnp.asarray(each.places)[self.cut.recording].T
+            places = jnp.asarray(each.places)[self.segmentation.recording].T
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, problem.columns.size - inputs.shape[2]), (0, 0)))
-        fixed = self.cut.rows, self.flight.dt, self.window
+        fixed = self.segmentation.rows, self.flight.dt, self.window
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
-        def at(parameters: Parameters, noise: LogNoise, feedthrough: Array, passed: Array) -> Innovations:
+        def at(parameters: Parameters, noise: LogNoise, feedthrough: Array, noise_feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
             flight = Segmented(observed, inputs, forcing, tangents, *fixed)
-            point = Point(own, noise, tuple(feedthrough.T), tuple(passed.T))
+            point = Point(own, noise, tuple(feedthrough.T), tuple(noise_feedthrough.T))
             return innovate(functions, model.forcing_parameters, flight, point)
 
         return at

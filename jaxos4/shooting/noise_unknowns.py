@@ -97,7 +97,7 @@ class NoiseUnknowns(NamedTuple):
         return Unknowns(
             names=own.names + names,
             units=own.units + tuple("1" if name.startswith("log") else "rad/s" for name in names),
-            parameters=own.count,
+            parameter_count=own.count,
             prior=PROPER_PRIOR,
             center=jnp.concatenate([own.center, first.ravel()]),
             half_width=jnp.concatenate([own.half_width, 1 / jnp.sqrt(precision)]),

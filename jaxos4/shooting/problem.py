@@ -22,12 +22,12 @@ from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stages, U
 from .scans import (
     Length,
     Rows,
-    cut,
     each_window,
     first_measured,
     predict_window,
     shoot,
     shoot_with_derivatives,
+    window_samples,
     windowed,
     with_tangents,
 )
@@ -171,7 +171,7 @@ class ShootingProblem(AbstractProblem):
 
     def rows(self, parameters: Parameters | None = None) -> Rows:
         """The data of all windows for a scan, with the forcing at `parameters`, by default `model.alpha`."""
-        index, within = self.cut()
+        index, within = self.window_samples()
         forcing = windowed(self.forcing(self.model.alpha if parameters is None else parameters), index)
         measured = windowed(tuple(self.measured().T), index)
         return Rows(forcing, tuple(y if within.all() else jnp.where(within, y, jnp.nan) for y in measured))
@@ -182,7 +182,7 @@ class ShootingProblem(AbstractProblem):
 
     def forced_rows(self) -> Callable[[Parameters], Rows]:
         """`rows` with the derivatives of the forcing, for a loop: what depends on no parameter is made once."""
-        rows, inputs, index = self.rows(), self.flight.inputs, self.cut()[0]
+        rows, inputs, index = self.rows(), self.flight.inputs, self.window_samples()[0]
         places = self.model.forcing_parameters
 
         def forced(parameters: Parameters) -> Rows:
@@ -206,7 +206,7 @@ class ShootingProblem(AbstractProblem):
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
-        (index, within), sigma = self.cut(), self.sigma[order]
+        (index, within), sigma = self.window_samples(), self.sigma[order]
         states = jnp.where(within[:, :, None], self.measured()[index, : self.size], jnp.nan)
         value, is_first = first_measured(states)
         return value.ravel(), (3 * sigma + jnp.where(is_first, 0.0, _UNMEASURED[: self.size])).ravel()
@@ -234,7 +234,7 @@ class ShootingProblem(AbstractProblem):
     @eqx.filter_jit
     def predict(self, parameters: Parameters, initial_state: InitialStates) -> Float[Array, "samples columns"]:
         """The output of noise-free sensors, in the order of `columns`."""
-        _, within = self.cut()
+        _, within = self.window_samples()
 
         def predict(forcing: Forcing, start: InitialState) -> Float[Array, "length columns"]:
             return predict_window(self._advance, forcing, parameters, start, self.length)
@@ -329,9 +329,9 @@ class ShootingProblem(AbstractProblem):
         """The state one sample later, down to the same level of the cascade."""
         return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
 
-    def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+    def window_samples(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
         """The samples of each window, and which of them belong to it."""
-        return cut(self.flight.states.shape[-2], self.windows)
+        return window_samples(self.flight.states.shape[-2], self.windows)
 
     def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
         return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)

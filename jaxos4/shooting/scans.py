@@ -186,9 +186,9 @@ def _linearised_shot(
         return jnp.broadcast_to(leaf, tuple(lanes))
 
     at = unstack(initial_state), jax.tree.map(lambda leaf: along_lanes(leaf[0]), rows.forcing), scalars
-    cut, panels = panels_of(advance, at, forcing_parameters, free=initial_state_is_free)
+    first_late, panels = panels_of(advance, at, forcing_parameters, free=initial_state_is_free)
     # NumPy, so that they are constants of the program.
-    parameter_tangents = tuple(np.eye(count, cut, dtype=parameters.dtype))
+    parameter_tangents = tuple(np.eye(count, first_late, dtype=parameters.dtype))
 
     def step(carry: _Carried, row: Rows) -> _Carried:
         feasible = carry.shot.feasible & _is_feasible(carry.state)
@@ -203,7 +203,7 @@ def _linearised_shot(
         following, push, push_late, cost, pull, squares = shot() if repeated else computed_once(feasible, shot)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
-            nothing, positions = jnp.zeros((cut, *lanes), parameters.dtype), np.asarray(forcing_parameters)
+            nothing, positions = jnp.zeros((first_late, *lanes), parameters.dtype), np.asarray(forcing_parameters)
             wide = jax.tree.map(lambda slope: nothing.at[positions].set(slope), row.forcing_tangents)
             directions.insert(1, wide)
 
@@ -217,17 +217,18 @@ def _linearised_shot(
 
         gradient = [g - sum(map(operator.mul, pull, s)) for g, s in zip(carry.gradient, slopes, strict=True)]
         information = [
-            _added(blocks, panel, cut, squares, slopes) for panel, blocks in zip(panels, carry.panels, strict=True)
+            _added(blocks, panel, first_late, squares, slopes)
+            for panel, blocks in zip(panels, carry.panels, strict=True)
         ]
         return _Carried(following, tangent, late, Shot(carry.shot.cost + cost, feasible), gradient, information)
 
-    last = _fold(step, _before(initial_state, count, cut, panels), rows, length)
+    last = _fold(step, _before(initial_state, count, first_late, panels), rows, length)
     information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)
     return LocalModel(*last.shot, jnp.concatenate(last.gradient), symmetric(information))
 
 
-def _before(initial_state: Float[Array, "size *lanes"], count: int, cut: int, panels: list[Panel]) -> _Carried:
-    """The carry before the first sample, for `count` parameters, and `cut` unknowns with a `tangent`."""
+def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: int, panels: list[Panel]) -> _Carried:
+    """The carry before the first sample, for `count` parameters. The unknowns before `first_late` have a `tangent`."""
     (size, *lanes), unknowns, dtype = initial_state.shape, panels[-1][1], initial_state.dtype
     own = np.eye(size, unknowns, count, dtype=dtype).reshape(size, unknowns, *(1 for _ in lanes))
     tangents = jnp.broadcast_to(own, (size, unknowns, *lanes))
@@ -236,24 +237,24 @@ def _before(initial_state: Float[Array, "size *lanes"], count: int, cut: int, pa
         return jnp.zeros((*shape, *lanes), dtype=dtype)
 
     def blocks(top: int, end: int) -> list[Array]:
-        return [zeros(end - top, width) for width in ([end] if top < cut else [cut, end - cut])]
+        return [zeros(end - top, width) for width in ([end] if top < first_late else [first_late, end - first_late])]
 
     return _Carried(
         state=unstack(initial_state),
-        tangent=unstack(tangents[:, :cut]),
-        late=unstack(tangents[:, cut:]).translation if cut < unknowns else None,
+        tangent=unstack(tangents[:, :first_late]),
+        late=unstack(tangents[:, first_late:]).translation if first_late < unknowns else None,
         shot=Shot(zeros(), jnp.ones(tuple(lanes), dtype=bool)),
-        gradient=[zeros(width) for width in (cut, unknowns - cut) if width],
+        gradient=[zeros(width) for width in (first_late, unknowns - first_late) if width],
         panels=[blocks(top, end) for top, end, _ in panels],
     )
 
 
 def _added(
-    blocks: list[Array], panel: Panel, cut: int, squares: list[Lanes], slopes: list[tuple[Array, ...]]
+    blocks: list[Array], panel: Panel, first_late: int, squares: list[Lanes], slopes: list[tuple[Array, ...]]
 ) -> list[Array]:
     """The rows of a panel with those of one sample."""
     (top, end, outputs), late = panel, len(blocks) - 1
-    own = slice(top - cut * late, end - cut * late)
+    own = slice(top - first_late * late, end - first_late * late)
     rows = [(i, (squares[i] * slopes[late][i][own])[:, None]) for i in outputs]
     return [b + sum(row * s[i][: b.shape[1]] for i, row in rows) for b, s in zip(blocks, slopes, strict=False)]
 
@@ -306,7 +307,9 @@ def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
 
 
-def cut(samples: int, windows: int) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+def window_samples(
+    samples: int, windows: int
+) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
     """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
     ends = np.arange(windows + 1) * samples // windows
     index = ends[:-1, None] + np.arange(np.diff(ends).max())

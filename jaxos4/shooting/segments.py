@@ -41,7 +41,7 @@ class Segments(NamedTuple):
 
     @classmethod
     def of(cls, number: int, capacity: int, edges: Int[Numeric, " edges"], settling: int) -> "Segments":
-        """At most so many segments, more than there are recordings if these are several.
+        """At most this many segments, more than there are recordings if these are several.
 
         `capacity`: the room for samples. `edges`: the first sample of each recording, and the end of the last.
         """

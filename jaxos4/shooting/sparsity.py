@@ -36,7 +36,7 @@ def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results
 def panels_of(
     advance: Callable, at: tuple[Any, Any, tuple], forcing_parameters: tuple[int, ...], *, free: bool
 ) -> tuple[int, list[Panel]]:
-    """The number of unknowns up to the last one that acts on rates or attitude; and the panels of all rows.
+    """The place of the first unknown after those that act on rates or attitude; and the panels of all rows.
 
     - `advance`: from a state, forcing and parameters, which are `at`, to the next state and the outputs.
     - `free`: whether the initial state is unknown too. Its leaves then follow the parameters.
@@ -50,12 +50,12 @@ def panels_of(
     for _ in range(size):  # an effect reaches the last state after at most `size` samples
         reached = reached | (leaves @ np.concatenate([reached, given]))[:size]
     acting, panels = (leaves @ np.concatenate([reached, given]))[size:], []
-    cut = max(count, *(np.flatnonzero(reached[: CHANNELS["attitude"]].any(axis=0)) + 1).tolist())
+    first_late = max(count, *(np.flatnonzero(reached[: CHANNELS["attitude"]].any(axis=0)) + 1).tolist())
     for row, outputs in enumerate(tuple(np.flatnonzero(column).tolist()) for column in acting.T):
         top, _, before = panels[-1] if panels else (row, row, ())
-        joined = before == outputs and row - top < _ROWS and row != cut
+        joined = before == outputs and row - top < _ROWS and row != first_late
         panels = [*panels[:-1], (top, row + 1, outputs)] if joined else [*panels, (row, row + 1, outputs)]
-    return cut, panels
+    return first_late, panels
 
 
 def symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *lanes"]:

@@ -43,19 +43,19 @@ def likelihood(
     feasible: Bool[Array, " segments"],
     errors: Series,
     slopes: Float[Array, "time channels unknowns segments"],
-    passed: Series,
+    feedthrough_squares: Series,
     noise: slice,
 ) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
     """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations.
 
-    `passed`: the squares of what feedthroughs explain, which the noise made too. `noise`: the places of the noise among
-    the unknowns.
+    `feedthrough_squares`: the squares of what feedthroughs explain, which the noise made too. `noise`: the places of
+    the noise among the unknowns.
     """
     weight = jnp.where(counts, 1 / variance, 0.0)
     logarithm = jnp.where(counts, jnp.log(variance), 0.0)
     relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, levels, segments)
     gradient = jnp.einsum("tcul,tcl->cul", slopes, weight * errors)
-    squares = errors**2 + passed
+    squares = errors**2 + feedthrough_squares
     surprise = (weight > 0) * (1 - weight * squares) / 2
     gradient = gradient.at[:, noise].add(jnp.einsum("tcul,tcl->cul", relative, surprise))
     information = jnp.einsum("tcul,tcvl->cuvl", slopes * weight[:, :, None], slopes)

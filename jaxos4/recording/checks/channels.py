@@ -73,7 +73,7 @@ def clipped_values(evidence: Evidence) -> Finding | None:
         "clipped_values",
         "a sensor is clipped at the end of its range; these values count as not measured",
         ", ".join(each),
-        "fly gentler, or set a larger range of the sensor",
+        "fly more gently, or set a larger range of the sensor",
         tuple(dict.fromkeys(quantity for name in found for quantity in _CLIPPED.get(name, ()))),
         many,
     )

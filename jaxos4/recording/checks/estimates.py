@@ -155,7 +155,7 @@ def interpolated(
 
 
 def _sums(angle: np.ndarray, gyro: np.ndarray, length: int) -> list[np.ndarray]:
-    """Products of the turns in each batch of so many samples, for each shift: (shifts, gyro and angle, gyro and angle).
+    """Products of the turns in each batch of `length` samples, by shift: (shifts, gyro and angle, gyro and angle).
 
     Constant errors of the gyro are subtracted.
     """

@@ -50,7 +50,7 @@ class Finding(msgspec.Struct, frozen=True):
 class Limits(msgspec.Struct, frozen=True):
     """Limits of the checks. A difference is a finding if it exceeds chance, and if it is large enough to matter.
 
-    - `standard_errors`: chance reaches so many of its standard errors in one of 2,000 comparisons, because the standard
+    - `standard_errors`: chance reaches this many of its standard errors in one of 2,000 comparisons, because these
       errors are those of a dozen batches of the flight.
     - `kinematics`: the same for the comparison of two causes, both of which are named if neither is clear.
     - `scale`: of attitude against gyro, relative. Inertias are wrong by the scale of the gyro.
