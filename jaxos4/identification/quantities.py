@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import AXES
-from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from ..models.abstract import PARAMETER_NAMES
 from ..results import NINETY_FIVE
 from .answers import Answer
 from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
@@ -33,24 +33,25 @@ def vehicle_quantities(
         else:
             half, condition = NINETY_FIVE * row.std, f", {row.note}" if row.note else ""
             value = f"{row.estimate:.4g} +- {half:.2g} {row.unit} (95 %){condition}"
-            notes = _notes(model, {alpha: table[alpha]}, shares)
+            notes = _notes(answer, {alpha: table[alpha]}, shares)
             found[axis.inertia] = Quantity(value, half / row.estimate, reservations=notes)
     for quantity, names in model.quantities.items():
         unseen = [name for name in names if name in answer.fixed and answer.fixed[name].note == PRIOR_NOTE]
         which = f"the flights say less about {', '.join(unseen)} than the bracket; fly with more motion"
         rows = {name: table[name] for name in names if name in table}
-        reservations = ((which,) if unseen else ()) + _notes(model, rows, shares)
+        reservations = ((which,) if unseen else ()) + _notes(answer, rows, shares)
         found[quantity] = Quantity("", 0.0, "" if rows else which, reservations)
     return found | {PREDICTIONS: prediction_horizons(skill, still)}
 
 
-def _notes(model: AbstractModel, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:
+def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:
     """Notes on parameters that rest on a bracket, lie outside it, or are at their limit."""
-    found, of_airframe = [], {each.name for each in model.parameters if each.scales_torque or callable(each.center)}
+    parameters = answer.problem.model.parameters
+    found, of_airframe = [], {each.name for each in parameters if each.scales_torque or callable(each.center)}
     for name, row in rows.items():
-        if "came out negative" in row.note:
+        if name in answer.negative:
             found.append(f"{name} came out negative, which is impossible")
-        if "outside its bracket" in row.note:
+        elif row.is_outside_bracket:
             # Only an airframe that has such a constant can be wrong about it.
             check = "check the airframe, or " if name in (*PARAMETER_NAMES, *of_airframe) else ""
             found.append(f"{name} is outside its bracket; {check}give a wider `bracket`")

@@ -57,6 +57,14 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     noise_limit: float | None | msgspec.UnsetType = msgspec.UNSET
     bracket: tuple[float, float] | None | msgspec.UnsetType = msgspec.UNSET
 
+    @property
+    def is_outside_bracket(self) -> bool:
+        """Whether the estimate lies outside the bracket, if there are both."""
+        if self.estimate is None or not isinstance(self.bracket, tuple):
+            return False
+        lower, upper = self.bracket
+        return not lower <= self.estimate <= upper
+
 
 class Constant(msgspec.Struct, frozen=True):
     """A physical constant that follows from the parameters. `note`: what of the airframe must be right (vehicle)."""
