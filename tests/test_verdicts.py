@@ -259,7 +259,7 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
 
 
 def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
-    row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "outside its bracket")
+    row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
     table = dict.fromkeys(("alpha3", "alpha6", "thrust_gain", "rotor_delay"), row)
     constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy")}
     said = vehicle_quantities(fitted[1].answer, table, constants, None, [])
