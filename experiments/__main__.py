@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -58,17 +58,17 @@ def run(name: str, arguments: list[str]) -> None:
         RECORDER.publish(result, command, machine())
 
 
-def commands(names: Sequence[str], folder: Path = FOLDER) -> dict[str, list[str]]:
+def commands(names: list[str], folder: Path = FOLDER) -> dict[str, list[str]]:
     """The arguments that compute published results once more, by their names; `all`: every result.
 
     A script that finds its `--out` file continues it: remove the file first.
     """
     every = sorted(path.stem for path in folder.glob("*.json"))
-    chosen = every if list(names) == ["all"] else names
+    chosen = every if names == ["all"] else names
     return {name: [*shlex.split(read(name, folder).command), "--publish", name] for name in chosen}
 
 
-def again(names: Sequence[str]) -> None:
+def again(names: list[str]) -> None:
     """Computes published results once more, each in a process of its own."""
     for name, arguments in commands(names).items():
         begin = time.perf_counter()

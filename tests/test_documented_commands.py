@@ -11,7 +11,7 @@ from helpers import ROOT, blocks
 from small_experiments import load
 from typer.main import get_command
 
-from experiments.__main__ import scripts
+from experiments.__main__ import again, published, render, scripts
 from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.airframe import airframe_table
 from jaxos4.cli import app
@@ -67,9 +67,11 @@ def parser(line: str):
     program, *words = shlex.split(line.removeprefix("python -m "))
     if program == "jaxos4":
         return COMMANDS[words[0]], words[1:]
-    assert words[0] in (*scripts(), "render")
+    own = {"render": render, "again": again}
+    assert words[0] in (*scripts(), *own)
+    published(words)
     script = typer.Typer()
-    script.command()(load(*words[0].split(".")).main if words[0] != "render" else lambda: None)
+    script.command()(own.get(words[0]) or load(*words[0].split(".")).main)
     return get_command(script), words[1:]
 
 
