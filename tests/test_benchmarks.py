@@ -8,7 +8,7 @@ from small_experiments import load, plot, result_of
 from experiments.benchmarks.case import ALL, RATES, costs
 from experiments.benchmarks.contenders import FITS, KINDS, REFERENCE_SHOT, SHOTS
 from experiments.benchmarks.opponents import c_fit, c_shots
-from experiments.benchmarks.opponents.c_library import compiler
+from experiments.benchmarks.opponents.c_library import FAST, compiled, compiler
 from experiments.benchmarks.opponents.residuals import Residuals
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
@@ -51,6 +51,13 @@ def test_a_benchmark_skips_who_is_missing_or_fails_and_times_only_who_reaches_th
         "diverged": {"parameters": 1e3 * truth, "first": first},
     }
     assert list(run.reached(case, answers).values()) == [1.0, 0.5, 1.0, 0.0]
+
+
+@in_c
+def test_opponents_in_c_leave_the_arithmetic_of_the_process_alone():
+    """A library that is linked with `-ffast-math` would round this quotient to 0 from now on."""
+    compiled("fits.c", *FAST, "-DLANES=4")
+    assert np.float64(1e-308) / 1e3 > 0
 
 
 @in_c

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 COMPILERS = ("cc", "gcc", "clang")
-FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+FLAGS = ("-O3", "-march=native", "-fPIC")
 # Loops over lanes become vector instructions; numbers that are not finite stay what they are.
 FAST = ("-ffast-math", "-fno-finite-math-only", "-fopenmp-simd")
 # The order of the states in `lanes.h`: p, q, r, phi, theta, psi, vx, vy, vz, x, y, z.
@@ -24,11 +24,16 @@ def compiler() -> str | None:
 
 @functools.cache
 def compiled(source: str, *flags: str) -> ctypes.CDLL:
-    """The library of a C file of this folder."""
+    """The library of a C file of this folder.
+
+    It is linked without the flags: a library that is linked with `-ffast-math` makes the whole process that loads it
+    round numbers below 2e-308 to 0.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "opponent.so"
+        object_file, library = Path(folder) / "opponent.o", Path(folder) / "opponent.so"
         path = Path(__file__).with_name(source)
-        subprocess.run([str(compiler()), *FLAGS, *flags, str(path), "-o", str(library), "-lm"], check=True)
+        subprocess.run([str(compiler()), *FLAGS, *flags, "-c", str(path), "-o", str(object_file)], check=True)
+        subprocess.run([str(compiler()), "-shared", str(object_file), "-o", str(library), "-lm"], check=True)
         return ctypes.CDLL(str(library))
 
 
