@@ -179,8 +179,7 @@ def _linearised_shot(
 
     Rows and weights that all lanes share have a last axis of 1.
     """
-    count, *lanes = parameters.shape
-    scalars = tuple(parameters)
+    (count, *lanes), scalars = parameters.shape, tuple(parameters)
 
     def along_lanes(leaf: Array) -> Array:
         return jnp.broadcast_to(leaf, tuple(lanes))
