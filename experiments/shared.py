@@ -156,6 +156,11 @@ def many_times(bracket: Bracket, flights: int) -> Bracket:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), bracket)
 
 
+def flight_keys(seed: int, flights: int) -> Keys[Array, "2 flights"]:
+    """The random keys of the noise and of the brackets of flights."""
+    return jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+
+
 def fit_noisy(
     estimator: AbstractEstimator, problem: ShootingProblem, flights: int, seed: int, noise: AbstractNoise | None = None
 ) -> tuple[Estimate, float]:
@@ -164,7 +169,7 @@ def fit_noisy(
     `problem`: by `standard_problem`. `noise`: by default white, as large as the problem says. A second call takes the
     time without that of compiling.
     """
-    keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+    keys = flight_keys(seed, flights)
     brackets = brackets_around(problem.model, keys[1])
 
     def part(some: slice) -> Estimate:

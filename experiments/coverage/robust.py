@@ -12,8 +12,8 @@ import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import print_table
-from experiments.shared import PARAMETERS, fit_noisy, measure, standard_problem
+from experiments.monte_carlo import covered_error, print_table
+from experiments.shared import PARAMETERS, fit_noisy, flight_keys, measure, standard_problem
 from jaxos4.analysis.evaluation import evaluate, robust_covariance
 from jaxos4.noise import NOISES
 from jaxos4.results import NINETY_FIVE
@@ -27,13 +27,12 @@ def main(
     problem = standard_problem(jaxos4.PublishedOS4(jaxos4.OS4))
     noise = NOISES["coloured"](jaxos4.SENSOR_SIGMA)
     found, _ = fit_noisy(jaxos4.IBSS(), problem, flights, seed, noise)
-    keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
 
     def deviations(parameters: jax.Array, states: jax.Array) -> np.ndarray:
         flown = eqx.tree_at(lambda p: p.flight.states, problem, states)
         return np.sqrt(np.diagonal(robust_covariance(evaluate(flown, parameters))))
 
-    states = measure(noise, problem.flight, keys[0])
+    states = measure(noise, problem.flight, flight_keys(seed, flights)[0])
     robust = np.stack([deviations(*one) for one in zip(found.parameters, states, strict=True)])
     error = np.abs(np.asarray(found.parameters - problem.model.alpha))
     rows = [
@@ -41,6 +40,6 @@ def main(
         for name, std in (("Cramer-Rao bound", np.asarray(found.std)), ("sandwich", robust))
         for held in [error < NINETY_FIVE * std]
     ]
-    chance = 100 * np.sqrt(0.05 * 0.95 / flights)
+    chance = 100 * covered_error(0.95, flights)
     title = f"95 % intervals that hold [%], {flights} flights, Monte-Carlo error {chance:.1g} %"
     print_table(title, ("covariance", *PARAMETERS, "all"), rows)

@@ -8,6 +8,7 @@ inertia are those of the next longer samples with an answer, within two standard
 If there is none: the shortest without vibration. If all have it: the longest with an answer.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -77,10 +78,10 @@ def start_of(likelihood: InnovationsProblem, found: Estimate) -> Float[np.ndarra
 def chosen_place(rows: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `rows`: the shortest sample time first."""
     answered = [i for i, row in enumerate(rows) if row.constants] or [0]
-    longer = dict(zip(answered, (rows[i] for i in answered[1:]), strict=False))
+    longer = dict(itertools.pairwise(answered))
     limits = [RULE.white + RULE.chance / math.sqrt(max(row.samples, 1)) for row in rows]
     clean = [i for i in answered if abs(rows[i].correlation) <= limits[i]] or answered[-1:]
-    return next((i for i in clean[:-1] if _agree(rows[i], longer[i])), clean[0])
+    return next((i for i in clean[:-1] if _agree(rows[i], rows[longer[i]])), clean[0])
 
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:

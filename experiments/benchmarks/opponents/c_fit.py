@@ -5,6 +5,7 @@ promises to lower the cost by less than `TOLERANCE`; it takes this step.
 """
 
 import ctypes
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -52,7 +53,7 @@ def levenberg_marquardt(case: Case, *, lanes: int, cores: int = 1) -> Callable[[
         fits(case.known, ctypes.byref(data), COARSE, TOLERANCE)
 
     edges = np.linspace(0, case.flights, cores + 1).astype(int)
-    parts = [slice(*pair) for pair in zip(edges, edges[1:], strict=False) if pair[0] < pair[1]]
+    parts = [slice(*pair) for pair in itertools.pairwise(edges) if pair[0] < pair[1]]
 
     def run() -> dict:
         found[:] = 0.0

@@ -84,7 +84,7 @@ def constant_force(evidence: Evidence) -> Finding | None:
     force = evidence.logged.specific_force
     measured = np.empty(0) if force is None else force[np.isfinite(force[:, 2]), 2]
     squares = np.square(evidence.logged.omega).sum(axis=1)
-    if len(set(measured.tolist())) != 1 or squares.std() < evidence.limits.thrust_moves * squares.mean():
+    if not measured.size or np.ptp(measured) > 0 or squares.std() < evidence.limits.thrust_moves * squares.mean():
         return None
     return Finding(
         "constant_force",
