@@ -65,6 +65,7 @@ class Airframe(eqx.Module):
     - `gravity`: g [m/s^2].
     - `max_rotor_speed`: full-scale rotor speed [rad/s]; infinite if unknown.
     - `sensor_rotation`: roll, pitch and yaw of the gyro and the accelerometer in the body [deg]; see `sensor_axes`.
+    - `guessed`: the names of the constants that are guesses; see `load_airframe`.
     """
 
     mass: Float[Numeric, ""] = eqx.field(converter=as_constant)
@@ -77,6 +78,12 @@ class Airframe(eqx.Module):
     gravity: Float[Numeric, ""] = eqx.field(converter=as_constant, default=GRAVITY)
     max_rotor_speed: Float[Numeric, ""] = eqx.field(converter=as_constant, default=math.inf)
     sensor_rotation: Float[Numeric, "3"] = eqx.field(converter=as_constant, default=(0.0, 0.0, 0.0))
+    guessed: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def guesses_drag(self) -> bool:
+        """Whether `drag_coefficient` is a guess. Then an estimate of Iz is proportional to this guess."""
+        return "drag_coefficient" in self.guessed
 
     @property
     def sensor_axes(self) -> Float[Numeric, "3 3"]:
@@ -129,8 +136,10 @@ def plus_layout(arm: float) -> list[tuple[float, float]]:
     return [(arm, 0.0), (0.0, -arm), (-arm, 0.0), (0.0, arm)]
 
 
-def _preset(arm: float, mass: float, inertia: tuple[float, ...], b: float, d: float, rotor: float, **more: float):
-    return Airframe(mass, inertia, plus_layout(arm), ALTERNATING_SPINS, b, d, rotor, **more)
+def _preset(
+    arm: float, mass: float, inertia: tuple[float, ...], b: float, d: float, rotor: float, gravity: float = GRAVITY
+) -> Airframe:
+    return Airframe(mass, inertia, plus_layout(arm), ALTERNATING_SPINS, b, d, rotor, gravity)
 
 
 # Table 1 of the paper is not available to us. These values are from public literature and code: the OS4 thesis, the
@@ -167,7 +176,7 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
     `inertia`, `drag_coefficient` and `rotor_inertia` can be `"guess"`, good enough to begin a search: with the mass m
     and the root mean square distance r of the rotors from the centre, m r^2 [0.3, 0.3, 0.5], 0.1 r times the thrust
-    coefficient, and 0.001 m r^2.
+    coefficient, and 0.001 m r^2. `guessed`, a list of names, marks numbers that are guesses of this kind.
 
     **Raises:** `InputError` with one line that names the wrong key; `OSError` if the file cannot be read.
     """
@@ -184,8 +193,10 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
 
 _VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,), "sensor_rotation": (3,)}
-_SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
-_REQUIRED = tuple(field.name for field in fields(Airframe) if field.default is MISSING)
+_GUESSED = "guessed"
+_CONSTANTS = [field for field in fields(Airframe) if field.name != _GUESSED]
+_SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in _CONSTANTS}
+_REQUIRED = tuple(field.name for field in _CONSTANTS if field.default is MISSING)
 _REPLACES = {"arm": "rotor_positions", "hover_speed": "thrust_coefficient"}
 _GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
 # The least and the largest value, if they are not those of the other constants.
@@ -205,9 +216,12 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
         are, them = ("is", "it") if len(missing) == 1 else ("are", "them")
         instead = " (`hover_speed` can replace `thrust_coefficient`)" if "thrust_coefficient" in missing else ""
         raise InputError(f"{listed} {are} missing; write {them} into the airframe, in SI units{instead}.")
-    keys = (*_REPLACES, *_SHAPES)
+    keys = (*_REPLACES, *_SHAPES, _GUESSED)
     if unknown := [name for name in table if name not in keys]:
         raise InputError(f"`{unknown[0]}` is not a known key; the keys are {', '.join(keys)}.")
+    noted = table.pop(_GUESSED, [])
+    if not isinstance(noted, list) or not all(isinstance(name, str) and name in _GUESSABLE for name in noted):
+        raise InputError(f"`{_GUESSED}` must be a list of some of {', '.join(_GUESSABLE)}.")
     guessed = [name for name in _GUESSABLE if isinstance(table[name], str) and table[name] == GUESS]
     constants = {name: _numbers(name, value) for name, value in table.items() if name not in guessed}
     if "arm" in constants:
@@ -221,7 +235,8 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
         "drag_coefficient": constants["thrust_coefficient"] * np.sqrt(square) * 0.1,
         "rotor_inertia": constants["mass"] * square * 1e-3,
     }
-    airframe = Airframe(**constants | {name: guesses[name] for name in guessed})
+    all_guessed = tuple(name for name in _GUESSABLE if name in (*guessed, *noted))
+    airframe = Airframe(**constants | {name: guesses[name] for name in guessed}, guessed=all_guessed)
     inertia, mixer = np.asarray(airframe.inertia), np.asarray(airframe.mixer)
     if 2 * inertia.max() > inertia.sum():
         raise InputError(
@@ -238,7 +253,8 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
 def airframe_table(airframe: Airframe) -> dict[str, Any]:
     """The constants of an airframe as numbers and lists: the inverse of `airframe_from_table`."""
     table = {name: np.asarray(getattr(airframe, name)) for name in _SHAPES}
-    return {name: value.tolist() for name, value in table.items() if np.isfinite(value).all()}
+    constants = {name: value.tolist() for name, value in table.items() if np.isfinite(value).all()}
+    return constants | ({_GUESSED: list(airframe.guessed)} if airframe.guessed else {})
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:

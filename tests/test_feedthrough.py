@@ -1,4 +1,4 @@
-"""The answer of a controller within a sample: input innovations, and the likelihood given them."""
+"""What the torque tells that the log does not: input innovations, and the likelihood given them."""
 
 import equinox as eqx
 import jax
@@ -49,9 +49,10 @@ def test_innovations_are_what_the_past_does_not_tell(rng):
     found = input_innovations(torque, rates, np.zeros(SAMPLES, int), DT)
     assert found.shape == (SAMPLES, FEEDTHROUGHS, 3)
     assert not found[:10].any()
-    for axis in range(3):
-        own = found[10:, :, axis]
-        np.testing.assert_allclose(own.T @ own / len(own), np.eye(FEEDTHROUGHS), atol=1e-9)
+    assert not found[:, 1, 2].any()  # one about yaw
+    for axis, count in enumerate((2, 2, 1)):
+        own = found[10:, :count, axis]
+        np.testing.assert_allclose(own.T @ own / len(own), np.eye(count), atol=1e-9)
         for lag in range(1, 11):
             past = np.column_stack([torque[10 - lag : SAMPLES - lag, :, axis], rates[10 - lag : SAMPLES - lag, axis]])
             np.testing.assert_allclose(own.T @ past / len(own), 0.0, atol=1e-9)
@@ -74,38 +75,45 @@ def test_a_flight_that_is_too_short_has_none(rng, samples):
     assert not input_innovations(torque[:samples], rates[:samples], np.zeros(samples, int), DT).any()
 
 
-def standard(rng, *, passed):
-    """The standard flight with noise, and input innovations of `passed` feedthroughs."""
+def standard(rng, *, passed, segments=2):
+    """The standard flight with noise, and `passed` input innovations about each axis."""
     model = jaxos4.PublishedOS4()
     omega = jaxos4.multisine(model.airframe, duration=3.0, dt=DT)
     flight = jaxos4.simulate(model, model.alpha, omega, dt=DT)
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
     problem = jaxos4.ShootingProblem(model, noisy, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
     innovations = rng.normal(size=(len(omega), passed, 3))
-    return InnovationsProblem(problem, segments=2, settling=50, input_innovations=innovations)
+    return InnovationsProblem(problem, segments=segments, settling=50, input_innovations=innovations)
+
+
+# Without gyroscopic torques a channel's noise changes no other channel, and rates are integrals.
+UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 
 
 def test_the_likelihood_compares_innovations_less_the_feedthrough(rng):
-    """The cost is quadratic in the feedthrough, and its derivatives are those of finite differences."""
+    """The cost is quadratic in what input innovations explain; its derivatives are those of finite differences."""
     problem = standard(rng, passed=2)
-    # Without gyroscopic torques a channel's noise changes no other channel.
-    names, parameters = problem.unknowns.names, jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
-    assert names[8:13] == ("log_p_strength", "log_p_time", "log_p_sensor", "p_feedthrough_1", "p_feedthrough_2")
-    own = jnp.concatenate([jnp.stack(NOISE[:3], axis=1), 0.01 * jnp.arange(6.0).reshape(3, 2)], axis=1)
-    values = jnp.concatenate([parameters, own.ravel()])
+    names = problem.unknowns.names
+    assert names[8:11] == ("log_p_strength", "log_p_time", "log_p_sensor")
+    assert names[11:17] == tuple(
+        f"p_{of}_{i}" for of in ("rate_gain", "disturbance_gain", "feedthrough") for i in (1, 2)
+    )
+    own = jnp.concatenate([jnp.stack(NOISE[:3], axis=1), 0.01 * jnp.arange(18.0).reshape(3, 6)], axis=1)
+    values = jnp.concatenate([UNCOUPLED, own.ravel()])
 
     @eqx.filter_jit
     def at(values):
         return problem.local_model(values[None])
 
     found, step = at(values), 1e-4
-    for name in ("p_feedthrough_2", "r_feedthrough_1", "alpha3", "log_q_sensor"):
+    explaining = ("p_feedthrough_2", "r_feedthrough_1", "q_rate_gain_1", "p_rate_gain_2", "r_disturbance_gain_2")
+    for name in (*explaining, "alpha3", "log_q_sensor"):
         place = names.index(name)
         change = step * (abs(float(values[place])) + 0.01)
         up, down = (at(values.at[place].add(sign * change)) for sign in (1, -1))
         slope = (up.cost - down.cost) / (2 * change)
         np.testing.assert_allclose(found.gradient[0, place], slope[0], rtol=1e-5, atol=1e-6)
-        if "feedthrough" in name:
+        if name in explaining:
             second = (up.cost - 2 * found.cost + down.cost) / change**2
             np.testing.assert_allclose(found.information[0, place, place], second[0], rtol=1e-3)
 
@@ -113,12 +121,45 @@ def test_the_likelihood_compares_innovations_less_the_feedthrough(rng):
 @pytest.mark.slow
 def test_the_filter_does_not_depend_on_the_feedthrough(rng):
     """Only what is compared does: innovations are e - k v, with e those without feedthrough."""
-    problem, k = standard(rng, passed=1), jnp.array([[0.01], [0.02], [-0.03]])
+    problem, k = standard(rng, passed=1), jnp.array([0, 0, 1])[:, None, None] * jnp.array([[0.01], [0.02], [-0.03]])
     parameters = problem.model.alpha
     cost = eqx.filter_jit(lambda passed: problem.innovations(parameters, NOISE, passed).cost.sum())
     one, none, other, twice, opposite = (float(cost(size * k)) for size in (1, 0, -1, 2, -2))
     # The squares of e - k v and e + k v have the same mean as those of e, and of k v, which add up.
     np.testing.assert_allclose(twice + opposite - 2 * none, 4 * (one + other - 2 * none), rtol=1e-9)
+
+
+def test_gains_correct_the_estimates_of_rate_and_disturbance(rng):
+    """Rates that change by what the torque tells have the likelihood of the rates without these changes."""
+    problem, dt = standard(rng, passed=1, segments=1), DT
+    told = np.asarray(problem.input_innovations)[:, 0]  # (samples, rates)
+    kept = np.exp(-dt / np.exp(np.asarray(NOISE.time_constant)))
+    reach = np.exp(np.asarray(NOISE.time_constant)) * (1 - kept)
+    gains = 0.02 * np.array([1.0, -2.0, 3.0]), 0.5 * np.array([-1.0, 2.0, 1.0])
+    moved, rate, disturbance = np.zeros_like(told), np.zeros(3), np.zeros(3)
+    for k in range(len(told) - 1):
+        rate = rate + reach * disturbance + gains[0] * told[k]
+        disturbance = kept * disturbance + gains[1] * told[k]
+        moved[k + 1] = rate
+    flight = problem.flight
+    states = flight.states.at[:, 6 + np.array([1, 3, 5])].add(moved)
+    other = eqx.tree_at(lambda p: p.problem.flight.states, problem, states)
+    by_input = jnp.stack([*map(jnp.asarray, gains), jnp.zeros(3)])[..., None]
+    cost = eqx.filter_jit(lambda problem, by_input: problem.innovations(UNCOUPLED, NOISE, by_input).cost.sum())
+    np.testing.assert_allclose(cost(other, by_input), cost(problem, jnp.zeros_like(by_input)), rtol=1e-9)
+    assert cost(other, jnp.zeros_like(by_input)) > cost(problem, jnp.zeros_like(by_input)) + 10
+
+
+def test_without_answers_within_a_sample_feedthroughs_are_fixed_and_gains_are_free(rng):
+    problem = standard(rng, passed=1)
+    late = InnovationsProblem(
+        problem.problem, segments=2, settling=50, input_innovations=problem.input_innovations, answers_within=False
+    )
+    for each, is_free in ((problem, True), (late, False)):
+        free = dict(zip(each.unknowns.names, np.asarray(each.unknowns.free), strict=True))
+        assert free["p_feedthrough_1"] == is_free
+        assert free["p_rate_gain_1"]
+        assert free["r_disturbance_gain_1"]
 
 
 def test_input_innovations_must_fit_the_flight(rng):
@@ -142,17 +183,18 @@ def test_a_search_counts_as_noise_what_the_feedthroughs_that_it_found_explain(rn
     assert search(problem.with_noise_feedthrough(nothing)).cost < found.cost
 
 
-def test_a_log_that_holds_every_run_of_the_controller_has_no_feedthrough():
-    """No torque before an instant answers what is measured at it. Means, and slower logs, hold such answers."""
+def test_no_torque_before_an_instant_answers_what_is_measured_at_it():
+    """Means, and slower logs, hold such answers."""
     flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0), duration=16.0, seed=0)
     (every,), slow = as_recordings(flight), as_recordings(flight)[0].rows(slice(None, None, 2))
     own, longer = prepare_vehicle([every], CINERAT, jaxos4.VehicleSettings()).data[:2]
     slower = prepare_vehicle([slow], CINERAT, jaxos4.VehicleSettings()).data[0]
-    assert not np.asarray(own.likelihood.input_innovations).any()
-    assert np.asarray(longer.likelihood.input_innovations).any()
-    assert np.asarray(slower.likelihood.input_innovations).any()
+    assert not own.likelihood.answers_within
+    assert longer.likelihood.answers_within
+    assert slower.likelihood.answers_within
     assert float(slower.problem.flight.averaging_time) == 0.0
-    assert own.likelihood.input_innovations.shape == longer.likelihood.input_innovations.shape  # they share a program
+    # They share a program.
+    assert own.likelihood.input_innovations.shape == longer.likelihood.input_innovations.shape
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ class ResponseSettings(NamedTuple):
     - `resolution`, `highest`: how far apart frequencies are, and the highest [Hz]: few vehicles move faster.
     - `memory`: of the regression [s], as long as the flight controller's answer. A longer one finds the same, less
       precisely. `fewest_lags`: of a memory that is shorter than this in samples.
+    - `answer`: for this long [s], rotors and controller show what the controller knows and the log does not.
     - `samples`: the regression needs this many for each of its coefficients.
     - `low`, `high`: the band in which the model is compared [Hz].
     - `unclear`: the standard deviation of a gain, as a share of the model's, from which on the gain does not count.
@@ -35,6 +36,7 @@ class ResponseSettings(NamedTuple):
     highest: float = 40.0
     memory: float = 0.1
     fewest_lags: int = 4
+    answer: float = 0.016
     samples: int = 8
     low: float = 4.0
     high: float = 20.0
@@ -215,7 +217,8 @@ def response(
 
     A regression predicts y - u from its own past, A(z) (y - u) = B(z) u + e with white noise e, so that the response is
     1 + B / A (the direct method, Ljung, System Identification, section 13.5). A controller that answers e within its
-    sample biases the first coefficient of B. So the errors contain what changes without this coefficient.
+    sample, or that measures more often than the log, biases the first coefficients of B. So the errors contain what
+    changes without these coefficients.
 
     **Arguments:** signals with one sample every `dt` [s], and which of them are `usable`.
     """
@@ -241,7 +244,7 @@ def response(
         root = np.sqrt(variance) * inverse_root[:-1]
         return np.log(1 + b / a), slopes @ root, variance / np.abs(a) ** 2
 
-    (whole, spread, disturbed), (late, *_) = regression(0), regression(1)
+    (whole, spread, disturbed), (late, *_) = regression(0), regression(max(round(settings.answer / dt), 1))
     answered = np.real(late - whole)
     caused = np.real(np.einsum("fi,ij,fj->f", shift.conj(), np.cov(u[before].T), shift)) / (lags + 1)
     return AxisResponse(

@@ -21,6 +21,7 @@ from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 _NOT_CARRIED = {
     ("voltage_exponent", "battery_fade"): "no simulator has the battery's voltage",
     ("motor_braking",): "is not carried: exported motors brake as they drive",
+    ("battery_sag",): "is not carried: the exported battery has no internal resistance",
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }

@@ -41,11 +41,17 @@ class Tables(NamedTuple):
     """Settings of the table of answers.
 
     - `scale`: an accelerometer, with what forward flight adds to the lift of rotors, has a scale known to this share.
+    - `guessed_drag`: the standard deviation of a guessed drag coefficient, as a share: the coefficients of published
+      quadrotors are within 40 % of the guess, with exceptions.
+    - `other_thrust`: a thrust that differs from the airframe's by more than this share shows that its coefficients were
+      not measured together, so that their ratio may differ as much.
     - `unknown`: the standard deviation of an alpha that was not estimated, in half-widths: as good as unknown.
     - `noted`: a factor of an interval from this one on is noted: it is printed with one decimal.
     """
 
     scale: float = 0.01
+    guessed_drag: float = 0.4
+    other_thrust: float = 0.1
     unknown: float = 1e3
     noted: float = 1.05
 
@@ -200,6 +206,21 @@ def rigid_body(answer: Answer) -> RigidBody:
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
 
+def thrust_excess(answer: Answer) -> float:
+    """By which share the thrust exceeds that of the airframe; 0 if the logs do not show it."""
+    model, values = answer.problem.model, np.asarray(answer.estimate.parameters)
+    gains = [values[i] for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
+    return float(np.prod(gains)) - 1
+
+
+def drag_error(answer: Answer) -> float:
+    """The standard deviation of the ratio of drag to thrust, as a share, by what is known of the airframe."""
+    if answer.problem.model.airframe.guesses_drag:
+        return TABLES.guessed_drag
+    excess = abs(thrust_excess(answer))
+    return excess if excess > TABLES.other_thrust else 0.0
+
+
 def vehicle_constants(answer: Answer) -> RigidBody:
     """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated."""
     model, free, values = answer.problem.model, answer.free, np.asarray(answer.estimate.parameters)
@@ -218,10 +239,14 @@ def vehicle_constants(answer: Answer) -> RigidBody:
     scale = TABLES.scale * bool(gains)
     shared = scale * np.where(np.isin(np.arange(8), INVERSES), alpha, 0.0)
     covariance += shared[:, None] * shared
+    covariance[YAW.place, YAW.place] += (drag_error(answer) * alpha[YAW.place]) ** 2
     constants, thrust = {}, "mass" if gains else "thrust_coefficient"
-    drag = f"the drag coefficient {float(model.airframe.drag_coefficient):.3g}"
+    ratio = float(model.airframe.drag_coefficient / model.airframe.thrust_coefficient)
+    of_yaw = f"{thrust} and the ratio of drag to thrust, {ratio:.3g} m,"
+    if model.airframe.guesses_drag:
+        of_yaw = f"{thrust} and the guessed ratio of drag to thrust, {ratio:.3g} m,"
     for axis in AXES:
-        place, needed = axis.place, f"{thrust} and {drag}" if axis == YAW else f"arms and {thrust}"
+        place, needed = axis.place, of_yaw if axis == YAW else f"arms and {thrust}"
         if known[place] and alpha[place] > 0:
             std = float(np.sqrt(covariance[place, place])) / alpha[place] ** 2
             constants[axis.inertia] = Constant(1 / float(alpha[place]), float(std), UNIT, f"if {needed} are right")

@@ -13,7 +13,7 @@ from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import decisive_horizon
 from ..recording.checks import Finding
 from ..results import meaning, result_names
-from .answers import Answer, overwhelmed
+from .answers import Answer, drag_error, overwhelmed, thrust_excess
 from .data import Data
 from .doubts_of_values import ALL_INERTIAS, PLAUSIBLE, consequences, doubts_of_alphas, doubts_of_values
 from .results import Constant, Disturbance, ParameterEstimate, PredictionSkill, RigidBody, SampleTime
@@ -63,6 +63,7 @@ def doubts_of_vehicle(
         *doubts_of_log(data.findings),
         *few_parts(data.seconds),
         *_doubts_of_weak_axes(weak),
+        *(_doubts_of_drag(answer) if YAW.inertia in constants else ()),
         *doubts_of_values(answer.problem.model, judged, constants, fixed, data.log_step, follow),
         *doubts_of_predictions(skill, still),
         *_doubts_of_sample_time(answer, sample_times, constants),
@@ -91,6 +92,19 @@ def _doubts_of_weak_axes(weak: Mapping[str, str]) -> Iterator[Doubt]:
     inertias = {axis.motion: axis.inertia for axis in AXES}
     for motion, why in weak.items():
         yield refusal("unidentifiable", why, f"fly more {motion}, or in calmer air", {inertias[motion]: None})
+
+
+def _doubts_of_drag(answer: Answer) -> Iterator[Doubt]:
+    """A ratio of drag to thrust that nobody measured: Iz is proportional to it."""
+    excess, moves = thrust_excess(answer), {YAW.inertia: None}
+    measure = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
+    if answer.problem.model.airframe.guesses_drag:
+        yield refusal("unidentifiable", "`drag_coefficient` is a guess, to which Iz is proportional", measure, moves)
+    elif drag_error(answer):
+        more = "more" if excess > 0 else "less"
+        cause = f"the rotors give {100 * abs(excess):.0f} % {more} thrust than the airframe says, so that the ratio of "
+        said = f"{cause}its drag to its thrust, to which Iz is proportional, may be off as much", measure
+        yield refusal("unidentifiable", *said, moves)
 
 
 def few_parts(seconds: float) -> Iterator[Doubt]:

@@ -5,7 +5,7 @@ times, from the longest on. A sample time that the user gives is fitted in the s
 
 The rule: the shortest sample time at which the innovations of the body rates are nearly white, and the moments of
 inertia are those of the next longer samples with an answer, within two standard deviations, and known nearly as well.
-If there is none: the shortest without vibration. If all have it: the longest with an answer.
+If there is none: the shortest with white innovations. If there is none either: the least correlated.
 """
 
 import itertools
@@ -80,7 +80,8 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
     answered = [i for i, row in enumerate(rows) if row.constants] or [0]
     longer = dict(itertools.pairwise(answered))
     limits = [RULE.white + RULE.chance / math.sqrt(max(row.samples, 1)) for row in rows]
-    clean = [i for i in answered if abs(rows[i].correlation) <= limits[i]] or answered[-1:]
+    clean = [i for i in answered if abs(rows[i].correlation) <= limits[i]]
+    clean = clean or [min(answered, key=lambda i: abs(rows[i].correlation))]
     return next((i for i in clean[:-1] if _agree(rows[i], rows[longer[i]])), clean[0])
 
 

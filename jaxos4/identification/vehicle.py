@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import Airframe
+from ..airframe import YAW, Airframe
 from ..analysis.prediction import HORIZONS, starts
 from ..bracket import Bracket
 from ..errors import InputError, TrainingError, shortened
@@ -18,11 +18,11 @@ from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
 from ..logs import Recording
 from ..models.flight_model import FlightModel
-from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
+from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
 from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from ..shooting.feedthrough import FEEDTHROUGHS, input_innovations
+from ..shooting.feedthrough import input_innovations
 from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
@@ -55,6 +55,7 @@ class Likelihoods(NamedTuple):
 
 
 LIKELIHOODS = Likelihoods()
+GUESS_REACH = 4.0  # alpha8 may be this many times a guess too small or too large: published drag torques differ as much
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +159,9 @@ def _data(
     if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
         value, error = prepared.level  # the flight says how the accelerometer errs along z
         bracket = {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
+    if airframe.guesses_drag and not isinstance(bracket, Bracket):
+        name, center = YAW.inverse, 1 / float(airframe.inertia[2])
+        bracket = {name: [-GUESS_REACH * center, (2 + GUESS_REACH) * center], **(bracket or {})}
     unknowns = Unknowns.of(model, bracket_of(bracket, model))
     shooting = _problem(model, prepared.fitted, windows=prepared.windows, unknowns=unknowns)
     measured = np.count_nonzero(~np.isnan(shooting.recorded()))
@@ -230,8 +234,16 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     segments = int(np.clip(seconds / LIKELIHOODS.seconds, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     capacity = capacity_of(finest.fitted.time.shape[0])
-    padded, inputs = with_room(shooting, capacity), _input_innovations(shooting, capacity)
-    return InnovationsProblem(padded, segments=segments, least_noise=least_noise, input_innovations=inputs)
+    flight, inputs = shooting.flight, _input_innovations(shooting, capacity)
+    # Neither torque before an instant answers it, nor does that of motors, which are slow.
+    is_late = float(flight.averaging_time) == 0.0 or COMMANDS in prepared.available
+    return InnovationsProblem(
+        with_room(shooting, capacity),
+        segments=segments,
+        least_noise=least_noise,
+        input_innovations=inputs,
+        answers_within=not (is_late and float(flight.dt) <= LIKELIHOODS.controller),
+    )
 
 
 def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.ndarray, "samples feedthroughs 3"] | None:
@@ -239,8 +251,6 @@ def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.nda
     flight = shooting.flight
     if flight.within is None:
         return None
-    if float(flight.averaging_time) == 0.0 and float(flight.dt) <= LIKELIHOODS.controller:
-        return np.zeros((capacity, FEEDTHROUGHS, 3))  # no torque before an instant answers it
     samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
     torque = np.square(np.asarray(flight.within)) @ mixer[:3].T
     stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)

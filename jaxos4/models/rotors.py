@@ -147,6 +147,9 @@ class Motor(NamedTuple):
     - `curve`: 1: the thrust is quadratic in the command, as without a load. 0: it is linear.
     - `braking`: the torque of a motor that is faster than its voltage, as a share of that of a drive. 0: it coasts.
     - `full`: the speed at the full command [rad/s].
+    - `sag`: the share of the battery's voltage that the load of hover takes, `hover` [rad/s] being the speed of all
+      rotors then. The voltage falls with the sum of the rotors' currents, so that a command to all rotors gains less
+      than one to a single rotor. The current is taken as proportional to the cube of the speed.
 
     The same for all motors:
 
@@ -165,6 +168,12 @@ class Motor(NamedTuple):
     curve: Scalar | float = 1.0
     braking: Scalar | float = 1.0
     full: Scalar | float = 1.0
+    sag: Scalar | float = 0.0
+    hover: Scalar | float = 1.0
+
+    def supplied(self, command: Float[Array, "4"], omega: Float[Array, "4"]) -> Float[Array, "4"]:
+        """The commands [rad/s] that act when the rotors turn at `omega`. Commands are calibrated in hover."""
+        return command * (1 - self.sag * (jnp.mean((omega / self.hover) ** 3) - 1))
 
     def command(self, omega: Speed) -> Speed:
         """The command [rad/s] that keeps a speed."""
@@ -196,7 +205,7 @@ def driven(omega: RotorSpeeds, motor: Motor, batch: Batch) -> Speeds:
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
         begin = jnp.where(is_first, settled, speed)
-        end = motor.step(begin, command, batch.grid.dt, 1 if batch.grid.are_parts else 2)
+        end = motor.step(begin, motor.supplied(command, begin), batch.grid.dt, 1 if batch.grid.are_parts else 2)
         return end, (begin, end)
 
     begin, end = jax.lax.scan(over_a_sample, batch.before, (omega, motor.settled(omega), batch.is_first))[1]

@@ -170,8 +170,8 @@ def _scaled(share: Callable[[Values, Grid], Float[Array, " samples"]]) -> Callab
 
 def _drive(omega: RotorSpeeds, values: Values, batch: Batch, airframe: Airframe) -> Speeds:
     full = jnp.asarray(airframe.max_rotor_speed)
-    motor = Motor(values["rotor_lag"], values["thrust_curve"], values["motor_braking"], full)
-    return driven(omega, motor, batch)
+    lag, curve, braking, sag = (values[p] for p in ("rotor_lag", "thrust_curve", "motor_braking", "battery_sag"))
+    return driven(omega, Motor(lag, curve, braking, full, sag, jnp.asarray(airframe.hover_speed)), batch)
 
 
 def _velocity(forcing: Forcing):
@@ -240,11 +240,14 @@ _OWN: dict[str, Term] = {
         command=_scaled(lambda values, grid: 1 - values["battery_fade"] * grid.elapsed),
     ),
     "motor": Term(
-        "motors follow their commands under the load of the propellers: rotor_lag [s], thrust_curve, motor_braking",
+        "motors follow their commands under the load of the propellers: rotor_lag [s], thrust_curve, motor_braking, "
+        "battery_sag: the share of the voltage that the load of hover takes",
         (
             _LAG,
-            Parameter("thrust_curve", "1", 0.25, center=0.85, contradiction=_limits((0.0, STEEPEST, _BENT, _CLIMB))),
+            Parameter("thrust_curve", "1", 0.1, center=0.85, contradiction=_limits((0.0, STEEPEST, _BENT, _CLIMB))),
             Parameter("motor_braking", "1", 0.6, center=0.5, nonnegative=True, plain=1.0),
+            # Lithium cells have 8 to 30 mOhm Ah, and vehicles hover at 7 to 10 C: 2 to 6 % of 3.8 V.
+            Parameter("battery_sag", "1", 0.04, center=0.04, nonnegative=True),
         ),
         # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),

@@ -1,9 +1,16 @@
-"""The answer of a controller within a sample.
+"""What the torque tells that the log does not: answers of a controller that knows more.
 
-If a sample lasts longer than the controller takes to answer, its torque holds answers to the noise of what is measured
-in it, and a likelihood that takes this torque for an input is biased. All of the torque is known before the sample, but
-for its *input innovation* v. With white noise in the log's rows, v depends on what is measured through the filter's
-innovation e alone. So e - gamma v is compared, with an unknown *feedthrough* gamma (`docs/method/filter_error.md`).
+All of the torque is known before its sample, but for its *input innovation* v. Two things make v depend on what the
+filter compares and estimates:
+
+- If a sample lasts longer than the controller takes to answer, v holds answers to the noise of what is measured in it.
+  With white noise in the log's rows, v depends on what is measured through the filter's innovation e alone. So
+  e - gamma v is compared, with an unknown *feedthrough* gamma.
+- A controller that runs faster than the log measures rates that the log lacks. Its answers tell of rates and
+  disturbances, so that the estimates of the filter are corrected by unknown gains times v. Without these gains, the
+  error of the filter correlates with the torque that follows, and all parameters are biased.
+
+See `docs/method/filter_error.md`.
 """
 
 from collections.abc import Iterator
@@ -12,7 +19,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 FEEDTHROUGHS = 2
-"""The number of input innovations of a body rate."""
+"""The largest number of input innovations of a body rate."""
+_COUNTS = (2, 2, 1)  # about roll, pitch and yaw; a second one of yaw would hide the reaction of the rotors
 _ROUNDING = 1e-6
 
 
@@ -26,8 +34,9 @@ def input_innovations(
 ) -> Float[np.ndarray, "samples feedthroughs 3"]:
     """The part of the torque within each sample that the past does not tell, about each axis, of mean square 1.
 
-    A linear regression on earlier samples of torque and rate about the same axis leaves `FEEDTHROUGHS` combinations of
-    the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch.
+    A linear regression on earlier samples of torque and rate about the same axis leaves combinations of the parts of a
+    sample, in which most of the rest lies: two about roll and pitch, one about yaw (the second is 0). 0 at the
+    beginning of a stretch.
 
     - `torque`: in equal parts of each sample, in any unit. `rates`: measured [rad/s]; NaN counts as 0.
     - `stretch`: the number of the uninterrupted stretch of each sample.
@@ -45,7 +54,8 @@ def input_innovations(
         rest = torque[rows, :, axis] - known @ (known.T @ torque[rows, :, axis])
         directions, sizes, _ = np.linalg.svd(rest, full_matrices=False)
         directions = np.where(sizes > _ROUNDING * torque[:, :, axis].std(), directions, 0.0)
-        found[rows, :, axis] = np.sqrt(len(rows)) * directions[:, :FEEDTHROUGHS]
+        count = _COUNTS[axis]
+        found[rows, :count, axis] = np.sqrt(len(rows)) * directions[:, :count]
     return found
 
 

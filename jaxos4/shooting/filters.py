@@ -46,10 +46,14 @@ BLOCK = 32
 
 
 class _Row(NamedTuple):
-    """One sample of all segments, which may forget before it or the next; `measured` is 0 if it was not."""
+    """One sample of all segments, which may forget before it or the next; `measured` is 0 if it was not.
+
+    `inputs`: the input innovations, 0 where nothing was measured.
+    """
 
     measured: Channels
     is_measured: Bool[Array, "channels segments"]
+    inputs: Float[Array, "feedthroughs channels segments"]
     restarts: Bool[Array, " segments"]
     restarts_next: Bool[Array, " segments"]
 
@@ -64,8 +68,18 @@ class _Known(NamedTuple):
     disturbance: tuple[Segments, ...]
 
 
+class InputGains(NamedTuple):
+    """What a unit of each input innovation adds to the estimates at the end of its sample, by feedthrough.
+
+    - `driven`: to the rate [rad/s]. `disturbance`: to the disturbance [rad/s^2].
+    """
+
+    driven: tuple[Float[Array, " channels *segments"], ...]
+    disturbance: tuple[Float[Array, " channels *segments"], ...]
+
+
 class _Feedback(NamedTuple):
-    """The parts of a filter that depend on the noise, by channel: its `Gains`, and fields of `Step`."""
+    """The parts of a filter that depend on the noise, by channel: its `Gains`, `InputGains`, and fields of `Step`."""
 
     driven: tuple[Segments, ...]
     driven_later: tuple[Segments, ...]
@@ -75,11 +89,12 @@ class _Feedback(NamedTuple):
     kept: tuple[Segments, ...]
     driven_kept: tuple[Segments, ...]
     reach: tuple[Segments, ...]
+    by_input: InputGains
 
     @classmethod
-    def of(cls, gains: Gains, step: Step) -> "_Feedback":
+    def of(cls, gains: Gains, step: Step, by_input: InputGains) -> "_Feedback":
         fields = gains.driven, gains.driven_later, gains.disturbance_later, step.driven_seen, step.seen
-        return cls(*map(tuple, (*fields, *step.transition)))
+        return cls(*map(tuple, (*fields, *step.transition)), by_input=by_input)
 
 
 def _advance(
@@ -98,11 +113,18 @@ def _advance(
     driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
     rates = move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates
     driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
-    later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, strict=True)
-    driven = tuple(x + a * d + gain * e for x, a, d, gain, e in later)
-    faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, strict=True)
-    disturbance = tuple(share * d + gain * e for share, d, gain, e in faded)
+    told = tuple(_told(gains, row.inputs) for gains in feedback.by_input)
+    later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, told[0], strict=True)
+    driven = tuple(x + a * d + gain * e + v for x, a, d, gain, e, v in later)
+    faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, told[1], strict=True)
+    disturbance = tuple(share * d + gain * e + v for share, d, gain, e, v in faded)
     return _emptied(_Known(driven, disturbance), row.restarts_next), errors
+
+
+def _told(gains: tuple[Array, ...], inputs: Float[Array, "feedthroughs channels segments"]) -> Channels:
+    """What input innovations add to an estimate, by channel."""
+    each = (v * (k if k.ndim > 1 else k[:, None]) for k, v in zip(gains, inputs, strict=True))
+    return sum(each, jnp.zeros(inputs.shape[1:], dtype=float))
 
 
 def _emptied(known: _Known, where: Bool[Array, " segments"]) -> _Known:
@@ -154,6 +176,7 @@ class Point(NamedTuple):
     noise: LogNoise
     feedthrough: tuple[Float[Array, " channels *segments"], ...]
     noise_feedthrough: tuple[Float[Array, " channels *segments"], ...]
+    by_input: InputGains
 
 
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
@@ -219,9 +242,9 @@ def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmente
 def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
-    parameters, noise, feedthrough, noise_feedthrough = at
+    parameters, noise, feedthrough, noise_feedthrough, by_input = at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
-    levels = len(jax.tree.leaves(noise))
+    levels = len(jax.tree.leaves((noise, by_input)))
     unknowns = count + levels + len(feedthrough)
     step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
     steps = step, jax.vmap(push)(basis(noise))
@@ -247,15 +270,12 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         nothing,
     )
     advance = functools.partial(_advance, functions)
-    filtered = functools.partial(_filter_rows, advance, parameters, steps, np.asarray(positions, int))
+    filtered = functools.partial(_filter_rows, advance, parameters, by_input, steps, np.asarray(positions, int))
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
-    row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, observed.restart, following)
-
-    def explained(by: tuple[Array, ...]) -> Series:
-        each = (v * (k if k.ndim > 1 else k[:, None]) for v, k in zip(jnp.moveaxis(inputs, 1, 0), by, strict=True))
-        return sum(each, jnp.zeros(observed.measured.shape, dtype=float))
-
-    fed = explained(feedthrough), jnp.square(explained(noise_feedthrough)), jnp.moveaxis(inputs, 2, 1)
+    seen = jnp.where(missing[:, None], 0.0, inputs)
+    row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, seen, observed.restart, following)
+    explained, known_noise = (jax.vmap(_told, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough))
+    fed = explained, jnp.square(known_noise), jnp.moveaxis(inputs, 2, 1)
     data = row, observed.counts, fed, forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
@@ -268,6 +288,7 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
 def _filter_rows(
     advance: Callable[..., Any],
     parameters: Float[Array, "parameters *segments"],
+    by_input: InputGains,
     steps: tuple[Step, Step],
     positions: np.ndarray,
     carry: _Carry,
@@ -295,10 +316,10 @@ def _filter_rows(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
-        fed = _Feedback.of(gains, steps[0])
+        fed = _Feedback.of(gains, steps[0], by_input)
         # The noise acts by the feedback alone, and the parameters do not act on it.
         _, push = jax.linearize(lambda known, fed: advance(known, forcing, scalars, fed, row), known, fed)
-        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, jax.vmap(_Feedback.of)(gain_slopes, steps[1]))
+        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, _directions(gain_slopes, steps[1], by_input))
 
         def filtered(known: _Known, scalars: tuple, forcing: Forcing = forcing):
             return advance(known, forcing, scalars, fed, row)
@@ -324,3 +345,12 @@ def _filter_rows(
     found, last = likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, fed[1], noise)
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)
+
+
+def _directions(gains: Gains, steps: Step, by_input: InputGains) -> _Feedback:
+    """The derivatives of the feedback in the levels of the noise, then in the gains of input innovations."""
+    levels, units = gains.variance.shape[0], basis(by_input)
+    of_noise = jax.tree.map(lambda leaf: jnp.zeros((levels, *leaf.shape[1:]), leaf.dtype), units)
+    some, more = jax.vmap(_Feedback.of)(gains, steps, of_noise), len(jax.tree.leaves(by_input))
+    wide = jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, more), *((0, 0),) * (leaf.ndim - 1))), some)
+    return wide._replace(by_input=jax.tree.map(lambda a, b: jnp.concatenate([a, b]), of_noise, units))

@@ -11,7 +11,7 @@ joint covariance is exact, so innovations of the right model are white at every 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from ..models.state import CHANNELS
 
 Channels = Float[Array, "channels segments"]
 Series = Float[Array, "time channels segments"]
+T = TypeVar("T")
 
 RATE_COUNT = CHANNELS["rates"]
 """The number of body rates, which come first among the channels."""
@@ -266,8 +267,9 @@ def next_gains(
     return after, gains
 
 
-def basis(noise: LogNoise) -> LogNoise:
-    """The directions of `noise`: in each, the same logarithm of all channels changes."""
-    leaves, tree = jax.tree.flatten(noise)
+def basis(unknowns: T) -> T:
+    """The directions of each leaf: in each direction, the same unknown of all channels changes by 1."""
+    leaves, tree = jax.tree.flatten(unknowns)
     directions = np.eye(len(leaves))
-    return tree.unflatten([np.multiply.outer(row, np.ones(noise.strength.shape)) for row in directions])
+    rows = zip(directions, leaves, strict=True)
+    return tree.unflatten([np.multiply.outer(row, np.ones(leaf.shape)) for row, leaf in rows])

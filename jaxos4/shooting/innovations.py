@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import Numeric, Parameters, as_float
 from ..bracket import Bracket
@@ -24,7 +24,7 @@ from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
-from .filters import Point, Segmented, innovate
+from .filters import InputGains, Point, Segmented, innovate
 from .gains import INSTANT, LogNoise, Observed, Window
 from .noise_unknowns import NoiseUnknowns, levels, own_names
 from .problem import ShootingProblem
@@ -43,7 +43,8 @@ class InnovationsProblem(AbstractProblem):
     the three are unknowns like the parameters, and follow them: `log_p_strength`, `log_p_time`, `log_p_sensor`, then
     those of q, r, and each specific force that the model predicts; with forces also `log_az_smoothing`, the time
     constant of the low-pass filter of its disturbance (fixed for rates, which have none), and with `input_innovations`
-    `p_feedthrough_1` and so on. The bracket is a Gaussian prior, whose standard deviation is its half-width.
+    `p_rate_gain_1`, `p_disturbance_gain_1`, `p_feedthrough_1` and so on. The bracket is a Gaussian prior, whose
+    standard deviation is its half-width.
 
     - `problem`: model, flight, known or free initial state, and the bracket of the parameters. Its windows and its
       sigma do not matter.
@@ -53,7 +54,8 @@ class InnovationsProblem(AbstractProblem):
     - `settling`: after this many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
     - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample, see
-      `jaxos4.shooting.feedthrough`; by default nothing: the controller answers no measurement within its sample.
+      `jaxos4.shooting.feedthrough`; by default nothing: the controller knows no more than the log.
+    - `answers_within`: whether the controller answers a measurement within its sample; otherwise feedthroughs are 0.
     - `noise_feedthrough`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default:
       not known, so that a search has two stages. The first finds them, the second counts them.
     - `noise_unknowns`: how the noise is looked for.
@@ -65,6 +67,7 @@ class InnovationsProblem(AbstractProblem):
     least_noise: Float[Array, " channels"] = eqx.field(converter=as_float)
     input_innovations: Float[Array, "samples feedthroughs 3"] = eqx.field(converter=as_float)
     noise_feedthrough: Float[Array, "channels feedthroughs"] = eqx.field(converter=as_float)
+    answers_within: Bool[Array, ""]
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
     noise_unknowns: NoiseUnknowns = eqx.field(static=True, default=NoiseUnknowns())
@@ -79,6 +82,7 @@ class InnovationsProblem(AbstractProblem):
         least_noise: Float[ArrayLike, " channels"] | None = None,
         input_innovations: Float[ArrayLike, "samples feedthroughs 3"] | None = None,
         noise_feedthrough: Float[ArrayLike, "channels feedthroughs"] | None = None,
+        answers_within: Bool[ArrayLike, ""] = True,
         noise_unknowns: NoiseUnknowns | None = None,
     ):
         if segments is None:
@@ -99,6 +103,7 @@ class InnovationsProblem(AbstractProblem):
             )
         unknown = np.full((channels, self.input_innovations.shape[1]), np.nan)
         self.noise_feedthrough = as_float(unknown if noise_feedthrough is None else noise_feedthrough)
+        self.answers_within = jnp.asarray(answers_within, dtype=bool)
         self.noise_unknowns = NoiseUnknowns() if noise_unknowns is None else noise_unknowns
         unknowns = problem.unknowns.count + len(self._own) * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
@@ -156,7 +161,10 @@ class InnovationsProblem(AbstractProblem):
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
         feedthroughs, data = self.input_innovations.shape[-2], (self.problem.measured(), self.flight.dt)
-        return self.noise_unknowns.after(self.problem.unknowns, self.channels, feedthroughs, *data, self.least_noise)
+        own = self.problem.unknowns
+        return self.noise_unknowns.after(
+            own, self.channels, feedthroughs, *data, self.least_noise, answers_within=self.answers_within
+        )
 
     @property
     def initial_guess(self) -> InitialGuess:
@@ -197,6 +205,11 @@ class InnovationsProblem(AbstractProblem):
     def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "channels own"]:
         return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
 
+    def _of_inputs(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "3 channels feedthroughs"]:
+        """The gains of rate and disturbance by input innovations, then the feedthroughs."""
+        own = self._of_channels(unknowns)[:, self._levels :]
+        return jnp.moveaxis(own.reshape(len(own), 3, self.input_innovations.shape[-2]), 1, 0)
+
     @property
     def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """See `AbstractProblem`. `parts` are the segments."""
@@ -210,7 +223,7 @@ class InnovationsProblem(AbstractProblem):
         is_known = ~jnp.isnan(self.noise_feedthrough).any()
 
         def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
-            found = jnp.where(is_known, self.noise_feedthrough, self._of_channels(before[0])[:, self._levels :])
+            found = jnp.where(is_known, self.noise_feedthrough, self._of_inputs(before[0])[2])
             return at(unknowns, jnp.where(is_known | (stage > 0), found, 0.0))
 
         unknowns, none = self.unknowns, jnp.zeros(number, dtype=float)
@@ -238,8 +251,7 @@ class InnovationsProblem(AbstractProblem):
 
         def at(row: WindowUnknowns, noise_feedthrough: Float[Array, "channels feedthroughs"]) -> LocalModel:
             values = row[0]
-            feedthrough = self._of_channels(values)[:, self._levels :]
-            found = innovations(values[:count], self.noise(values), feedthrough, noise_feedthrough)
+            found = innovations(values[:count], self.noise(values), self._of_inputs(values), noise_feedthrough)
             shared = found.gradient.shape[1] - len(self._own)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, shared)
             if places is not None:
@@ -263,13 +275,16 @@ class InnovationsProblem(AbstractProblem):
         return observe_in_segments(self.problem, self.segmentation, self.settling)
 
     def innovations(
-        self, parameters: Parameters, noise: LogNoise, feedthrough: Float[Array, "channels feedthroughs"] | None = None
+        self, parameters: Parameters, noise: LogNoise, by_input: Float[Array, "3 channels feedthroughs"] | None = None
     ) -> Innovations:
-        """The innovations of all segments, with derivatives in the parameters of its recording. `feedthrough`: or 0."""
-        nothing = jnp.zeros((self.problem.columns.size, self.input_innovations.shape[-2]))
-        feedthrough = nothing if feedthrough is None else feedthrough
+        """The innovations of all segments, with derivatives in the parameters of its recording.
+
+        `by_input`: the gains of rate and disturbance by input innovations, and the feedthroughs; by default 0.
+        """
+        nothing = jnp.zeros((3, self.problem.columns.size, self.input_innovations.shape[-2]))
+        by_input = nothing if by_input is None else by_input
         noise_feedthrough = jnp.nan_to_num(self.noise_feedthrough)
-        return self._innovations()(parameters, noise, feedthrough, noise_feedthrough)
+        return self._innovations()(parameters, noise, by_input, noise_feedthrough)
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
         """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
@@ -284,11 +299,13 @@ class InnovationsProblem(AbstractProblem):
         fixed = self.segmentation.rows, self.flight.dt, self.window
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
-        def at(parameters: Parameters, noise: LogNoise, feedthrough: Array, noise_feedthrough: Array) -> Innovations:
+        def at(parameters: Parameters, noise: LogNoise, by_input: Array, noise_feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
             flight = Segmented(observed, inputs, forcing, tangents, *fixed)
-            point = Point(own, noise, tuple(feedthrough.T), tuple(noise_feedthrough.T))
+            driven, disturbance, feedthrough = (tuple(each.T) for each in by_input)
+            gains = InputGains(driven, disturbance)
+            point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), gains)
             return innovate(functions, model.forcing_parameters, flight, point)
 
         return at

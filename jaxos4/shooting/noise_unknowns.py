@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Scalar
 from ..bracket import PROPER_PRIOR
@@ -69,6 +69,8 @@ class NoiseUnknowns(NamedTuple):
         measured: Float[Array, "samples channels"],
         dt: Scalar,
         least_noise: Float[Array, " channels"],
+        *,
+        answers_within: Bool[Array, ""],
     ) -> Unknowns:
         """The parameters, then noise and feedthroughs of each channel, in brackets from differences of measurements."""
         if self.longest_smoothing >= self.shortest_of_force:
@@ -89,14 +91,15 @@ class NoiseUnknowns(NamedTuple):
         lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))
         free = jnp.ones(first.shape, dtype=bool).at[:, 3:].set(~rate)
         first, lowest, highest, free = (
-            jnp.pad(x, ((0, 0), (0, feedthroughs)), constant_values=value)
+            jnp.pad(x, ((0, 0), (0, 3 * feedthroughs)), constant_values=value)
             for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf), (free, True))
         )
+        free = free.at[:, free.shape[1] - feedthroughs :].set(answers_within)
         names = tuple(each.format(name) for name in channels for each in own_names(count, feedthroughs))
         precision = jnp.full(first.size, self.precision)
         return Unknowns(
             names=own.names + names,
-            units=own.units + tuple("1" if name.startswith("log") else "rad/s" for name in names),
+            units=own.units + tuple(_unit(name) for name in names),
             parameter_count=own.count,
             prior=PROPER_PRIOR,
             center=jnp.concatenate([own.center, first.ravel()]),
@@ -112,4 +115,9 @@ class NoiseUnknowns(NamedTuple):
 def own_names(count: int, feedthroughs: int) -> tuple[str, ...]:
     """The names of the unknowns of a channel, with its name to be filled in. `count`: of noise levels."""
     noise = ("log_{}_strength", "log_{}_time", "log_{}_sensor", "log_{}_smoothing")
-    return (*noise[:count], *(f"{{}}_feedthrough_{i + 1}" for i in range(feedthroughs)))
+    of_inputs = ("rate_gain", "disturbance_gain", "feedthrough")
+    return (*noise[:count], *(f"{{}}_{what}_{i + 1}" for what in of_inputs for i in range(feedthroughs)))
+
+
+def _unit(name: str) -> str:
+    return "1" if name.startswith("log") else "rad/s^2" if "disturbance" in name else "rad/s"

@@ -20,6 +20,7 @@ VALUES = {
     **{"roll_damping": 1.5, "pitch_damping": 0.8, "yaw_damping": 0.4, "roll_velocity": 0.3, "pitch_velocity": -0.4},
     **{"voltage_exponent": 0.7, "battery_fade": 0.02},
     **{"rotor_lag": 0.06, "rotor_delay": 0.02, "rotor_reaction": 0.02, "thrust_curve": 0.97, "motor_braking": 0.3},
+    **{"battery_sag": 0.05},
     **{"thrust_gain": 1.2, "x_drag": 0.4, "y_drag": 0.3, "z_drag": 0.6, "ax_bias": 0.5, "ay_bias": -0.4},
     **{"az_bias": 0.2, "p_bias": 0.03, "q_bias": -0.02, "r_bias": 0.01},
 }
@@ -94,6 +95,7 @@ def reference(terms, omega, dt, *, fine):
             speeds, change = u, np.zeros(4)
         else:
             speeds = z[12:]
+            u = u * (1 - v["battery_sag"] * (np.mean((speeds / float(FULL.hover_speed)) ** 3) - 1))
             drive = u - curve * speeds
             if "motor" in terms:
                 brake, smooth = v["motor_braking"], 0.005 * full
