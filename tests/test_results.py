@@ -189,7 +189,8 @@ def test_a_result_shows_itself(tmp_path):
     lines = found.summary().splitlines()
     assert max(map(len, lines)) <= 80
     place = [
-        next(i for i, line in enumerate(lines) if line.startswith(said)) for said in ("identified: ", "Ix ", "Iz: ")
+        next(i for i, line in enumerate(lines) if line.startswith(said))
+        for said in ("Ix: identified.", "Ix ", "Iz: the")
     ]
     assert place == sorted(place)  # verdict, quantities, reservations
     assert place[1] < 5
@@ -197,7 +198,7 @@ def test_a_result_shows_itself(tmp_path):
     assert "alpha3" in found.summary(verbose=True)
     assert any(line.startswith("Ix") and line.endswith("if arms and mass are right") for line in wide(found))
     shown = found._repr_html_()
-    assert "All requested quantities are identified: Ix." in shown
+    assert "Ix: identified. Iz: refused (not identified)." in shown
     assert "1.733e-05" in shown
     evil = identified_vehicle(verdicts={"Ix": Verdict("contradicted", "", ("<script>",))})
     assert "<script>" not in evil._repr_html_()
@@ -205,7 +206,7 @@ def test_a_result_shows_itself(tmp_path):
 
 def test_verdicts_have_colours_on_a_terminal_alone():
     shown = {"force_terminal": True, "color_system": "standard", "no_color": False}
-    for options, begin in ((shown, "\x1b[32midentified: "), ({"force_terminal": False}, "identified: ")):
+    for options, begin in ((shown, "\x1b[32mIx: identified."), ({"force_terminal": False}, "Ix: identified.")):
         console = Console(width=80, file=io.StringIO(), **options)
         print_identification(console, identified_vehicle())
         assert console.file.getvalue().startswith(begin)
