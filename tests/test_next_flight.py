@@ -42,7 +42,7 @@ def test_half_widths_shrink_with_the_root_of_the_time_and_with_the_amplitude(hal
 def test_time_is_that_of_all_flights_that_count():
     both = [vehicle({"Ix": 0.16}, seconds=10.0), vehicle({"Ix": 0.16}, seconds=22.0)]
     says(next_flight(both, {"Ix": 0.16}), "fly 50 s more roll (known")
-    says(next_flight(both, {"Ix": 0.099}), "next: nothing is missing")
+    says(next_flight(both, {"Ix": 0.099}), "next: nothing is missing.")
 
 
 def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once():

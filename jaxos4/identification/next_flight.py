@@ -31,7 +31,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
             every = (each.provenance.fitted_seconds for each in fitted)
             motions.append(_more(axis.motion, spread, sum(x for x in every if isinstance(x, float))))
             flown.add(f"fly more {axis.motion}")
-            known.append(f"{axis.inertia} {100 * spread:.0f} %")
+            known.append(f"{axis.inertia} {100 * spread:.3g} %")
     if motions:
         advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * TOLERANCE.vague:.0f} %"]
     for name, own in counted.items():
@@ -40,7 +40,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
             same = next((each for each in advised if each.startswith(remedy)), remedy)
             advised.setdefault(same, []).append(name)
     said = "; ".join(f"{advice} ({', '.join(names)})" for advice, names in advised.items())
-    return f"next: {said or _REPEAT}."
+    return f"next: {said or (_REPEAT if len(results) == 1 else 'nothing is missing')}."
 
 
 def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:

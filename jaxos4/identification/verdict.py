@@ -17,12 +17,13 @@ CONTRADICTED = "contradicted"
 STATUSES = (IDENTIFIED, RESERVED, MISSING, CONTRADICTED)
 """From the best to the worst."""
 _TRUSTED = (IDENTIFIED, RESERVED)
-_ADVICE = {
+ADVICE = {
     IDENTIFIED: "identified",
     RESERVED: "use with care",
     MISSING: "refused (not identified)",
     CONTRADICTED: "refused (contradicted)",
 }
+"""Whether to use a quantity, by its status, in words."""
 
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 
@@ -226,7 +227,7 @@ def headline(statuses: Mapping[str, str]) -> dict[str, str]:
     Terminal, page, notebook and comparison all begin with these sentences. `statuses`: by quantity.
     """
     named = {status: [name for name, own in statuses.items() if own == status] for status in STATUSES}
-    return {status: f"{', '.join(names)}: {_ADVICE[status]}." for status, names in named.items() if names}
+    return {status: f"{', '.join(names)}: {ADVICE[status]}." for status, names in named.items() if names}
 
 
 def statuses_of(verdicts: Mapping[str, Verdict]) -> dict[str, str]:
