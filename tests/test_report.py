@@ -120,7 +120,6 @@ def test_no_line_hides_another_and_a_title_says_who_sees_which_channels(study, r
         widths = [line.get_linewidth() for line in lines]
         assert widths == sorted(widths, reverse=True)
         assert len({*widths}) == 4
-        assert len({line.get_xdata()[0] for line in lines}) == 4
     said = "Not of the same channels: ibss, hybrid see all; network, svsf see rates"
     assert said in words(report[0].read_text(encoding="utf-8"))
 

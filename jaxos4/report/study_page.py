@@ -24,7 +24,7 @@ MOST_DRAWN = 12
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
 _COLUMNS, _SPECIFICATION = 4, "specification.toml"
 _AGAIN = f"jaxos4 study {_SPECIFICATION} --out .  # in the folder of this page"
-_WIDEST, _NARROWEST = 3.4, 1.2  # line widths [pt] of the first and the last estimator, so that none hides another
+_WIDEST, _NARROWEST = 3.0, 1.0  # line widths [pt] of the first and the last estimator, so that none hides another
 
 
 def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
@@ -143,9 +143,10 @@ def _against_noise(
     scales = data["scale"].values
     for parameter, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
         for place, look in _looks(data):
-            x, wide = dodged(scales, place, data.sizes["estimator"]), _width(data, place)
+            x = scales if interval is None else dodged(scales, place, data.sizes["estimator"])
+            wide = _width(data, place)
             y, gid = values[parameter].isel(estimator=place).values, estimator_gid(place)
-            panel.plot(x, y, gid=gid, linewidth=wide, markersize=3.5 + wide, **look.line)
+            panel.plot(x, y, gid=gid, linewidth=wide, markersize=2.5 + 1.8 * wide, **look.line)
             if interval is not None:
                 one = interval.isel(parameter=parameter, estimator=place)
                 ends = one["low"].values, one["high"].values
