@@ -14,7 +14,7 @@ from ..errors import printable
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification
-from ..identification.verdict import RIGID_BODY, headline, reason_lines, statuses_of
+from ..identification.verdict import RIGID_BODY, headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .identification_figures import (
@@ -29,7 +29,7 @@ from .identification_figures import (
 )
 from .identification_signals import BAND, identified_signals
 from .style import drawing, styles
-from .terminal import quantity_rows
+from .terminal import quantity_rows, warning_lines
 from .text import DASH, plain
 
 # The page shows these entries of the provenance in a place of their own.
@@ -67,7 +67,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         title=title or ", ".join(printable(Path(name).name) for name in found.logs),
         found=found,
         verdict=verdict(found),
-        verdict_lines=reason_lines(found.verdicts, found.doubts),
+        verdict_lines=warning_lines(found),
         next_flight=next_flight([found], spreads_of(found)) if found.verdicts and found.has_answer else "",
         center=[f"{x.axis} {plain(1e3 * x.value)} ± {plain(NINETY_FIVE * (1e3 * x.std), 2)} mm" for x in center],
         quantities=quantities(found),
@@ -94,7 +94,8 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
         own = found.parameters.get(row.name.replace(" ", "_"))
         small = row.judged == RIGID_BODY and abs(row.value) <= NINETY_FIVE * row.std
         said = dict.fromkeys([note, "" if own is None else own.note, "below noise" if small else ""])
-        rows.append((cells, "; ".join(filter(None, said))))
+        shown = (row.name, DASH, *cells[2:]) if small else cells  # a J_R of -3 kg m^2 would be read as a value
+        rows.append((shown, "; ".join(filter(None, said))))
     listed = {cells[0] for cells, _ in rows}
     for name in INERTIAS:
         if name in found.verdicts and name not in listed:
@@ -105,7 +106,7 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
 def identification_html(found: Identification) -> str:
     """Verdict, physical quantities and reservations, for a notebook."""
     rows = zip(*quantity_rows(physical_quantities(found)), strict=True)
-    lines = [*reason_lines(found.verdicts, found.doubts), *(f"note: {note}" for note in found.provenance.notes)]
+    lines = [*warning_lines(found), *(f"note: {note}" for note in found.provenance.notes)]
     return render("summary.html.j2", verdict=verdict(found), rows=list(rows), lines=lines)
 
 

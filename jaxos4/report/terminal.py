@@ -25,6 +25,7 @@ from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
 from .text import Listing, plain, say
 
+_WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
 
@@ -86,7 +87,16 @@ def _quantities(found: Identification) -> Section:
 
 
 def _reasons(found: Identification) -> Section:
-    yield from reason_lines(found.verdicts, found.doubts)
+    yield from warning_lines(found)
+
+
+def warning_lines(found: Identification) -> list[str]:
+    """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
+    wide = {name: factor for name, factor in found.widened.items() if factor > _WIDENED}
+    factors = sorted({f"{each:.1f}" for each in (min(wide.values(), default=1.0), max(wide.values(), default=1.0))})
+    said = f"warning: parts of the flights disagree, so that intervals were widened {' to '.join(factors)} times: "
+    lacking = f"{said}{', '.join(wide)}. The model lacks an effect, or the flights are not of one vehicle."
+    return [*reason_lines(found.verdicts, found.doubts), *[lacking] * bool(wide)]
 
 
 def _notes(found: Identification) -> Section:
