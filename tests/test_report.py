@@ -175,7 +175,7 @@ def test_trouble_is_named(report):
         "noise x 0.1, ibss, flight 1: at bound",
         "noise x 0.1, ibss, flight 3: nonfinite trajectory",
         "noise x 10, ibss, flight 2: max sweeps",
-        "3 flights that did not end successful",
+        "3 flights without a successful result",
         "† absolute error, in the parameter's unit: the truth is 0",
         "‡ absolute error, in the parameter's unit: below the noise floor",
         "jaxos4 study specification.toml --out .",
@@ -200,7 +200,7 @@ def test_a_study_of_one_flight_shows_the_answer_and_no_statistics(tmp_path):
     one = study.isel({name: 0 for name in SCENARIO} | {"flight": 0, "scale": 1})
     half = one["half_width"].sel(level=0.95).values
     held = int((abs(one["estimate"] - one["truth"]).values <= half).sum())
-    assert f"ibss at noise x 1: successful, {held} of 3 intervals hold the truth." in shown
+    assert f"ibss at noise x 1: successful, {held} of 3 intervals contain the truth." in shown
     for k, name in enumerate(study["parameter"].values):
         row = {heading: cells["noise x 1, ibss", name, heading][0] for heading in ("truth", "estimate", "interval")}
         value = float(one["estimate"][k])

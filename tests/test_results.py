@@ -356,7 +356,10 @@ def test_a_comparison_is_not_more_confident_than_its_results(tmp_path, run):
     assert code == 0
     page = words((tmp_path / "page.html").read_text(encoding="utf-8"))
     says(
-        page, "Iy: identified. Ix: use with care. Iz: refused", "Ix in results 2, 3", "Dashed: what the airframe's file"
+        page,
+        "Iy: identified. Ix: use with care. Iz: refused",
+        "Ix in results 2, 3",
+        "Dashed: the value in the airframe's file",
     )
     says(page, "Next: ")
     other = of_inertias(2.3e-5, 1e-7, provenance={"flights": ["3.csv"]})

@@ -50,7 +50,7 @@ def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str,
     found, of_airframe = [], {each.name for each in parameters if each.scales_torque or callable(each.center)}
     for name, row in rows.items():
         if name in answer.negative:
-            found.append(f"{name} came out negative, which is impossible")
+            found.append(f"{name} is negative, which is impossible; it is 0 here")
         elif row.is_outside_bracket and name in guessed and row.estimate and isinstance(row.bracket, tuple):
             ratio = sum(row.bracket) / 2 / row.estimate
             check = (

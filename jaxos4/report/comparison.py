@@ -86,7 +86,7 @@ def agreement(found: Comparison) -> str:
 
 
 def quantity_cells(found: Comparison, each: ComparedQuantity) -> Iterator[tuple[str, str, str, str]]:
-    """The name of each result, its estimate, its interval, and whether it counts; then what the airframe's file has."""
+    """The name of each result, its estimate, its interval, and whether it counts; then the airframe file's value."""
     for name, answer, used in zip(found.names, each.answers, each.used, strict=True):
         if answer is None:
             yield name, DASH, "", "not estimated"
@@ -102,7 +102,7 @@ def quantity_cells(found: Comparison, each: ComparedQuantity) -> Iterator[tuple[
 def forest(found: Comparison, look: Style) -> Figure:
     """The 95 % intervals of each quantity by result, from top to bottom; band: pooled; grey, hollow: does not count.
 
-    Dashed: what the airframe's file has.
+    Dashed: the value in the airframe's file.
     """
     count, drawn = len(found.names), [each for each in found.quantities if any(each.answers)]
     figure, panels = grid(len(drawn), columns=3, height=0.9 + 0.19 * count)

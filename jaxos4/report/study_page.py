@@ -162,7 +162,7 @@ def _against_noise(
 
 
 def coverage(data: xr.Dataset) -> Figure | None:
-    """Share of intervals that hold the truth against the level that they claim, at each noise scale."""
+    """Share of intervals that contain the truth against the level that they claim, at each noise scale."""
     found = metrics.mean_coverage(data)
     if not found["coverage"].notnull().any():
         return None
@@ -184,7 +184,7 @@ def coverage(data: xr.Dataset) -> Figure | None:
         panel.set_ylim(lowest, 1.02)
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
         panel.grid(axis="x", visible=False)
-    label(figure, x="level claimed", y="intervals that hold the truth")
+    label(figure, x="level claimed", y="intervals that contain the truth")
     legend(figure, estimators)
     return figure
 

@@ -156,7 +156,7 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
 
 
 def _result_table(data: xr.Dataset) -> Table:
-    """The number of flights by result, mean rollouts, and the share of seed brackets that hold the truth."""
+    """The number of flights by result, mean rollouts, and the share of seed brackets that contain the truth."""
     counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
     occurs = np.flatnonzero((counts > 0).any([name for name in counts.dims if name != "code"]).values)
 

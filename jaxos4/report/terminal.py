@@ -215,7 +215,7 @@ def _of_vehicle(found: Identification) -> Section:
     if found.disturbances:
         levels = found.disturbances.items()
         gusts = ", ".join(f"{name} {x.strength:.2g} {x.unit} over {x.correlation_time:.2g} s" for name, x in levels)
-        yield f"disturbances that the model lacks, and their correlation time: {gusts}."
+        yield f"disturbances that the model does not explain, with their correlation time: {gusts}."
         sensors = ", ".join(f"{name} {x.sensor:.2g}" for name, x in levels)
         yield f"white noise of the sensors [rad/s; m/s^2]: {sensors}."
     if found.widened:
