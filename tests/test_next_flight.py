@@ -61,6 +61,7 @@ def test_terminal_and_page_end_with_it(tmp_path):
     assert " ".join(printed(found).split()).endswith(line)
     write_flight_page(tmp_path / "flight.html", found)
     says(words((tmp_path / "flight.html").read_text(encoding="utf-8")).replace("Next:", "next:"), line)
+    says(words(found._repr_html_()), line)
 
 
 def test_an_os4_that_does_not_show_a_parameter_is_told_to_design_a_flight():

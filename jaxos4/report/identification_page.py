@@ -68,7 +68,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         found=found,
         verdict=verdict(found),
         verdict_lines=warning_lines(found),
-        next_flight=next_flight([found], spreads_of(found)) if found.verdicts and found.has_answer else "",
+        next_flight="".join(_next(found)),
         center=[f"{x.axis} {plain(1e3 * x.value)} ± {plain(NINETY_FIVE * (1e3 * x.std), 2)} mm" for x in center],
         quantities=quantities(found),
         signals=identified_signals(found, look),
@@ -106,8 +106,12 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
 def identification_html(found: Identification) -> str:
     """Verdict, physical quantities and reservations, for a notebook."""
     rows = zip(*quantity_rows(physical_quantities(found)), strict=True)
-    lines = [*warning_lines(found), *(f"note: {note}" for note in found.provenance.notes)]
+    lines = [*warning_lines(found), *(f"note: {note}" for note in found.provenance.notes), *_next(found)]
     return render("summary.html.j2", verdict=verdict(found), rows=list(rows), lines=lines)
+
+
+def _next(found: Identification) -> list[str]:
+    return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
 
 
 def verdict(found: Identification) -> str:
