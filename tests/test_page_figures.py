@@ -82,10 +82,12 @@ def test_a_few_wild_samples_do_not_set_the_scale_of_the_gusts():
 
 def test_much_widened_intervals_are_a_warning(tmp_path):
     found = identified_vehicle(widened={"alpha3": 1.7, "alpha6": 2.4, "rotor_lag": 4.9})
-    said = "warning: parts of the flights disagree, so that intervals were widened 2.4 to 4.9 times: alpha6, rotor_lag."
+    said = "warning: parts of the flight disagree, so that intervals were widened 2.4 to 4.9 times: alpha6, rotor_lag."
     write_flight_page(tmp_path / "flight.html", found)
     for text in (found.summary(width=400), words((tmp_path / "flight.html").read_text(encoding="utf-8"))):
-        says(text, said, "The model lacks an effect")
+        says(text, said, "The model lacks an effect.")
+    several = identified_vehicle(widened=found.widened, provenance={"flights": ["a.csv", "b.csv"]})
+    says(several.summary(width=400), "The model lacks an effect, or the flights are not of one vehicle.")
     assert "warning" not in printed(identified_vehicle(widened={"alpha3": 1.9}))
 
 

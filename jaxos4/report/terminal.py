@@ -94,8 +94,9 @@ def warning_lines(found: Identification) -> list[str]:
     """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
     wide = {name: factor for name, factor in found.widened.items() if factor > _WIDENED}
     factors = sorted({f"{each:.1f}" for each in (min(wide.values(), default=1.0), max(wide.values(), default=1.0))})
-    said = f"warning: parts of the flights disagree, so that intervals were widened {' to '.join(factors)} times: "
-    lacking = f"{said}{', '.join(wide)}. The model lacks an effect, or the flights are not of one vehicle."
+    flights, other = ("flights", ", or the flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "")
+    said = f"warning: parts of the {flights} disagree, so that intervals were widened {' to '.join(factors)} times: "
+    lacking = f"{said}{', '.join(wide)}. The model lacks an effect{other}."
     return [*reason_lines(found.verdicts, found.doubts), *[lacking] * bool(wide)]
 
 
