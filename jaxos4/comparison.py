@@ -1,15 +1,19 @@
 """Results compared quantity by quantity: whether repeated flights agree, and the value that all of them give."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from .airframe import INERTIAS
 from .errors import InputError, printable
+from .identification.answers import UNIT
+from .identification.next_flight import next_flight, pooled_statuses
 from .identification.physical import PhysicalQuantity, physical_quantities
 from .identification.results import Identification
+from .identification.verdict import IDENTIFIED, RESERVED, STATUSES, pooled_status
 from .result_file import read_result
 from .results import NINETY_FIVE
 
@@ -25,6 +29,8 @@ class ComparedQuantity(NamedTuple):
       intervals say, `std` is widened by the square root of `chi2` over its degrees of freedom.
     - `chi2`, `p`: the weighted sum of squares about the mean, and the probability of this or more if all results have
       the same true value. NaN if fewer than two count.
+    - `status`: that of the mean: the worst of the results that count, or of all if none counts.
+    - `reference`: the value in the airframe's file, of a moment of inertia; NaN if the results have several.
     """
 
     name: str
@@ -35,6 +41,8 @@ class ComparedQuantity(NamedTuple):
     std: float
     chi2: float
     p: float
+    status: str
+    reference: float
 
     @property
     def ci95(self) -> tuple[float, float]:
@@ -45,15 +53,22 @@ class ComparedQuantity(NamedTuple):
 class Comparison(NamedTuple):
     """Results compared; made by `jaxos4.compare_results`.
 
-    - `names`: of the results. `quantities`: each that a result has.
+    - `names`: of the results. `flights`: the logs of each. `quantities`: each that a result has.
     - `notes`: what makes the results hard to compare.
     - `level`: the probability that any quantity is reported as different although all agree.
+    - `statuses`: of each quantity that has a verdict, by name: no better than those of the results that count.
+    - `reasons`: by the names of quantities, why they are not simply identified: each with the numbers of its results.
+    - `next_flight`: what to fly next, in one line.
     """
 
     names: tuple[str, ...]
+    flights: tuple[str, ...]
     quantities: tuple[ComparedQuantity, ...]
     notes: tuple[str, ...]
     level: float
+    statuses: Mapping[str, str]
+    reasons: tuple[str, ...]
+    next_flight: str
 
     @property
     def tested(self) -> tuple[ComparedQuantity, ...]:
@@ -95,26 +110,85 @@ def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Compar
             )
     tables = [{row.name: row for row in physical_quantities(each)} for each in every]
     listed = dict.fromkeys(name for table in sorted(tables, key=len, reverse=True) for name in table)
-    quantities = tuple(_compared(name, [table.get(name) for table in tables]) for name in listed)
-    return Comparison(names, quantities, tuple(_notes(names, every)), level)
+    statuses = pooled_statuses(every)
+    unseen = [name for name in INERTIAS if name in statuses and name not in listed]
+    quantities = tuple(
+        _compared(name, [table.get(name) for table in tables], statuses.get(name), _reference(name, every))
+        for name in sorted({**listed, **dict.fromkeys(unseen)}, key=lambda name: name not in INERTIAS)
+    )
+    flights = tuple(", ".join(printable(Path(log).name) for log in each.logs) for each in every)
+    found = Comparison(names, flights, quantities, tuple(_notes(names, every)), level, {}, tuple(_reasons(every)), "")
+    advice = next_flight(every, _spreads(quantities))
+    if different := found.different:
+        judged = {row.judged for each in different for row in each.answers if row is not None}
+        statuses |= {name: max(statuses[name], RESERVED, key=STATUSES.index) for name in judged & statuses.keys()}
+        which = ", ".join(each.name for each in different)
+        advice = f"next: first find out why the results differ in {which}; {advice.removeprefix('next: ')}"
+    return found._replace(statuses=statuses, next_flight=advice)
 
 
-def _compared(name: str, answers: list[PhysicalQuantity | None]) -> ComparedQuantity:
+def _reference(name: str, every: Sequence[Identification], *, same: float = 1e-3) -> float:
+    """The moment of inertia in the airframe's file; NaN if the results have several. `same`: see `_notes`."""
+    if name not in INERTIAS:
+        return np.nan
+    values = [float(np.asarray(each.airframe.inertia)[INERTIAS.index(name)]) for each in every]
+    return values[0] if np.allclose(values, values[0], rtol=same, atol=0) else np.nan
+
+
+def _spreads(quantities: Sequence[ComparedQuantity]) -> dict[str, float]:
+    """Half of the 95 % interval of each pooled moment of inertia, as a share of it; of all results if none counts."""
+    found = {}
+    for each in quantities:
+        rows = [row for row in each.answers if row is not None and row.std > 0]
+        if each.name not in INERTIAS or not rows:
+            continue
+        with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
+            weight = np.array([row.std for row in rows]) ** -2.0
+            all_together = weight.sum() ** -0.5, weight @ [row.value for row in rows] / weight.sum()
+            std, value = (each.std, each.value) if np.isfinite(each.value) else all_together
+            found[each.name] = float(NINETY_FIVE * std / np.abs(value))
+    return found
+
+
+def _reasons(every: Sequence[Identification]) -> list[str]:
+    """Why quantities are not simply identified, with the numbers of the results."""
+    places: dict[tuple[str, str], list[int]] = {}
+    for place, found in enumerate(every, start=1):
+        for name, verdict in found.verdicts.items():
+            for reason in verdict.reasons:
+                places.setdefault((name, reason), []).append(place)
+    quantities: dict[tuple[str, str], list[str]] = {}
+    for (name, reason), numbers in places.items():
+        quantities.setdefault((", ".join(map(str, numbers)), reason), []).append(name)
+    order = list(pooled_statuses(every))
+    rows = sorted(quantities.items(), key=lambda row: order.index(row[1][0]))
+    return [
+        f"{', '.join(names)} in result{'s' * (',' in numbers)} {numbers}: {reason}" for (numbers, reason), names in rows
+    ]
+
+
+def _compared(
+    name: str, answers: list[PhysicalQuantity | None], unseen: str | None, reference: float
+) -> ComparedQuantity:
+    """The mean of the answers that count. `unseen`: the status of a quantity without an answer."""
     from scipy.special import chdtrc  # slow to import
 
     used = tuple(each is not None and each.trusted and each.std > 0 for each in answers)
     rows = [each for each, counts in zip(answers, used, strict=True) if each is not None and counts]
-    unit = next(each.unit for each in answers if each is not None)
+    judged = [IDENTIFIED if each.verdict is None else each.verdict.status for each in answers if each is not None]
+    status, nan = pooled_status(judged or [unseen or IDENTIFIED]), np.nan
+    unit = next((each.unit for each in answers if each is not None), UNIT)
+    found = ComparedQuantity(name, unit, tuple(answers), used, nan, nan, nan, nan, status, reference)
     if not rows:
-        return ComparedQuantity(name, unit, tuple(answers), used, *4 * [np.nan])
+        return found
     values, std = np.array([each.value for each in rows]), np.array([each.std for each in rows])
     with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
         weight = np.square(std.min() / std)
         mean = float(weight @ values / weight.sum())
         chi2, free = float(np.square((values - mean) / std).sum()), len(rows) - 1
         error = float(std.min() / np.sqrt(weight.sum()) * np.sqrt(max(chi2 / max(free, 1), 1.0)))
-    tests = (chi2, float(chdtrc(free, chi2))) if free else (np.nan, np.nan)
-    return ComparedQuantity(name, unit, tuple(answers), used, mean, error, *tests)
+    found = found._replace(value=mean, std=error)
+    return found._replace(chi2=chi2, p=float(chdtrc(free, chi2))) if free else found
 
 
 def _notes(names: Sequence[str], every: Sequence[Identification], *, same: float = 1e-3) -> list[str]:

@@ -53,7 +53,7 @@ def test_estimate_recovers_the_truth_within_its_intervals(run):
     code, out, err, report = estimate(run, "--report", "e.html")
     assert code == 0, err
     page = words(pathlib.Path("e.html").read_text(encoding="utf-8"))
-    assert all(said in page for said in ("What was found", "Measured, predicted, residual", "What the residuals say"))
+    assert all(said in page for said in ("Physical quantities", "Measured, predicted, residual", "Residuals"))
     assert {"estimator", "model", "result", "rollouts", "cost", "seconds", "parameters", "fit"} <= report.keys()
     assert pathlib.Path("e.json").read_text().count('"ci95": [-') > 1  # a list of numbers is one line
     assert (report["estimator"], report["model"], report["result"]) == ("ibss", "published", "successful")

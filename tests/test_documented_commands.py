@@ -126,5 +126,7 @@ def test_the_commands_of_pages_run(story, run, tmp_path, request):
         if "--airframe-out" in line:
             mine.write_text(filled_in(mine.read_text(), vehicle))
     if story == "real":  # its verdicts are those that the page shows
-        (verdicts,) = re.findall(r"^identified:.*?(?=^quantity)", PAGES["README.md"], flags=re.DOTALL | re.MULTILINE)
+        (verdicts,) = re.findall(
+            r"^[^\n]*: identified\..*?(?=^quantity)", PAGES["README.md"], flags=re.DOTALL | re.MULTILINE
+        )
         assert " ".join(verdicts.split()) in said

@@ -10,6 +10,7 @@ from synthetic_results import AIRFRAME, VALUES, held, provenance, vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table
+from jaxos4.errors import InputError
 from jaxos4.export import TARGETS, export_vehicle, read_result
 from jaxos4.export.vehicle import CARRIED, rigid_vehicle
 
@@ -61,6 +62,32 @@ def test_what_is_exported_of_a_vehicle(write):
     assert (found.vehicle.inertia[2], found.vehicle.rotor_inertia) == (pytest.approx(2.9e-5), pytest.approx(2e-8))
     assert (found.vehicle.lag, found.vehicle.thrust_curve) == (0, 1)
     assert any(note.startswith("Iz: not identified") for note in found.notes)
+    assert any(note.startswith("rotor_lag: unknown, because the log has measured") for note in found.notes)
+
+
+def test_a_design_flies_the_vehicle_that_was_found(run, write, tmp_path, monkeypatch):
+    gust = {"strength": 3.0, "unit": "rad/s^2", "time_constant": 0.2, "sensor": 0.01, "correlation": 0.0}
+    gusts = {name: gust | {"strength": strength} for name, strength in zip("pqr", (3.0, 4.0, 1.0), strict=True)}
+    write(vehicle_result(disturbances=gusts))
+    asked = []
+
+    def stop(loop, **_):
+        asked.append(loop)
+        raise InputError("enough.")
+
+    monkeypatch.setattr(jaxos4, "design_references", stop)
+    refused(run("design", "found.json", "--out", "references.csv"), "enough.")
+    refused(run("design", "found.json", "--gust", "1", "--lag", "0.1", "--out", "references.csv"), "enough.")
+    found, changed = asked
+    vehicle = read_result(tmp_path / "found.json").vehicle
+    for name in ("inertia", "thrust_coefficient", "drag_coefficient", "rotor_inertia"):
+        np.testing.assert_allclose(getattr(found.airframe, name), getattr(vehicle, name))
+    np.testing.assert_allclose(found.gust, [3.0, 4.0, 1.0])
+    np.testing.assert_allclose(found.damping, [0.4, 0.5, 0.7])
+    assert [float(x) for x in (found.rotor_lag, found.rotor_delay, found.thrust_curve)] == [0.05, 0.01, 0.8]
+    assert (found.logged, float(changed.rotor_lag)) == ("commands", 0.1)
+    np.testing.assert_allclose(changed.gust, [1.0, 1.0, 1.0])
+    refused(run("design", "found.json", "--airframe", "x500", "--out", "r.csv"), "--airframe: found.json has its own")
 
 
 def test_what_a_simulator_lacks_and_what_is_replaced_or_does_not_vary_is_noted(write):

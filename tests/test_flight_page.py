@@ -44,8 +44,8 @@ def written(path, title="A flight", **changes):
 
 def test_the_page_says_what_was_found(tmp_path):
     text, shown = written(tmp_path / "flight.html")
-    assert text.index("All requested quantities are identified: Ix") < text.index("<main>")
-    says(shown, "identified: Ix 1.73e-05 +- 2.9e-07 kg m^2 (95 %), if", "Iz: the flights say less about alpha8 than")
+    assert text.index("Ix: identified. Iz: refused (not identified).") < text.index("<main>")
+    says(shown, "Iz: the flights say less about alpha8 than")
     says(
         shown,
         *("ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230", "57710 56710 to 58720 130"),
@@ -201,19 +201,22 @@ CAREFUL = Verdict("identified with a reservation", "", ("it is known to 20 % onl
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, "All requested quantities are identified: Ix."),
+        ({}, "Ix: identified. Iz: refused (not identified)."),
         (
             {"verdicts": {"Ix": CAREFUL, "Iy": Verdict("identified"), "Iz": CAREFUL}},
-            "All requested quantities are identified: Iy; identified with a reservation: Ix and Iz.",
+            "Iy: identified. Ix, Iz: use with care.",
         ),
-        ({"verdicts": {}}, "All requested quantities are identified."),
-        ({"result": "implausible", "verdicts": WRONG}, "Not to be trusted: Ix is contradicted."),
+        ({"verdicts": {}}, "No quantity was judged."),
+        ({"result": "implausible", "verdicts": WRONG}, "Ix: refused (contradicted)."),
         ({"result": "max_sweeps", "verdicts": {}}, "Not to be trusted: the search did not converge"),
         ({"result": "nonfinite_trajectory"}, "There is no answer: "),
     ],
 )
-def test_the_verdict_is_one_sentence(changes, said):
-    says(verdict(identified_vehicle(**changes)), said)
+def test_the_headline_has_every_quantity_and_is_that_of_the_terminal(changes, said):
+    found = identified_vehicle(**changes)
+    assert verdict(found).startswith(said)
+    if found.verdicts and found.has_answer:
+        assert printed(found).startswith(verdict(found))
 
 
 def test_the_inertias_of_all_sample_times_are_shown(tmp_path):

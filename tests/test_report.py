@@ -1,5 +1,6 @@
 """The report of a study: its files, every number in its tables, the trouble that it names, and what it refuses."""
 
+import csv
 import io
 import json
 import math
@@ -19,8 +20,8 @@ from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.estimators import ESTIMATORS as REGISTRY
-from jaxos4.report import error_table, study_page, write_report
-from jaxos4.report.study_tables import scenarios
+from jaxos4.report import error_csv, error_table, study_page, write_report
+from jaxos4.report.study_tables import scenario_tables, scenarios
 from jaxos4.report.style import drawing, log_axis, styles
 from jaxos4.report.text import DASH, percent, plain
 from jaxos4.study import metrics, read_results
@@ -71,14 +72,56 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
     folder = report[0].parent
     names = {path.relative_to(folder).as_posix() for path in report}
     assert names == {"report.html"} | {f"figures/{n}.svg" for n in OF_SCENARIO}
-    assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == names
+    written = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert written == names | {"specification.toml"}  # which the page's command names
+    assert "jaxos4 study specification.toml --out ." in report[0].read_text(encoding="utf-8")
+    assert (folder / "specification.toml").read_text() == study.attrs["specification"]
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     xr.testing.assert_equal(read_results(tmp_path), study)
-    code, out, err = run("report", str(tmp_path))
+    code, out, err = run("report", str(tmp_path), "--csv", str(tmp_path / "errors.csv"))
     assert (code, err) == (0, "")
     assert "4 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
+
+
+def test_the_csv_has_every_number(study):
+    rows = list(csv.DictReader(io.StringIO(error_csv(study))))
+    data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
+    error, efficiency = metrics.estimator_error(data), metrics.efficiency(data)
+    assert len(rows) == error["absolute"].size
+    for row in rows:
+        at = {"scale": float(row["noise_scale"]), "estimator": row["estimator"], "parameter": row["parameter"]}
+        for name, value in (("rms_error", error["absolute"]), ("efficiency_low", efficiency["low"])):
+            expected = float(value.sel(at))
+            assert (row[name] == "") == math.isnan(expected)
+            assert not row[name] or float(row[name]) == pytest.approx(expected, rel=1e-5)
+    alpha7 = [row for row in rows if row["parameter"] == "alpha7"]
+    assert {(row["unit"], row["rms_error_percent"], row["model"]) for row in alpha7} == {("1", "", "published")}
+
+
+def test_the_unit_in_a_head_is_that_of_the_cells_below_it():
+    """alpha7 is 0, so that no error is a share of it; alpha2 and alpha5 are below the noise floor."""
+    study = synthetic_study(flights=24, estimators=("ibss", "network"))
+    data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
+    units = dict(scenario_tables(data)["error"].headings)
+    assert units["alpha3"] == units["alpha8"] == "%"
+    assert (units["alpha7"], units["alpha2"]) == ("1", "1/s")
+    mixed = data.assign(truth=data["truth"].where(data["parameter"] != "alpha3", data["truth"] * (data["scale"] < 5)))
+    assert dict(scenario_tables(mixed)["error"].headings)["alpha3"] == "%; marked: 1/(kg m^2)"
+
+
+def test_no_line_hides_another_and_a_title_says_who_sees_which_channels(study, report):
+    data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
+    with drawing():
+        figures = [study_page.errors(data), study_page.overview(data)]
+    for figure in figures:
+        lines = [[line for line in figure.axes[0].lines if line.get_gid() == f"estimator-{i}"][0] for i in range(4)]
+        widths = [line.get_linewidth() for line in lines]
+        assert widths == sorted(widths, reverse=True)
+        assert len({*widths}) == 4
+    said = "Not of the same channels: ibss, hybrid see all; network, svsf see rates"
+    assert said in words(report[0].read_text(encoding="utf-8"))
 
 
 def test_every_number_in_the_tables(study, page):
@@ -132,11 +175,11 @@ def test_trouble_is_named(report):
         "noise x 0.1, ibss, flight 1: at bound",
         "noise x 0.1, ibss, flight 3: nonfinite trajectory",
         "noise x 10, ibss, flight 2: max sweeps",
-        "3 flights that did not end successful",
+        "3 flights without a successful result",
         "† absolute error, in the parameter's unit: the truth is 0",
         "‡ absolute error, in the parameter's unit: below the noise floor",
-        "jaxos4 study synthetic.toml --out synthetic",
-        *(f"[{UNITS[place]}]" for place in (0, 1, 6)),
+        "jaxos4 study specification.toml --out .",
+        *("alpha1 [%]", *(f"[{UNITS[place]}]" for place in (1, 6))),
     ):
         assert said in shown, said
 
@@ -157,7 +200,7 @@ def test_a_study_of_one_flight_shows_the_answer_and_no_statistics(tmp_path):
     one = study.isel({name: 0 for name in SCENARIO} | {"flight": 0, "scale": 1})
     half = one["half_width"].sel(level=0.95).values
     held = int((abs(one["estimate"] - one["truth"]).values <= half).sum())
-    assert f"ibss at noise x 1: successful, {held} of 3 intervals hold the truth." in shown
+    assert f"ibss at noise x 1: successful, {held} of 3 intervals contain the truth." in shown
     for k, name in enumerate(study["parameter"].values):
         row = {heading: cells["noise x 1, ibss", name, heading][0] for heading in ("truth", "estimate", "interval")}
         value = float(one["estimate"][k])

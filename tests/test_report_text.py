@@ -23,7 +23,7 @@ def test_the_text_of_a_flight():
     says(
         printed(identified_flight()),
         *("alpha3 1/(kg m^2) 57712 [56709, 58716] 1.3e+02", "alpha6 1/(kg m^2) - - - not identifiable: not excited"),
-        *("cannot be distinguished from 0.", "multiple of the noise: alpha2 0.25.", "p 97.5, q 81.3"),
+        *("cannot be distinguished from 0.", "sensors that are quieter by a factor of 4.0 (alpha2).", "p 97.5, q 81.3"),
         "The residuals of q are not white noise: the model does not explain",
         *(f"{test}, tests at 1 %: not those of q." for test in (white, free)),
         "Ix 1.733e-05 +- 2.9e-07, J_R below noise; the alphas agree with one rigid body, p = 0.21.",
@@ -59,7 +59,7 @@ def test_the_text_of_a_flight_warns_and_is_short_without_an_answer(changes, said
 def test_the_text_of_a_vehicle(tmp_path):
     says(
         printed(identified_vehicle()),
-        *("alpha3 1/(kg m^2) 5.771e+04 [5.671e+04, 5.872e+04]", "held, not identifiable: alpha1 -0.8125."),
+        *("alpha3 1/(kg m^2) 5.771e+04 [5.671e+04, 5.872e+04]", "fixed, not identifiable: alpha1 -0.8125."),
         *("Ix 1.733e-05 +- 2.9e-07 (if arms and mass are right)", "(377 starts)", "0.50 s - +- -"),
         "0.25 s 0.73 +- 0.14 0.73 +- 0.14 0.73 +- 0.14 0.41, 0.41, 0.41",
         "flight model (offset, damping), 32 s, a sample every 4 ms: successful, 812 rollouts",
@@ -68,7 +68,7 @@ def test_the_text_of_a_vehicle(tmp_path):
     doubtful = printed(identified_vehicle(disturbances=gusts, widened={"alpha3": 1.7}, verdicts=WRONG, skill=None))
     says(
         doubtful,
-        *("contradicted: Ix.", "Ix: Ix is negative; check the arms.", "by the factor: alpha3 1.7."),
+        *("Ix: refused (contradicted).", "Ix: Ix is negative; check the arms.", "by the factor: alpha3 1.7."),
         *("their correlation time: p 1.2 rad/s^2 over 0.1 s.", "white noise of the sensors [rad/s; m/s^2]: p 0.02."),
     )
     assert "Predictions" not in doubtful

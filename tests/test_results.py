@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import CRAZYFLIE, refused
 from matplotlib.figure import Figure
-from pages import printed, stands_alone, words
+from pages import printed, says, stands_alone, words
 from rich.console import Console
 from strange import survives_strange_values
 from synthetic_identification import (
@@ -189,7 +189,8 @@ def test_a_result_shows_itself(tmp_path):
     lines = found.summary().splitlines()
     assert max(map(len, lines)) <= 80
     place = [
-        next(i for i, line in enumerate(lines) if line.startswith(said)) for said in ("identified: ", "Ix ", "Iz: ")
+        next(i for i, line in enumerate(lines) if line.startswith(said))
+        for said in ("Ix: identified.", "Ix ", "Iz: the")
     ]
     assert place == sorted(place)  # verdict, quantities, reservations
     assert place[1] < 5
@@ -197,7 +198,7 @@ def test_a_result_shows_itself(tmp_path):
     assert "alpha3" in found.summary(verbose=True)
     assert any(line.startswith("Ix") and line.endswith("if arms and mass are right") for line in wide(found))
     shown = found._repr_html_()
-    assert "All requested quantities are identified: Ix." in shown
+    assert "Ix: identified. Iz: refused (not identified)." in shown
     assert "1.733e-05" in shown
     evil = identified_vehicle(verdicts={"Ix": Verdict("contradicted", "", ("<script>",))})
     assert "<script>" not in evil._repr_html_()
@@ -205,7 +206,7 @@ def test_a_result_shows_itself(tmp_path):
 
 def test_verdicts_have_colours_on_a_terminal_alone():
     shown = {"force_terminal": True, "color_system": "standard", "no_color": False}
-    for options, begin in ((shown, "\x1b[32midentified: "), ({"force_terminal": False}, "identified: ")):
+    for options, begin in ((shown, "\x1b[32mIx: identified."), ({"force_terminal": False}, "Ix: identified.")):
         console = Console(width=80, file=io.StringIO(), **options)
         print_identification(console, identified_vehicle())
         assert console.file.getvalue().startswith(begin)
@@ -284,7 +285,7 @@ def files(tmp_path):
 def test_three_results_that_agree_are_pooled_and_one_that_does_not_is_named(run, tmp_path, files):
     code, out, err = run("compare", *files[:3])
     assert (code, err) == (0, "")
-    assert out.startswith("The results agree in all 2 quantities")
+    assert out.startswith("The results agree within their intervals in all 2 quantities")
     agree = jaxos4.compare_results([tmp_path / name for name in files[:3]])
     ix, iy = agree.quantities
     errors = (np.array(AGREE) - np.mean(AGREE)) / 2e-7
@@ -315,8 +316,55 @@ def test_what_a_verdict_refuses_is_shown_and_does_not_count(tmp_path):
     assert found.quantities[0].value == pytest.approx(np.mean(AGREE))
     console = Console(width=80, file=io.StringIO())
     print_comparison(console, found)
-    assert "not counted: contradicted" in console.file.getvalue()
+    assert "not counted: refused (contradicted)" in " ".join(console.file.getvalue().split())
     assert "not to be trusted as a whole" in console.file.getvalue()
+
+
+CAREFUL = Verdict("identified with a reservation", "", ("it is known to 16 % only; fly more roll, or longer",))
+UNSEEN = Verdict("not identified", "", ("the disturbance is larger; fly more yaw",))
+
+
+def test_a_comparison_is_not_more_confident_than_its_results(tmp_path, run):
+    """Two of three have a reservation about Ix, and none has an Iz."""
+    good = {"Ix": Verdict("identified"), "Iy": Verdict("identified"), "Iz": UNSEEN}
+    results = [
+        msgspec.structs.replace(of_inertias(ix, std, provenance={"flights": [f"{i}.csv"]}), verdicts=verdicts)
+        for i, (ix, std, verdicts) in enumerate(
+            ((1.66e-5, 1e-6, good), (1.7e-5, 1e-6, good | {"Ix": CAREFUL}), (1.62e-5, 2e-6, good | {"Ix": CAREFUL}))
+        )
+    ]
+    found = jaxos4.compare_results(results)
+    assert found.statuses == {"Ix": CAREFUL.status, "Iy": "identified", "Iz": "not identified"}
+    assert [each.status for each in found.quantities[:3]] == list(found.statuses.values())
+    assert found.flights == ("0.csv", "1.csv", "2.csv")
+    assert found.quantities[0].reference == pytest.approx(float(CRAZYFLIE.inertia[0]))
+    assert found.quantities[2].answers == (None, None, None)
+    console = Console(width=80, file=io.StringIO())
+    print_comparison(console, found)
+    out = " ".join(console.file.getvalue().split())
+    says(
+        out,
+        "Iy: identified. Ix: use with care. Iz: refused (not identified). The results agree",
+        "Ix in results 2, 3: it is known to 16 % only; fly more roll, or longer.",
+        "Iz in results 1, 2, 3: the disturbance is larger; fly more yaw.",
+        *("airframe's file", "result 2: 1.csv, of 1.csv", "A wrong mass or arm length is wrong in all results"),
+    )
+    assert out.endswith("next: fly more yaw (Iz).")
+    for i, result in enumerate(results):
+        written(result, tmp_path / f"{i}.json")
+    code, *_ = run("compare", "0.json", "1.json", "2.json", "--report", "page.html")
+    assert code == 0
+    page = words((tmp_path / "page.html").read_text(encoding="utf-8"))
+    says(
+        page,
+        "Iy: identified. Ix: use with care. Iz: refused",
+        "Ix in results 2, 3",
+        "Dashed: the value in the airframe's file",
+    )
+    says(page, "Next: ")
+    other = of_inertias(2.3e-5, 1e-7, provenance={"flights": ["3.csv"]})
+    differs = jaxos4.compare_results([*results, msgspec.structs.replace(other, verdicts=good)])
+    assert differs.next_flight.startswith("next: first find out why the results differ in Ix; ")
 
 
 def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):

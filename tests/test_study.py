@@ -191,7 +191,11 @@ def test_every_variable_has_a_name_and_a_unit_and_the_attributes_are_those_of_th
     study, attributes = load_study(specification(tmp_path, SPECIFICATION)), dict(dataset.attrs)
     (tmp_path / "again.toml").write_text(attributes.pop("specification"))
     assert load_study(tmp_path / "again.toml") == study
-    software = {"version": jaxos4.__version__, "jax": jax.__version__, "command": "jaxos4 study study.toml --out DIR"}
+    software = {
+        "version": jaxos4.__version__,
+        "jax": jax.__version__,
+        "command": "jaxos4 study specification.toml --out .",
+    }
     numbers = {"title": study.title, "precision": "float64", "seed": 5, "failures": "[]"}
     assert attributes == {"device": "these tests", **software, **numbers}
 

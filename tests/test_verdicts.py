@@ -136,6 +136,12 @@ def test_predictions_reach_as_far_as_their_skill_is_clear():
     found = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, clear, poor, clear), ["yaw"])
     assert found.value == "better than constant rates up to roll 0.5 s, pitch 0.1 s ahead"
     assert found.reservations == ("yaw cannot be checked; fly more yaw",)
+    never = RateSkill([0.05, -0.1, -0.2], [0.1, 0.1, 0.1], *[[None] * 3] * 3)
+    one = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, never, clear, clear), ["yaw"])
+    assert one.value == "better than constant rates up to pitch 0.5 s ahead; no better for roll"
+    none = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, never, never, clear), ["yaw"])
+    said = "roll and pitch cannot be predicted better than by constant rates; fly more roll and pitch"
+    assert none == Quantity(missing=said)
 
 
 def test_the_result_is_that_of_what_was_asked():
@@ -260,13 +266,16 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
 
 def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
-    table = dict.fromkeys(("alpha3", "alpha6", "thrust_gain", "rotor_delay"), row)
-    constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy")}
-    said = vehicle_quantities(fitted[1].answer, table, constants, None, [])
-    outside = {name: [x for x in said[name].reservations if "outside" in x] for name in ("Ix", "thrust", "motors")}
-    remedies = {name: each.partition("; ")[2] for name, (each,) in outside.items()}
-    checked = "check the airframe, or give a wider `bracket`"
-    assert remedies == {"Ix": checked, "thrust": checked, "motors": "give a wider `bracket`"}
+    table = dict.fromkeys(("alpha3", "alpha6", "alpha8", "thrust_gain", "rotor_delay"), row)
+    constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy", "Iz")}
+    found = vehicle_quantities(fitted[1].answer, table, constants, None, [])
+    wider = [each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations if "wider" in each]
+    assert wider == [
+        "Ix is 2.5 times the guess; check `mass` and `rotor_positions`, or give a wider `bracket`",
+        "Iz is 2.5 times the guess; measure `drag_coefficient`, or give a wider `bracket`",
+        "thrust_gain is outside its bracket; check the airframe, or give a wider `bracket`",
+        "rotor_delay is outside its bracket; give a wider `bracket`",
+    ]
 
 
 def without_the_strongest_thrust(flight):

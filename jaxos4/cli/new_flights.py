@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
 import jaxos4
 
@@ -34,6 +34,7 @@ SensorsOption = Annotated[
 # The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
 _OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": None, "noise": 0.0, "method": "euler"}
 _OPEN |= {"model": "published", "excitation": "multisine", "channels": "all", "initial_state": "free"}
+_PRESET = "os4"
 _CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
 _CLOSED |= {"sensors": None, "references": None}
 _RANGES = {"gust": (0, 1e6), "lag": (0, 1), "delay": (0, 1), "noise": (0, 1e6), "accuracy": (1e-6, 1e6)}
@@ -125,7 +126,11 @@ def _open_loop(asked: dict[str, Any]) -> tuple["jaxos4.Flight", str]:
 
 def design(
     out: Annotated[Path, Option(help="The CSV to write: rotor speeds; with --closed-loop: references.")],
-    airframe: options.AirframeOption = "os4",
+    result: Annotated[
+        Path | None,
+        Argument(metavar="[RESULT.json]", help="A vehicle: a file of `jaxos4 estimate --out`. With it, --closed-loop."),
+    ] = None,
+    airframe: options.AirframeOption = _PRESET,
     closed_loop: Annotated[
         bool, Option("--closed-loop", help="References for a real vehicle, which flies under its controller.")
     ] = False,
@@ -165,8 +170,13 @@ def design(
 
     Designs rotor speeds; with --closed-loop, references for a controller.
     """
+    closed_loop = closed_loop or result is not None
     asked = of_kind(closed_loop, locals())
-    check_outputs(airframe, bracket, out=out, figure=figure)
+    if result is not None:
+        if airframe != _PRESET:
+            raise InputError(f"--airframe: {result} has its own; leave it out.")
+        asked["gust"] = gust  # that of the result, if none is given
+    check_outputs(result, None if result else airframe, bracket, out=out, figure=figure)
     begin = time.perf_counter()
     with stages("loading the library") as progress, option_names(bracket=bracket):
         found = _find(asked, progress)
@@ -221,14 +231,18 @@ def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def make_loop(asked: Mapping[str, Any]) -> "jaxos4.ClosedLoop":
-    """The vehicle in closed loop with these options."""
+    """The vehicle in closed loop with these options; that of a result, if there is one."""
+    settings = options.given(rotor_lag=asked["lag"], rotor_delay=asked["delay"])
+    if asked.get("result") is not None:
+        from ..export import found_loop
+
+        return found_loop(asked["result"], **settings, **options.given(gust=asked["gust"], logged=asked["sensors"]))
     vehicle = jaxos4.load_airframe(asked["airframe"])
     logged, scaled = asked["sensors"], vehicle.has_full_scale
     if logged == "commands" and not scaled:
         raise InputError(
             f"--sensors commands: {asked['airframe']} has no max_rotor_speed [rad/s]; set it, or log speeds."
         )
-    settings = options.given(rotor_lag=asked["lag"], rotor_delay=asked["delay"])
     return jaxos4.ClosedLoop(
         vehicle, logged=logged or ("commands" if scaled else "speeds"), gust=asked["gust"], **settings
     )

@@ -14,6 +14,7 @@ from typer import Argument, Option
 
 import jaxos4
 
+from .._files import write_file
 from ..errors import InputError, in_words, printable
 from ._shared import ESTIMATORS, check_outputs, stages
 
@@ -109,6 +110,9 @@ def _connected(address: str):
 def report(
     source: Annotated[Path, Argument(metavar="SOURCE", help="The folder of a study, or a file of `estimate --out`.")],
     out: Annotated[Path | None, Option(help="Of a file: the page to write. Default: beside it, as .html.")] = None,
+    csv: Annotated[
+        Path | None, Option(help="Of a study: errors, bounds, efficiency and coverage as a table (CSV).")
+    ] = None,
 ) -> None:
     """Make the page of a result, or the report of a study.
 
@@ -118,6 +122,10 @@ def report(
     if not source.exists():
         raise InputError(
             f"{source}: is not there; give the folder of a `jaxos4 study`, or a file of `jaxos4 estimate --out`."
+        )
+    if not source.is_dir() and csv is not None:
+        raise InputError(
+            f"--csv: {source} is a result; `found.to_dataframe()` in Python makes its table. Leave it out."
         )
     if not source.is_dir():
         check_outputs(source, out=page)
@@ -129,6 +137,9 @@ def report(
         if source.is_dir():
             dataset = jaxos4.study.read_results(source)
             progress("drawing")
+            if csv is not None:
+                check_outputs(source / "results.nc", csv=csv)
+                write_file(csv, jaxos4.report.error_csv(dataset))
             page, *figures = jaxos4.report.write_report(dataset, source)
         else:
             found = jaxos4.read_result(source)
@@ -137,6 +148,8 @@ def report(
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
         typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")
+    if csv is not None:
+        typer.echo(f"{csv}: errors, bounds, efficiency and coverage")
 
 
 def compare(

@@ -182,6 +182,10 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
     for axis in AXES:
         if axis.inverse not in found:
             notes.append(f"{axis.inertia}: not identified; a guess, from the airframe or from the bracket")
+    if "rotor_lag" not in values:
+        notes.append(
+            "rotor_lag: unknown, because the log has measured rotor speeds; rotors follow commands at once here"
+        )
     for names, why in _NOT_CARRIED.items():
         some = [name for name in found if without_recording(name) in names]
         if some:

@@ -34,7 +34,7 @@ from .results import (
 from .search import Optimum
 
 UNIT = "kg m^2"
-NEGATIVE_NOTE = "came out negative, which is impossible; at the limit"
+NEGATIVE_NOTE = "negative, which is impossible; set to 0"
 
 
 class Tables(NamedTuple):

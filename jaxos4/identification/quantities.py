@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..airframe import AXES
+from ..airframe import AXES, YAW
 from ..models.abstract import PARAMETER_NAMES
 from ..results import NINETY_FIVE
 from .answers import Answer
@@ -46,11 +46,17 @@ def vehicle_quantities(
 
 def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:
     """Notes on parameters that rest on a bracket, lie outside it, or are at their limit."""
-    parameters = answer.problem.model.parameters
+    parameters, guessed = answer.problem.model.parameters, {axis.inverse: axis.inertia for axis in AXES}
     found, of_airframe = [], {each.name for each in parameters if each.scales_torque or callable(each.center)}
     for name, row in rows.items():
         if name in answer.negative:
-            found.append(f"{name} came out negative, which is impossible")
+            found.append(f"{name} is negative, which is impossible; it is 0 here")
+        elif row.is_outside_bracket and name in guessed and row.estimate and isinstance(row.bracket, tuple):
+            ratio = sum(row.bracket) / 2 / row.estimate
+            check = (
+                "measure `drag_coefficient`" if guessed[name] == YAW.inertia else "check `mass` and `rotor_positions`"
+            )
+            found.append(f"{guessed[name]} is {ratio:.2g} times the guess; {check}, or give a wider `bracket`")
         elif row.is_outside_bracket:
             # Only an airframe that has such a constant can be wrong about it.
             check = "check the airframe, or " if name in (*PARAMETER_NAMES, *of_airframe) else ""
@@ -63,16 +69,24 @@ def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> 
     """The horizon up to which predictions beat constant rates by a standard error, about each axis that moves."""
     if skill is None:
         return Quantity(missing="nothing was held out; give `holdout` or `validate`")
-    ahead = []
+    ahead, poor = [], []
     for axis in (each for each in AXES if each.motion not in still):
         own, longest = getattr(skill, axis.rate), 0.0
         for horizon, value, std in zip(skill.horizons, own.skill, own.std, strict=True):
             if value is not None and value <= (std or 0.0):
                 break
             longest = horizon if value is not None else longest
-        ahead.append(f"{axis.motion} {longest:.2g} s")
+        if longest:
+            ahead.append(f"{axis.motion} {longest:.2g} s")
+        else:
+            poor.append(axis.motion)
     unseen = (f"{' and '.join(still)} cannot be checked; fly more {' and '.join(still)}",) if still else ()
-    return Quantity(f"better than constant rates up to {', '.join(ahead)} ahead" * bool(ahead), reservations=unseen)
+    if poor and not ahead:
+        motions = " and ".join(poor)
+        return Quantity(missing=f"{motions} cannot be predicted better than by constant rates; fly more {motions}")
+    reach = f"better than constant rates up to {', '.join(ahead)} ahead" if ahead else ""
+    worse = f"; no better for {' and '.join(poor)}" if poor else ""
+    return Quantity(reach + worse, reservations=unseen)
 
 
 def os4_quantities(table: dict[str, ParameterEstimate], body: RigidBody) -> dict[str, Quantity]:

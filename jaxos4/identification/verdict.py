@@ -3,7 +3,7 @@
 A doubt counts against a quantity by how far the quantity would move if the doubt were true.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -17,6 +17,13 @@ CONTRADICTED = "contradicted"
 STATUSES = (IDENTIFIED, RESERVED, MISSING, CONTRADICTED)
 """From the best to the worst."""
 _TRUSTED = (IDENTIFIED, RESERVED)
+ADVICE = {
+    IDENTIFIED: "identified",
+    RESERVED: "use with care",
+    MISSING: "refused (not identified)",
+    CONTRADICTED: "refused (contradicted)",
+}
+"""Whether to use a quantity, by its status, in words."""
 
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 
@@ -214,28 +221,37 @@ def _reason(doubt: Doubt, name: str) -> str:
     return f"{doubt} (this would move {', '.join(sizes)})" if sizes else str(doubt)
 
 
-def status_lines(verdicts: dict[str, Verdict], tabled: Collection[str] = ()) -> list[str]:
-    """The quantities by their status. `tabled`: those whose value stands in a table, and not here."""
-    lines = []
-    for status in STATUSES:
-        said = [
-            f"{name} {verdict.value}".strip() if verdict.trusted and name not in tabled else name
-            for name, verdict in verdicts.items()
-            if verdict.status == status
-        ]
-        lines += [f"{status}: {(', ' if tabled else '; ').join(said)}."] * bool(said)
-    return lines
+def headline(statuses: Mapping[str, str]) -> dict[str, str]:
+    """Whether to use the quantities of each status that occurs, in one sentence, from the best status to the worst.
+
+    Terminal, page, notebook and comparison all begin with these sentences. `statuses`: by quantity.
+    """
+    named = {status: [name for name, own in statuses.items() if own == status] for status in STATUSES}
+    return {status: f"{', '.join(names)}: {ADVICE[status]}." for status, names in named.items() if names}
+
+
+def statuses_of(verdicts: Mapping[str, Verdict]) -> dict[str, str]:
+    """The status of each quantity."""
+    return {name: verdict.status for name, verdict in verdicts.items()}
+
+
+def pooled_status(statuses: Iterable[str]) -> str:
+    """The status of the mean of several results: the worst of those that count, or of all if none counts."""
+    given = list(statuses)
+    return max([each for each in given if each in _TRUSTED] or given, key=STATUSES.index)
 
 
 def reason_lines(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
-    """Each reason with the quantities that it concerns, then mere notes."""
+    """How far predictions reach; each reason with the quantities that it concerns; then mere notes."""
     concerned: dict[str, list[str]] = {}
     for status in STATUSES:
         for name, verdict in verdicts.items():
             for reason in verdict.reasons if verdict.status == status else ():
                 concerned.setdefault(reason, []).append(name)
     notes = [doubt for doubt in doubts if all(doubt.status_left(name) == IDENTIFIED for name in verdicts)]
+    predicted = verdicts.get(PREDICTIONS)
     return [
+        *([f"{PREDICTIONS}: {predicted.value}."] if predicted is not None and predicted.trusted else []),
         *(f"{', '.join(names)}: {reason}." for reason, names in concerned.items()),
         *(f"note: {doubt}. It affects no quantity." for doubt in notes if verdicts),
     ]

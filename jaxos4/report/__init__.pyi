@@ -7,7 +7,7 @@ from .log_page import write_log_page as write_log_page
 from .plots import Plots as Plots
 from .prediction import print_prediction as print_prediction, write_prediction_figure as write_prediction_figure
 from .study_page import write_report as write_report
-from .study_tables import error_table as error_table
+from .study_tables import error_csv as error_csv, error_table as error_table
 from .terminal import (
     identification_summary as identification_summary,
     print_identification as print_identification,

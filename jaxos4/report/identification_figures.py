@@ -10,10 +10,10 @@ from jaxtyping import Float
 from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Patch
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-from ..airframe import INERTIAS, Airframe
+from ..airframe import INERTIAS, MOTIONS, Airframe
 from ..analysis.diagnostics import Correlations
 from ..analysis.frequency_response import RESPONSE, AxisResponse, FrequencyResponse
 from ..analysis.inertia import CenterOfMass
@@ -23,6 +23,8 @@ from ..identification.results import Constant, Identification, SampleTime
 from ..models.state import CASCADE_ORDER
 from ..results import NINETY_FIVE
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, grid, label, style, ticks_at
+
+_FAR = (2, 10, 100, 1000, 10000, 100000)  # ticks of brackets that were left far behind, in half-widths
 
 
 def priors(found: Identification, look: Style) -> Figure | None:
@@ -35,15 +37,20 @@ def priors(found: Identification, look: Style) -> Figure | None:
     if not rows:
         return None
     figure, (panel,) = grid(1, columns=1, width=3.3, height=0.5 + 0.19 * len(rows))
+    reach = 2.0
     for place, (bracket, value, interval) in enumerate(rows.values()):
         center, half = np.mean(bracket), (bracket[1] - bracket[0]) / 2
-        low, high = np.clip((np.array(interval) - center) / half, -2, 2)
+        low, at, high = (np.array([interval[0], value, interval[1]]) - center) / half
+        reach = max(reach, abs(low), abs(high))
         panel.barh(place, 2, left=-1, height=0.7, color=FAINT, alpha=0.3, linewidth=0)
         panel.plot([low, high], [place, place], color=look.color, linewidth=2.2)
-        panel.plot(np.clip((value - center) / half, -2, 2), place, look.marker, color=look.color, markersize=3.5)
+        panel.plot(at, place, look.marker, color=look.color, markersize=3.5)
     panel.set_yticks(range(len(rows)), [name.replace("_", " ") for name in rows])
     panel.set_ylim(len(rows) - 0.4, -0.6)
-    panel.set_xlim(-2, 2)
+    if reach > 5:  # one parameter far away would shrink all others to dots
+        panel.set_xscale("symlog", linthresh=2.0, linscale=2.0)
+        ticks_at(panel.xaxis, [-x for x in _FAR if x < reach] + [-1, 0, 1] + [x for x in _FAR if x < reach])
+    panel.set_xlim(-1.1 * reach, 1.1 * reach)
     panel.grid(axis="y", visible=False)
     label(figure, x="from the centre of the bracket, in half-widths")
     return figure
@@ -66,14 +73,17 @@ def residual_figure(found: Correlations) -> Figure:
         most = float(np.max(found.torque_bound[i]))
         crossed.axhspan(-most, most, color=FAINT, alpha=0.3, linewidth=0)
         for place, dash in enumerate((0, 2, 1)):
-            values = found.with_torque[i, place]
-            crossed.plot(
-                range(-lags, lags + 1), values, color=style(place).color, linestyle=BOUND_DASHES[dash], linewidth=1.1
-            )
+            values, look = found.with_torque[i, place], {"color": style(place).color, "linestyle": BOUND_DASHES[dash]}
+            crossed.plot(range(-lags, lags + 1), values, label=f"{MOTIONS[place]} torque", linewidth=1.1, **look)
+        if i == 0:  # in the panels, because a page shows each panel by itself
+            own.legend([Patch(color=FAINT, alpha=0.3)], ["95 % by chance"], fontsize=7, loc="upper right")
+            crossed.legend(fontsize=7, loc="upper right", ncols=3, handlelength=2.4)
         crossed.set_title(f"{name}: with the torques")
         for panel, values, bound in ((own, found.own[i], found.bound[i]), (crossed, found.with_torque[i], most)):
-            reach = 1.15 * max(float(np.abs(values).max(initial=0.0)), bound, 0.05)
-            panel.set_ylim(-min(reach, 1.15), min(reach, 1.15))
+            # The first panels have room for their legends.
+            reach = (1.6 if i == 0 else 1.15) * max(float(np.abs(values).max(initial=0.0)), bound, 0.05)
+            reach = min(reach, 1.6 if i == 0 else 1.15)
+            panel.set_ylim(-reach, reach)
             panel.axhline(0, color=INK, linewidth=0.7)
             panel.grid(visible=False)
             panel.yaxis.set_major_locator(MaxNLocator(2, steps=[1, 2, 5, 10]))
@@ -129,7 +139,7 @@ def correlations(found: Identification) -> Float[np.ndarray, "parameters paramet
 
 
 def correlation_matrix(found: Identification, *, least: float = 0.05, most: int = 400) -> Markup:
-    """The correlations of the parameters as an SVG: a square for each pair, hollow if negative.
+    """The correlations of the parameters as an SVG: a square for each pair, hollow if negative; rows and columns named.
 
     Those below `least` are left out; if there are more than `most`, the smallest too.
     """
@@ -147,7 +157,9 @@ def correlation_matrix(found: Identification, *, least: float = 0.05, most: int 
             tip = escape(f"{name}, {names[column]}: {value:.2f}")
             box = f'x="{x - half:.1f}" y="{y - half:.1f}" width="{2 * half:.1f}" height="{2 * half:.1f}"'
             marks.append(f'<rect class="{"plus" if value > 0 else "minus"}" {box}><title>{tip}</title></rect>')
-    width, height = room + cell * len(names), cell * len(names)
+        x = room + cell * (row + 1) + 3  # beside the diagonal, where the column of this parameter begins
+        marks.append(f'<text x="{x}" y="{y + 4}">{escape(name.replace("_", " "))}</text>')
+    width, height = 2 * room + cell * len(names), cell * len(names)
     shape = f'viewBox="0 0 {width} {height}" style="max-width: {1.5 * width:.0f}px"'
     return Markup(f'<svg class="matrix" {shape}>{"".join(marks)}</svg>')  # noqa: S704  # names are escaped
 
@@ -160,8 +172,9 @@ def strongest(found: Identification, *, least: float = 0.9, most: int = 5) -> li
     return sorted((pair for pair in pairs if abs(pair[2]) > least), key=lambda pair: -abs(pair[2]))[:most]
 
 
-GAINS = (0.2, 5.0)
-"""The gains that a figure of the response shows."""
+GAINS = (0.5, 2.0)
+"""The gains that a figure of the response shows at least: verdicts are about some percent."""
+_WIDEST = (0.2, 5.0)  # and at most: what reaches further is unknown
 
 
 def gain_band(one: AxisResponse) -> Float[np.ndarray, "2 frequencies"]:
@@ -234,9 +247,15 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
         draw_response(gain, axis, axis.gain, gain_band(axis), 1.0, look.color)
         draw_response(phase, axis, degrees, np.array([degrees - spread, degrees + spread]), 0.0, look.color)
         coherence.plot(axis.frequency, axis.coherence, color=look.color)
+        mean, ends = axis.agreement(), GAINS
+        if np.isfinite(mean.interval).all():
+            low, high = mean.interval
+            gain.fill_between([mean.low, mean.high], low, high, color=INK, alpha=0.18, linewidth=0)
+            gain.plot([mean.low, mean.high], [mean.ratio] * 2, color=INK, linewidth=1.6)
+            ends = min(ends[0], max(0.8 * low, _WIDEST[0])), max(ends[1], min(1.25 * high, _WIDEST[1]))
         gain.set_yscale("log")
-        gain.set_ylim(GAINS)
-        ticks_at(gain.yaxis, (0.2, 0.5, 1, 2, 5))
+        gain.set_ylim(ends)
+        ticks_at(gain.yaxis, (0.1, 0.2, 0.5, 0.7, 1, 1.4, 2, 5, 10))
         phase.set_ylim(-180, 180)
         phase.yaxis.set_major_locator(MultipleLocator(90))
         coherence.set_ylim(0, 1.03)

@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,10 @@ import numpy as np
 from .._files import check_writable, write_file
 from ..airframe import INERTIAS
 from ..errors import printable
+from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification
-from ..identification.verdict import IDENTIFIED, RIGID_BODY, STATUSES, reason_lines, status_lines
+from ..identification.verdict import RIGID_BODY, headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .identification_figures import (
@@ -29,7 +29,7 @@ from .identification_figures import (
 )
 from .identification_signals import BAND, identified_signals
 from .style import drawing, styles
-from .terminal import quantity_rows
+from .terminal import quantity_rows, warning_lines
 from .text import DASH, plain
 
 # The page shows these entries of the provenance in a place of their own.
@@ -67,7 +67,8 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         title=title or ", ".join(printable(Path(name).name) for name in found.logs),
         found=found,
         verdict=verdict(found),
-        verdict_lines=[*status_lines(found.verdicts), *reason_lines(found.verdicts, found.doubts)],
+        verdict_lines=warning_lines(found),
+        next_flight="".join(_next(found)),
         center=[f"{x.axis} {plain(1e3 * x.value)} ± {plain(NINETY_FIVE * (1e3 * x.std), 2)} mm" for x in center],
         quantities=quantities(found),
         signals=identified_signals(found, look),
@@ -92,42 +93,34 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
     for row, cells, note in zip(every, *quantity_rows(every), strict=True):
         own = found.parameters.get(row.name.replace(" ", "_"))
         small = row.judged == RIGID_BODY and abs(row.value) <= NINETY_FIVE * row.std
-        causes = row.verdict.reasons if row.verdict is not None and row.name == row.judged else ()
-        said = dict.fromkeys([note, "" if own is None else own.note, "below noise" if small else "", *causes])
-        rows.append((cells, "; ".join(filter(None, said))))
+        said = dict.fromkeys([note, "" if own is None else own.note, "below noise" if small else ""])
+        shown = (row.name, DASH, *cells[2:]) if small else cells  # a J_R of -3 kg m^2 would be read as a value
+        rows.append((shown, "; ".join(filter(None, said))))
     listed = {cells[0] for cells, _ in rows}
     for name in INERTIAS:
         if name in found.verdicts and name not in listed:
-            why = found.verdicts[name]
-            rows.append(((name, DASH, "", "kg m^2"), "; ".join((why.status, *why.reasons))))
+            rows.append(((name, DASH, "", "kg m^2"), found.verdicts[name].status))
     return sorted(rows, key=lambda row: INERTIAS.index(row[0][0]) if row[0][0] in INERTIAS else len(INERTIAS))
 
 
 def identification_html(found: Identification) -> str:
     """Verdict, physical quantities and reservations, for a notebook."""
     rows = zip(*quantity_rows(physical_quantities(found)), strict=True)
-    lines = [*reason_lines(found.verdicts, found.doubts), *(f"note: {note}" for note in found.provenance.notes)]
+    lines = [*warning_lines(found), *(f"note: {note}" for note in found.provenance.notes), *_next(found)]
     return render("summary.html.j2", verdict=verdict(found), rows=list(rows), lines=lines)
 
 
+def _next(found: Identification) -> list[str]:
+    return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
+
+
 def verdict(found: Identification) -> str:
-    """Whether to trust the identification, in one sentence. The page shows the verdicts below it."""
+    """Whether to trust the quantities, in a sentence for each status. The page shows the reasons below it."""
     if not found.has_answer:
         return f"There is no answer: {meaning(found.result)}."
-    if found.successful:
-        named = {each.status for each in found.verdicts.values() if each.trusted}
-        said = (
-            f"{status}: {_joined(name for name, each in found.verdicts.items() if each.status == status)}"
-            for status in sorted(named, key=STATUSES.index)
-        )
-        return f"All requested quantities are {'; '.join(said) or IDENTIFIED}."
-    refused = _joined(f"{name} is {each.status}" for name, each in found.verdicts.items() if not each.trusted)
-    return f"Not to be trusted: {refused or meaning(found.result)}."
-
-
-def _joined(words: Iterable[str]) -> str:
-    *first, last = [*words] or [""]
-    return f"{', '.join(first)} and {last}" if first else last
+    if found.verdicts:
+        return " ".join(headline(statuses_of(found.verdicts)).values())
+    return "No quantity was judged." if found.successful else f"Not to be trusted: {meaning(found.result)}."
 
 
 def _text(x: Any) -> str:

@@ -81,7 +81,10 @@ def _common(traces: Traces) -> list[Panel]:
     gusts = [
         Line(name, each, style(i)) for i, (name, each) in enumerate(zip("pqr", traces.disturbance.T, strict=False))
     ]
-    return [*panels, Panel("gusts [rad/s²]", gusts)] if gusts else panels
+    # At the ends of a log the filters err much: a few samples would hide all others.
+    known = np.abs(traces.disturbance[np.isfinite(traces.disturbance)])
+    reach = 1.3 * float(np.quantile(known, 0.99)) if known.size else 0.0
+    return [*panels, Panel("gusts [rad/s²]", gusts, reach=reach)] if gusts else panels
 
 
 def _horizon(traces: Traces, ahead: Predictions, place: int, axis: Axis, look: Style) -> View:

@@ -36,7 +36,7 @@ def estimates(data: xr.Dataset) -> Table:
 
 
 def outcomes(data: xr.Dataset) -> list[str]:
-    """How each estimate ended, and how many of its intervals hold the truth."""
+    """How each estimate ended, and how many of its intervals contain the truth."""
     known = {code: name.replace("_", " ") for name, code in metrics.codes(data).items()}
     level = shown_level(data)
     share = metrics.coverage(data).sel(level=level)
@@ -46,7 +46,7 @@ def outcomes(data: xr.Dataset) -> list[str]:
             at = {"scale": i, "estimator": j}
             result = known.get(int(data["result"].isel(at | {"flight": 0})), "unknown result")
             counted, hold = (int(share[name].isel(at).sum()) for name in ("count", "coverage"))
-            held = f", {hold} of {counted} intervals hold the truth" if counted else ""
+            held = f", {hold} of {counted} intervals contain the truth" if counted else ""
             lines.append(f"{estimator} at {scale}: {result}{held}.")
     return lines
 

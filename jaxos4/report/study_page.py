@@ -22,11 +22,16 @@ MOST_DRAWN = 12
 
 # Attributes of the Dataset, and their labels on the page.
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
-_COLUMNS = 4
+_COLUMNS, _SPECIFICATION = 4, "specification.toml"
+_AGAIN = f"jaxos4 study {_SPECIFICATION} --out .  # in the folder of this page"
+_WIDEST, _NARROWEST = 3.0, 1.0  # line widths [pt] of the first and the last estimator, so that none hides another
 
 
 def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
-    """Draws all figures, then writes `report.html` and `figures/*.svg`; returns their paths, the page first."""
+    """Draws all figures, then writes `report.html` and `figures/*.svg`; returns their paths, the page first.
+
+    The specification is written too, as `specification.toml`: the page's command names it.
+    """
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
     every, drawings, sections = list(scenarios(dataset)), [], []
@@ -36,18 +41,20 @@ def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
         shown = figures if number <= MOST_DRAWN else {}
         drawings.append(draw(shown, data, f"-{number}" if len(every) > 1 else ""))
         found = {"number": number, "label": title, "figures": drawings[-1], "best": best_estimators(data)}
+        found["channels"] = study_tables.channels_by_estimator(data)
         found |= {"tables": study_tables.scenario_tables(data), "trouble": study_tables.troubled_flights(data)}
         if of_one:
             found |= {"outcomes": one_flight.outcomes(data), "best": {}}
             found["tables"]["estimates"] = one_flight.estimates(data)
         sections.append(found)
     estimators, attributes = names(dataset, "estimator"), {name: str(x) for name, x in dataset.attrs.items()}
+    specification = attributes.get("specification", "")
     missing, cells = study_tables.cells_not_run(dataset)
     page = render(
         "study.html.j2",
         title=attributes.get("title", "") or "A study",
-        command=attributes.get("command", ""),
-        specification=attributes.get("specification", ""),
+        command=_AGAIN if specification else "",
+        specification=specification,
         provenance=[(shown, attributes[name]) for name, shown in _PROVENANCE.items() if name in attributes],
         estimators=estimators,
         bounds=list(bounds(dataset))[: len(BOUND_DASHES)],
@@ -63,6 +70,8 @@ def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
     )
     files = {folder / f"{each.stem}.svg": each.svg for figures in drawings for each in figures.values()}
     folder.mkdir(exist_ok=True)
+    if specification:
+        write_file(directory / _SPECIFICATION, specification)
     for path, content in files.items():
         write_file(path, content)
     write_file(target, page)
@@ -135,7 +144,9 @@ def _against_noise(
     for parameter, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
         for place, look in _looks(data):
             x = scales if interval is None else dodged(scales, place, data.sizes["estimator"])
-            panel.plot(x, values[parameter].isel(estimator=place).values, gid=estimator_gid(place), **look.line)
+            wide = _width(data, place)
+            y, gid = values[parameter].isel(estimator=place).values, estimator_gid(place)
+            panel.plot(x, y, gid=gid, linewidth=wide, markersize=2.5 + 1.8 * wide, **look.line)
             if interval is not None:
                 one = interval.isel(parameter=parameter, estimator=place)
                 ends = one["low"].values, one["high"].values
@@ -151,7 +162,7 @@ def _against_noise(
 
 
 def coverage(data: xr.Dataset) -> Figure | None:
-    """Share of intervals that hold the truth against the level that they claim, at each noise scale."""
+    """Share of intervals that contain the truth against the level that they claim, at each noise scale."""
     found = metrics.mean_coverage(data)
     if not found["coverage"].notnull().any():
         return None
@@ -173,7 +184,7 @@ def coverage(data: xr.Dataset) -> Figure | None:
         panel.set_ylim(lowest, 1.02)
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
         panel.grid(axis="x", visible=False)
-    label(figure, x="level claimed", y="intervals that hold the truth")
+    label(figure, x="level claimed", y="intervals that contain the truth")
     legend(figure, estimators)
     return figure
 
@@ -192,10 +203,11 @@ def overview(data: xr.Dataset) -> Figure | None:
     spent = np.maximum(rollouts, none)
     for row, look in _looks(data):
         at, line = known[:, row], {"color": look.color, "linestyle": look.dash, "gid": estimator_gid(row)}
+        line["linewidth"] = _width(data, row)
         x, y, across = dodged(data["scale"].values, row, data.sizes["estimator"])[at], values[at, row], spent[at, row]
         by_noise.plot(x, y, **line)
         by_noise.vlines(x, low[at, row], high[at, row], color=look.color, linewidth=1.0, gid=estimator_gid(row))
-        by_rollouts.plot(across, y, linewidth=1.0, **{**line, "zorder": 1.5})
+        by_rollouts.plot(across, y, **{**line, "zorder": 1.5})
         for size, (place, a, b, c) in enumerate(zip(np.flatnonzero(at), x, across, y, strict=True)):
             tip = f"noise x {data['scale'].values[place]:g}: {plain(c)} ({plain(low[place, row])} to "
             tip += f"{plain(high[place, row])}), {plain(rollouts[place, row])} rollouts"
@@ -227,6 +239,11 @@ def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
     """The noise scales for estimator `place` of `count`, spread over 0.3 of the gap between two, so that marks show."""
     gap = np.diff(np.log(np.sort(scales))).min() if len(scales) > 1 else np.log(3.0)
     return scales * np.exp(0.3 * gap * (place / max(count - 1, 1) - 0.5))
+
+
+def _width(data: xr.Dataset, place: int) -> float:
+    """The width of the line of an estimator [pt]: a later one lies on an earlier one, and is narrower."""
+    return _WIDEST - (_WIDEST - _NARROWEST) * place / max(data.sizes["estimator"] - 1, 1)
 
 
 def _looks(data: xr.Dataset) -> Iterator[tuple[int, Style]]:

@@ -1,5 +1,7 @@
 """The scenarios of a study, and their tables as rows of text, for the page and for the terminal."""
 
+import csv
+import io
 import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -145,11 +147,16 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         for mark, reason in zip(_MARKS, metrics.NO_PERCENTAGE, strict=True)
         if mark and mark in used
     )
-    return Table(list(zip(names(data, "parameter"), names(data, "unit"), strict=True)), groups, tuple(notes))
+    headings = []
+    for place, (name, unit) in enumerate(zip(names(data, "parameter"), names(data, "unit"), strict=True)):
+        column = [cells[place] for _, rows in groups for _, cells, _ in rows if cells[place].text != DASH]
+        marked = [bool(cell.mark) for cell in column]
+        headings.append((name, "%" if not any(marked) else unit if all(marked) else f"%; marked: {unit}"))
+    return Table(headings, groups, tuple(notes))
 
 
 def _result_table(data: xr.Dataset) -> Table:
-    """The number of flights by result, mean rollouts, and the share of seed brackets that hold the truth."""
+    """The number of flights by result, mean rollouts, and the share of seed brackets that contain the truth."""
     counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
     occurs = np.flatnonzero((counts > 0).any([name for name in counts.dims if name != "code"]).values)
 
@@ -195,6 +202,41 @@ def failed_cells(dataset: xr.Dataset) -> dict[str, Any]:
         for failure in failures[:_MOST_LISTED]
     ]
     return {"listed": listed, "total": len(failures)}
+
+
+def channels_by_estimator(data: xr.Dataset) -> dict[str, list[str]]:
+    """The channels that estimators look at, each with its estimators."""
+    found: dict[str, list[str]] = {}
+    for name, seen in zip(names(data, "estimator"), data["seen"].values.ravel().tolist(), strict=True):
+        found.setdefault(str(seen), []).append(name)
+    return found
+
+
+def error_csv(dataset: xr.Dataset) -> str:
+    """Errors, bounds, efficiency and coverage as CSV: a row for each scenario, noise, estimator and parameter.
+
+    Errors and bounds are in the parameter's unit. An empty cell: not known.
+    """
+    text, fixed = io.StringIO(newline=""), [name for name in metrics.SCENARIO if name in _PHRASES]
+    writer = csv.writer(text, lineterminator="\n")
+    measured = ["rms_error", "rms_error_percent", "bound", "efficiency", "efficiency_low", "efficiency_high"]
+    measured += ["coverage", "coverage_low", "coverage_high", "rollouts"]
+    writer.writerow([*fixed, "noise_scale", "estimator", "seen", "parameter", "unit", "level", *measured])
+    for _, _, data in scenarios(dataset):
+        level = shown_level(data)
+        error, bound, spent = metrics.estimator_error(data), metrics.bound_error(data), metrics.mean_rollouts(data)
+        share, ratio = metrics.coverage(data).sel(level=level), metrics.efficiency(data)
+        percents = error["percent"].where(error["reason"] == 0)
+        sizes = (data.sizes[name] for name in ("scale", "estimator", "parameter"))
+        for i, j, k in itertools.product(*map(range, sizes)):
+            at, at_all = {"scale": i, "estimator": j}, {"scale": i, "estimator": j, "parameter": k}
+            values = [error["absolute"], percents, bound["absolute"], ratio["efficiency"], ratio["low"], ratio["high"]]
+            values += [share[name] for name in ("coverage", "low", "high")]
+            numbers = [float(each.isel(at_all)) for each in values] + [float(spent.isel(at))]
+            about = [data[name].item() for name in fixed] + [data["scale"].values[i], names(data, "estimator")[j]]
+            about += [data["seen"].isel(estimator=j).item(), names(data, "parameter")[k], names(data, "unit")[k], level]
+            writer.writerow([*about, *("" if np.isnan(number) else f"{number:.6g}" for number in numbers)])
+    return text.getvalue()
 
 
 def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:

@@ -9,17 +9,27 @@ from rich.console import Console
 from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
+from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities
 from ..identification.results import COLOURED, Identification
-from ..identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED, reason_lines, status_lines
+from ..identification.verdict import (
+    CONTRADICTED,
+    IDENTIFIED,
+    MISSING,
+    RESERVED,
+    headline,
+    reason_lines,
+    statuses_of,
+)
 from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
-from .text import Listing, say
+from .text import Listing, plain, say
 
+_WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
 
-# Of the lines that begin with a verdict, on terminals that have colours.
+# Of the sentences of the headline, on terminals that have colours.
 _COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
 
 _COMMANDS = "of full scale (commands)"
@@ -35,17 +45,20 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
     `verbose`: for a vehicle, also all parameters, the noise and the quality of predictions. An OS4 always has its
     parameters.
     """
-    sections = [_verdicts, _quantities, _reasons, _notes]
+    sections = [_quantities, _reasons, _notes]
     if not found.is_vehicle:
-        sections = [_verdicts, _reasons, _notes, _parameters, _fit, _inertias, _validation]
+        sections = [_reasons, _notes, _parameters, _fit, _inertias, _validation]
     elif verbose:
         sections += [_parameters, _held, _inertias, _of_vehicle]
-    for section in (*sections, _summary) if found.has_answer else (_notes, _failure):
+    if found.has_answer:
+        for status, sentence in headline(statuses_of(found.verdicts)).items():
+            say(console, sentence, _COLOURS[status])
+    for section in (*sections, _summary, _next) if found.has_answer else (_notes, _failure):
         for part in section(found):
             if isinstance(part, Listing):
                 part.print_on(console)
             else:
-                say(console, part, _COLOURS.get(part.split(":")[0]))
+                say(console, part)
 
 
 def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:
@@ -67,11 +80,6 @@ def quantity_rows(rows: Sequence[PhysicalQuantity]) -> tuple[list[tuple[str, ...
     return cells, notes
 
 
-def _verdicts(found: Identification) -> Section:
-    tabled = {row.judged for row in physical_quantities(found)} if found.is_vehicle else ()
-    yield from status_lines(found.verdicts, tabled)
-
-
 def _quantities(found: Identification) -> Section:
     cells, notes = quantity_rows(physical_quantities(found))
     if cells:
@@ -79,7 +87,17 @@ def _quantities(found: Identification) -> Section:
 
 
 def _reasons(found: Identification) -> Section:
-    yield from reason_lines(found.verdicts, found.doubts)
+    yield from warning_lines(found)
+
+
+def warning_lines(found: Identification) -> list[str]:
+    """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
+    wide = {name: factor for name, factor in found.widened.items() if factor > _WIDENED}
+    factors = sorted({f"{each:.1f}" for each in (min(wide.values(), default=1.0), max(wide.values(), default=1.0))})
+    flights, other = ("flights", ", or the flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "")
+    said = f"warning: parts of the {flights} disagree, so that intervals were widened {' to '.join(factors)} times: "
+    lacking = f"{said}{', '.join(wide)}. The model lacks an effect{other}."
+    return [*reason_lines(found.verdicts, found.doubts), *[lacking] * bool(wide)]
 
 
 def _notes(found: Identification) -> Section:
@@ -113,14 +131,14 @@ def _parameters(found: Identification) -> Section:
     headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_os4)
     yield Listing(headings, rows, ("estimate", "bound"), [row.note for row in found.parameters.values()])
     limits = [
-        f"{name} {row.noise_limit:.2g}"
+        f"{plain(1 / row.noise_limit, 2)} ({name})"
         for name, row in found.parameters.items()
-        if "below noise" in row.note and row.noise_limit
+        if "below noise" in row.note and row.noise_limit and row.noise_limit < 1
     ]
     if limits:
         yield (
-            "below noise: cannot be distinguished from 0. The airframe's values could be distinguished at this "
-            f"multiple of the noise: {', '.join(limits)}."
+            "below noise: cannot be distinguished from 0. You would need sensors that are quieter by a factor of "
+            f"{', '.join(limits)}."
         )
     if of_os4:
         yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
@@ -130,7 +148,7 @@ def _held(found: Identification) -> Section:
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
         reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
-    yield from (f"held, {reason}: {', '.join(held)}." for reason, held in reasons.items())
+    yield from (f"fixed, {reason}: {', '.join(held)}." for reason, held in reasons.items())
 
 
 def _fit(found: Identification) -> Section:
@@ -198,7 +216,7 @@ def _of_vehicle(found: Identification) -> Section:
     if found.disturbances:
         levels = found.disturbances.items()
         gusts = ", ".join(f"{name} {x.strength:.2g} {x.unit} over {x.correlation_time:.2g} s" for name, x in levels)
-        yield f"disturbances that the model lacks, and their correlation time: {gusts}."
+        yield f"disturbances that the model does not explain, with their correlation time: {gusts}."
         sensors = ", ".join(f"{name} {x.sensor:.2g}" for name, x in levels)
         yield f"white noise of the sensors [rad/s; m/s^2]: {sensors}."
     if found.widened:
@@ -226,6 +244,11 @@ def _summary(found: Identification) -> Section:
     else:
         how, digits = f"{found.model} model, {used.channels} channels", 1
     yield f"{found.estimator}, {how}: {found.result}, {found.rollouts} rollouts, {found.seconds:.{digits}f} s"
+
+
+def _next(found: Identification) -> Section:
+    if found.verdicts:
+        yield next_flight([found], spreads_of(found))
 
 
 def _share(value: float | None) -> str:

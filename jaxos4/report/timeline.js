@@ -78,7 +78,7 @@
     ctx.restore();
   }
 
-  function plot(title, height, time, lines, half) {
+  function plot(title, height, time, lines, half, reach) {
     const [grid, soft, ink] = ["--grid", "--soft", "--ink"].map(color);
     const axis = { stroke: soft, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 } };
     const y = lines.map((line) => line.values);
@@ -103,7 +103,8 @@
       width: box.clientWidth,
       height,
       cursor: { sync: { key: "time", scales: ["x", null] }, bind: { dblclick: () => () => zoom(...whole) } },
-      scales: { x: { time: false } },
+      scales: { x: { time: false }, y: reach ? { range: [-reach, reach] } : {} },
+      legend: { show: lines.length > 1 || !plots.length }, // the first one has the time
       axes: [
         { ...axis, size: 28, splits: ticks, values: (_, at, axis, space, step) => labels(at, step) },
         { ...axis, label: title, size: 52, labelSize: 20, space: height < 120 ? 14 : 22 },
@@ -164,13 +165,13 @@
     const views = given.views.length ? [given.views[list.selectedIndex], ...given.common] : given.common;
     for (const view of views) {
       const { time, panels } = merged(view);
-      for (const { title, lines, half, residual } of panels) {
-        plot(title, 160, time, lines, half);
+      for (const { title, lines, half, residual, reach } of panels) {
+        plot(title, 160, time, lines, half, reach);
         if (residual) {
           const [first, other] = [lines[0].values, lines[lines.length - 1].values];
           const left = first.map((value, i) => (value == null || other[i] == null ? null : value - other[i]));
           const { color, joined } = lines[lines.length - 1];
-          plot("residual", 95, time, [{ label: "measured - predicted", values: left, color, joined, dash: [] }], 0);
+          plot("residual", 95, time, [{ label: "measured - predicted", values: left, color, joined, dash: [] }], 0, 0);
         }
       }
     }

@@ -27,12 +27,14 @@ class Panel(NamedTuple):
     - `title`: with the unit.
     - `half`: half the width of a band around the last line, in the same unit; 0: no band.
     - `residual`: whether a panel below shows the first line minus the last.
+    - `reach`: where the axis ends, up and down; 0: at the largest value.
     """
 
     title: str
     lines: Sequence[Line]
     half: float = 0.0
     residual: bool = False
+    reach: float = 0.0
 
 
 class View(NamedTuple):
@@ -155,6 +157,7 @@ def _view(view: View) -> dict[str, Any]:
                 "title": panel.title,
                 "half": panel.half,
                 "residual": panel.residual,
+                "reach": panel.reach,
                 "lines": [
                     {
                         "label": line.label,

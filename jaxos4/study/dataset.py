@@ -208,7 +208,7 @@ def assemble(store: Store) -> xr.Dataset:
             path = store.cell_file(cell.number)
             raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
     variables = {name: (dims(name), arrays[name], _named(*about[2:])) for name, about in VARIABLES.items()}
-    command = {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)}
+    command = {"command": "jaxos4 study specification.toml --out .", "failures": json.dumps(failures)}
     dataset = xr.Dataset(variables | _brackets(study), coordinates, provenance(study, store.device) | command)
     flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
     dataset["result"].attrs |= flags

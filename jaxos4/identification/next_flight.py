@@ -1,0 +1,83 @@
+"""What to fly next: for each quantity that is not known well enough, which motion and how long, or the remedy."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+from ..airframe import AXES, INERTIAS
+from ..results import NINETY_FIVE
+from .results import Identification
+from .verdict import IDENTIFIED, MISSING, RESERVED, TOLERANCE, pooled_status
+
+_ROUND = 5.0  # s; flights are not planned more precisely
+_MOST = 300.0  # s, about one battery: beyond it a stronger motion is the better advice
+_REPEAT = "nothing is missing; repeat the flight and compare the results with `jaxos4 compare`"
+
+
+def next_flight(results: Sequence[Identification], spreads: Mapping[str, float]) -> str:
+    """What to fly next, in one line, for one result or for the mean of several.
+
+    `spreads`: half of the 95 % interval of each moment of inertia, as a share of it. A reservation about another
+    quantity of a vehicle is no reason to fly.
+    """
+    counted = {
+        name: [each for each in results if name in each.verdicts and each.verdicts[name].status == status]
+        for name, status in pooled_statuses(results).items()
+        if status != IDENTIFIED and (name in INERTIAS or status != RESERVED or not results[0].is_vehicle)
+    }
+    motions, known, flown, advised = [], [], set(), {}
+    for axis in AXES:
+        spread, fitted = spreads.get(axis.inertia, 0.0), counted.get(axis.inertia, [])
+        if fitted and TOLERANCE.vague < spread < math.inf:
+            every = (each.provenance.fitted_seconds for each in fitted)
+            motions.append(_more(axis.motion, spread, sum(x for x in every if isinstance(x, float))))
+            flown.add(f"fly more {axis.motion}")
+            known.append(f"{axis.inertia} {100 * spread:.3g} %")
+    if motions:
+        advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * TOLERANCE.vague:.0f} %"]
+    for name, own in counted.items():
+        for remedy in dict.fromkeys(each for each in _remedies(name, own) if each.split(",")[0] not in flown):
+            # A remedy that begins another one adds nothing to it.
+            same = next((each for each in advised if each.startswith(remedy)), remedy)
+            advised.setdefault(same, []).append(name)
+    said = "; ".join(f"{advice} ({', '.join(names)})" for advice, names in advised.items())
+    return f"next: {said or (_REPEAT if len(results) == 1 else 'nothing is missing')}."
+
+
+def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:
+    """The status of each quantity that a result judges; see `pooled_status`."""
+    names = dict.fromkeys(name for each in results for name in each.verdicts)
+    return {
+        name: pooled_status(each.verdicts[name].status for each in results if name in each.verdicts) for name in names
+    }
+
+
+def spreads_of(found: Identification) -> dict[str, float]:
+    """Half of the 95 % interval of each moment of inertia of a result, as a share of it."""
+    constants = found.rigid_body.constants if found.is_vehicle else {}
+    return {name: NINETY_FIVE * row.std / abs(row.estimate) for name, row in constants.items() if row.estimate}
+
+
+def _more(motion: str, spread: float, seconds: float) -> str:
+    """How much more of a motion an interval needs, which falls with the root of the time and with the amplitude.
+
+    `seconds`: how long was fitted until now [s].
+    """
+    lacking = (spread / TOLERANCE.vague) ** 2 - 1  # information, in multiples of that of the flights until now
+    if seconds * lacking <= _MOST:
+        return f"{_ROUND * math.ceil(seconds * lacking / _ROUND):.0f} s more {motion}"
+    return f"{motion} as long as before but {lacking**0.5:.2g} times as strong"
+
+
+def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
+    """The remedies of the causes that keep a quantity of these results from being identified."""
+    for found in results:
+        verdict = found.verdicts[name]
+        doubts = [each for each in found.doubts if each.status_left(name) != IDENTIFIED]
+        # A verdict has the reasons of its own status alone.
+        yield from (each.remedy for each in doubts if any(each.cause in said for said in verdict.reasons))
+        for said in verdict.reasons:
+            cause, _, remedy = said.rpartition("; ")
+            if cause and not cause.startswith("it is known to") and not any(each.cause in said for each in doubts):
+                yield remedy
+            elif verdict.status == MISSING and not found.is_vehicle and not doubts:
+                yield "fly what `jaxos4 design` proposes"

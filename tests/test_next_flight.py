@@ -1,0 +1,69 @@
+"""What to fly next: from the half-width now to the 10 % that a verdict needs, or the remedy of another cause."""
+
+import msgspec
+import pytest
+from pages import printed, says, words
+from synthetic_identification import identified_flight, identified_vehicle
+
+from jaxos4.identification.next_flight import next_flight, spreads_of
+from jaxos4.identification.results import Constant, RigidBody
+from jaxos4.identification.verdict import RESERVED, Quantity, Verdict, judge, refusal, reservation
+from jaxos4.report import write_flight_page
+
+HALF = {"Ix": 0.16, "Iy": 0.05, "Iz": 0.64}
+
+
+def vehicle(half=HALF, doubts=(), seconds=32.0):
+    """A vehicle whose moments of inertia are known to these shares, with verdicts to match."""
+    constants = {name: Constant(1e-5, 1e-5 * each / 1.959963984540054, "kg m^2") for name, each in half.items()}
+    verdicts = judge({name: Quantity("", each) for name, each in half.items()}, doubts).verdicts
+    about = {"verdicts": verdicts, "doubts": tuple(doubts), "provenance": {"fitted_seconds": seconds}}
+    return identified_vehicle(rigid_body=RigidBody(constants), **about)
+
+
+def said(*results):
+    return next_flight(results, spreads_of(results[0]))
+
+
+@pytest.mark.parametrize(
+    ("half", "advice"),
+    [
+        # 32 s (1.6^2 - 1) = 50 s; the root of 6.4^2 - 1 is 6.3
+        ({"Ix": 0.16}, "next: fly 50 s more roll (known now: Ix 16 %; needed: 10 %)."),
+        ({"Iz": 0.64}, "next: fly yaw as long as before but 6.3 times as strong (known now: Iz 64 %; needed: 10 %)."),
+        (HALF, "50 s more roll, yaw as long as before but 6.3 times as strong (known now: Ix 16 %, Iz 64 %; needed"),
+        ({"Iy": 0.05}, "next: nothing is missing; repeat the flight and compare"),
+    ],
+)
+def test_half_widths_shrink_with_the_root_of_the_time_and_with_the_amplitude(half, advice):
+    says(said(vehicle(half)), advice)
+
+
+def test_time_is_that_of_all_flights_that_count():
+    both = [vehicle({"Ix": 0.16}, seconds=10.0), vehicle({"Ix": 0.16}, seconds=22.0)]
+    says(next_flight(both, {"Ix": 0.16}), "fly 50 s more roll (known")
+    says(next_flight(both, {"Ix": 0.099}), "next: nothing is missing.")
+
+
+def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once():
+    calm = refusal("unidentifiable", "gusts are larger", "fly more yaw, or in calmer air", {"Iz": None})
+    slow = reservation("the log is slow", "log faster", {"Ix": None})
+    found = vehicle({"Ix": 0.05, "Iz": 0.05}, [calm, slow])
+    unseen = Verdict("not identified", "", ("it is unseen; fly more yaw",))
+    verdicts = found.verdicts | {"predictions": unseen, "drag": msgspec.structs.replace(unseen, status=RESERVED)}
+    found = msgspec.structs.replace(found, verdicts=verdicts)
+    says(said(found), "next: log faster (Ix); fly more yaw, or in calmer air (Iz, predictions).")
+
+
+def test_terminal_and_page_end_with_it(tmp_path):
+    found = vehicle()
+    line = said(found)
+    assert " ".join(printed(found).split()).endswith(line)
+    write_flight_page(tmp_path / "flight.html", found)
+    says(words((tmp_path / "flight.html").read_text(encoding="utf-8")).replace("Next:", "next:"), line)
+    says(words(found._repr_html_()), line)
+
+
+def test_an_os4_that_does_not_show_a_parameter_is_told_to_design_a_flight():
+    unseen = {"alpha6": Verdict("not identified", "", ("not identifiable: not excited",))}
+    says(said(identified_flight(verdicts=unseen)), "next: fly what `jaxos4 design` proposes (alpha6).")

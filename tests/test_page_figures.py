@@ -1,0 +1,99 @@
+"""The figures of an identification's page: nothing outside of an axis, a legend for each line, names for each mark."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+from pages import printed, says, words
+from synthetic_identification import (
+    CONSTANTS,
+    KNOWN,
+    behind_an_estimate,
+    identified_flight,
+    identified_vehicle,
+    synthetic_response,
+    vehicle_traces,
+)
+
+from jaxos4.identification.results import Constant, RigidBody
+from jaxos4.report import write_flight_page
+from jaxos4.report.identification_figures import frequency_responses, priors, residual_figure
+from jaxos4.report.identification_signals import identified_signals
+from jaxos4.report.style import drawing, styles
+
+LOOK = styles(["ibss"])["ibss"]
+
+
+@pytest.mark.parametrize("far", [3.0, 60.0])
+def test_every_parameter_is_inside_the_axis_of_the_brackets(far):
+    low, high = 0.0, 2.0  # the centre is 1, and half of the width is 1
+    at = 1.0 + far
+    row = msgspec.structs.replace(KNOWN, bracket=(low, high), estimate=at, ci95=(at - 0.5, at + 0.5))
+    near = msgspec.structs.replace(row, estimate=1.0, ci95=(0.9, 1.1))
+    with drawing():
+        (panel,) = priors(identified_vehicle(parameters={"alpha8": row, "alpha3": near}), LOOK).axes
+    ends = panel.get_xlim()
+    for line in panel.lines:
+        places = np.asarray(line.get_xdata(), dtype=float)
+        assert ((ends[0] < places) & (places < ends[1])).all()
+    assert panel.lines[0].get_xdata()[1] == pytest.approx(far + 0.5)
+    assert panel.get_xscale() == ("symlog" if far > 5 else "linear")
+
+
+def test_the_gain_has_the_mean_that_the_verdict_is_about_and_an_axis_that_shows_it():
+    found = synthetic_response()
+    with drawing():
+        figure = frequency_responses(found, LOOK)
+    for place, axis in ((0, found.roll), (3, found.pitch)):
+        gain, mean = figure.axes[place], axis.agreement()
+        bar = next(line for line in gain.lines if list(line.get_ydata()) == [mean.ratio] * 2)
+        assert list(bar.get_xdata()) == [mean.low, mean.high]
+        low, high = gain.get_ylim()
+        assert low < mean.interval[0] < mean.interval[1] < high
+        assert high / low < 10
+    assert figure.axes[6].get_ylim() == pytest.approx((0.5, 2.0))
+
+
+def test_residuals_have_a_legend():
+    with drawing():
+        figure = residual_figure(behind_an_estimate()["correlations"])
+    said = [text.get_text() for panel in figure.axes[:2] for text in panel.get_legend().get_texts()]
+    assert said == ["95 % by chance", "roll torque", "pitch torque", "yaw torque"]
+
+
+def test_each_row_and_column_of_the_correlations_has_its_name(tmp_path):
+    write_flight_page(tmp_path / "flight.html", identified_flight(**behind_an_estimate()))
+    matrix = (tmp_path / "flight.html").read_text(encoding="utf-8").split('class="matrix"')[1].split("</svg>")[0]
+    for name in ("alpha3", "alpha6"):
+        assert matrix.count(f">{name}</text>") == 2
+
+
+def test_a_few_wild_samples_do_not_set_the_scale_of_the_gusts():
+    traces = vehicle_traces()
+    wild = traces.disturbance.copy()
+    wild[:2] = 1e4
+    drawn = json.loads(identified_signals(identified_vehicle(traces=traces._replace(disturbance=wild)), LOOK))
+    panels = {panel["title"]: panel["reach"] for view in drawn["common"] for panel in view["panels"]}
+    largest = np.abs(traces.disturbance).max()
+    assert 0.9 * largest < panels["gusts [rad/s²]"] < 2 * largest
+    assert panels["inputs [rad/s]"] == 0
+
+
+def test_much_widened_intervals_are_a_warning(tmp_path):
+    found = identified_vehicle(widened={"alpha3": 1.7, "alpha6": 2.4, "rotor_lag": 4.9})
+    said = "warning: parts of the flight disagree, so that intervals were widened 2.4 to 4.9 times: alpha6, rotor_lag."
+    write_flight_page(tmp_path / "flight.html", found)
+    for text in (found.summary(width=400), words((tmp_path / "flight.html").read_text(encoding="utf-8"))):
+        says(text, said, "The model lacks an effect.")
+    several = identified_vehicle(widened=found.widened, provenance={"flights": ["a.csv", "b.csv"]})
+    says(several.summary(width=400), "The model lacks an effect, or the flights are not of one vehicle.")
+    assert "warning" not in printed(identified_vehicle(widened={"alpha3": 1.9}))
+
+
+def test_a_moment_of_inertia_below_noise_has_no_value(tmp_path):
+    body = RigidBody(CONSTANTS | {"J_R": Constant(-2.83, 9.0, "kg m^2")}, 0.2, True)
+    write_flight_page(tmp_path / "flight.html", identified_flight(rigid_body=body))
+    text = words((tmp_path / "flight.html").read_text(encoding="utf-8"))
+    says(text, "J_R kg m^2 – -20.47 to 14.81 below noise")
+    assert "-2.83" not in text
