@@ -120,9 +120,20 @@ def test_each_rotor_may_have_a_topic_of_its_own(tmp_path):
     for i, t in enumerate(late):
         messages[f"/motor_speed/{i}"] = ("other/msg/One", t, lambda k, i=i: {"data": speeds(late[i])[k, i]})
     path = bag(tmp_path / "four.bag", "bag", messages, {"other/msg/One": "std_msgs/Header header\nfloat64 data"})
-    flight, _ = read_log(path, columns={"columns": MAP | {f"omega{i + 1}": f"/motor_speed/{i}.data" for i in range(4)}})
+    given = {"columns": MAP | {f"omega{i + 1}": f"/motor_speed/{i}.data" for i in range(4)}}
+    flight, notes = read_log(path, columns=given)
     t = np.asarray(flight.time)[2:-4] + 0.002
     np.testing.assert_allclose(flight.omega[2:-4], speeds(t), atol=0.1)
+    # A zero of the telemetry is none of the rotor, and is not spread over its neighbours.
+    messages["/motor_speed/2"] = (
+        *messages["/motor_speed/2"][:2],
+        lambda k: {"data": speeds(late[2])[k, 2] * (k % 20 != 10)},
+    )
+    path = bag(tmp_path / "zeros.bag", "bag", messages, {"other/msg/One": "std_msgs/Header header\nfloat64 data"})
+    flight, more = read_log(path, columns=given)
+    np.testing.assert_allclose(flight.omega[2:-4], speeds(t), atol=1)
+    (note,) = set(more) - set(notes)
+    assert note.startswith("impossible values count as not measured, in /motor_speed/2.data: ")
 
 
 # Presets

@@ -235,9 +235,18 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
             return None
         log.names.update((name, chosen[name]) for name in names)
         t = found[names[0]].t
-        same = (found[name] for name in names)
-        values = [s.values[:, 0] if s.t is t else np.interp(t, s.t, s.values[:, 0]) for s in same]
-        return Series(t, np.column_stack(values))
+
+        def at(name: str) -> np.ndarray:
+            series = found[name]
+            if series.t is t:
+                return series.values[:, 0]
+            return (
+                log.speeds_at(t, series, chosen[name])
+                if name in SPEED_NAMES
+                else np.interp(t, series.t, series.values[:, 0])
+            )
+
+        return Series(t, np.column_stack([at(name) for name in names]))
 
     def turning(names: Sequence[str]) -> Series | None:
         """The samples with all four rotors; `None` if one of them never turns."""
