@@ -59,7 +59,7 @@ def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
 
 
 def _check_metadata(path: FilePath, limits: Limits) -> None:
-    """The same for a text in YAML, which may not refer to itself either: a list of lists of lists can have any length."""
+    """The same for a text in YAML, which may not refer to itself either: lists of lists of it could have any length."""
     with opened(path, "rb") as file:
         content = file.read(limits.metadata + 1)
     if len(content) > limits.metadata:

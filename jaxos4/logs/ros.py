@@ -217,9 +217,8 @@ def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
                 return math.nan
             except (AttributeError, TypeError):
                 fields = [name for name in getattr(value, "__dataclass_fields__", ()) if name[:2] != "__"]
-                wrong(
-                    f"has no {shortened(str(step), 40)} there, but {', '.join(fields) or 'a number'}; correct the column map"
-                )
+                what = f"has no {shortened(str(step), 40)} there, but {', '.join(fields) or 'a number'}"
+                wrong(f"{what}; correct the column map")
         try:
             return float(value)
         except (TypeError, ValueError):
