@@ -20,6 +20,8 @@ from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
 from recorded_logs import RPM, blackbox_csv, check, outcome, speeds, survives_damage
 
+from jaxos4 import logs
+from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import FORMATS, log_format, read_log
 
@@ -99,6 +101,25 @@ def test_a_file_that_is_not_read_is_named_with_what_to_do(case, save):
     message = outcome(read, save(content))
     assert words in message
     assert message.endswith("Logs that are read: " + ", ".join(each.label for each in FORMATS) + ".")
+
+
+class Failing:
+    """A format of another package that was made for another version."""
+
+    label = "lab"
+
+    def recognises(self, begin):
+        raise AttributeError("no such version")
+
+
+@pytest.mark.parametrize("kind", [Failing(), None])
+def test_a_wrong_format_of_another_package_is_a_warning(kind, save, monkeypatch):
+    monkeypatch.setattr(logs, "_OTHERS", {"lab": kind})
+    path = save(flight_csv.csv().encode())
+    with pytest.warns(UserWarning, match=r"the log format lab of another package fails \(.*\); update or uninstall it"):
+        assert log_format(path) is logs.CSV
+    with pytest.warns(UserWarning, match="lab"), pytest.raises(InputError, match="flight CSV, lab"):
+        log_format(save(UNREAD["gzip"][0]))
 
 
 # The flight CSV

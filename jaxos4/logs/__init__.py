@@ -3,7 +3,6 @@
 Each log format is one file and one line in `FORMATS`, or an entry point of another package in `jaxos4.log_formats`.
 """
 
-import itertools
 import os
 import re
 import warnings
@@ -14,7 +13,7 @@ import numpy as np
 
 from .._registry import Registry
 from ..airframe import Airframe
-from ..errors import printable
+from ..errors import in_words, printable
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from .ardupilot import ARDUPILOT
 from .assemble import recording_of
@@ -129,21 +128,34 @@ def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
 def log_format(path: Path) -> LogFormat:
     """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
 
-    Formats of other packages are asked before the last. A pipe can be read only once, so it always counts as the last.
+    Formats of other packages are asked before the last; one that fails is a `UserWarning`. A pipe can be read only
+    once, so it always counts as the last.
     Raises `InputError` if the file cannot be opened, or is evidently of another kind.
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
         begin = file.read(1 << 18) if file.seekable() else b""
     # What an archive holds without compression is not its own format.
-    formats = itertools.chain(() if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1], _OTHERS.values())
-    kind = next((each for each in formats if each.recognises(begin)), FORMATS[-1])
+    formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1]
+    kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin) or FORMATS[-1]
     unread = (each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL))
     if kind is FORMATS[-1] and (known := next(unread, None)):
         what, remedy = known
-        labels = ", ".join(each.label for each in (*FORMATS, *_OTHERS.values()))
+        labels = ", ".join((*(each.label for each in FORMATS), *_OTHERS))
         refuse(path, f"is {what}; {remedy}. Logs that are read: {labels}")
     return kind
+
+
+def _of_others(begin: bytes) -> LogFormat | None:
+    """The format of another package that recognises a log. A package that fails is skipped."""
+    for name in _OTHERS:
+        try:
+            if _OTHERS[name].recognises(begin):
+                return _OTHERS[name]
+        except Exception as error:  # noqa: BLE001 - whatever another package does
+            what = f"the log format {name} of another package fails ({in_words(error)}); update or uninstall it"
+            warnings.warn(what, UserWarning, stacklevel=4)
+    return None
 
 
 def as_recordings(
