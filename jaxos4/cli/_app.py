@@ -1,9 +1,7 @@
-"""The application: its commands, and their exit codes."""
+"""The application: its commands, and the errors that end them."""
 
 import functools
-import io
 import os
-import signal
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -11,7 +9,6 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import InputError, TrainingError, printable
-from ._interrupts import end_by_signal, kept_interrupts
 from ._jax import NO_CACHE, platform_fault, prepare
 from ._shared import check_sizes
 from .estimate import estimate, train
@@ -20,7 +17,6 @@ from .information import identifiability, inspect
 from .new_flights import design, simulate
 from .studies import compare, report, study
 
-_INTERRUPTED = 128 + signal.SIGINT  # the parser's code
 _EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1: nothing is kept."
 
 
@@ -59,36 +55,7 @@ def _jaxos4(
     """Identify the parameters of a quadrotor from its flights."""
 
 
-def main() -> None:
-    """Runs the command line. Exit code 0: done, 1: failed, 2: unusable arguments or input.
-
-    A command that is interrupted ends by the signal, which a shell shows as 130: scripts that call it end too, and no
-    thread that still computes meets an interpreter that has ended.
-    """
-    _open_streams()
-    with kept_interrupts() as interrupted:
-        try:
-            code = _run()
-        except BaseException:  # an import that is interrupted can end in any error
-            if not interrupted():
-                raise
-            code = _INTERRUPTED
-    if code == _INTERRUPTED or interrupted():
-        code = _INTERRUPTED
-        end_by_signal()
-    raise SystemExit(code)
-
-
-def _open_streams() -> None:
-    """Prints what no encoding can print, as names of files may hold, and nothing if an output was closed."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
-        elif isinstance(stream := getattr(sys, name), io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-def _run() -> int:
+def run_command() -> int:
     """Runs the command, and prints the error that ended it. Returns the exit code."""
     try:
         code = app(prog_name="jaxos4", standalone_mode=False) or 0
