@@ -9,7 +9,7 @@ from math_core import LatexToMathML
 from mkdocs.structure.files import File
 from mkdocs.utils import get_relative_url
 
-from jaxos4.cli import app
+from jaxos4.cli._app import app
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = {

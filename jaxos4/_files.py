@@ -35,6 +35,10 @@ BROKEN = (
 )
 
 _LARGEST_TEXT = 1 << 27  # bytes of a JSON or TOML file: a study with inputs of a million samples
+_MOST_VALUES = {
+    "JSON": 5_000_000,
+    "TOML": 500_000,
+}  # of such a study; TOML takes 6 us for one, and inputs are CSV files
 # A key of TOML in 64 parts or more: the time and memory that `tomllib` takes for it grow with the square of the parts.
 _LONG_KEY = re.compile(rb"""(?:\.[ \t]*(?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[\w-]+)[ \t]*){63}""")
 _LARGEST = sys.float_info.max  # of a number: a longer integer has no float, and Python does not print it
@@ -122,6 +126,8 @@ def _read_text(
         content = file.read(_LARGEST_TEXT + 1)
     if len(content) > _LARGEST_TEXT:
         raise InputError(f"{path}: has more than {_LARGEST_TEXT:,} bytes; {remedy}.")
+    if sum(map(content.count, (b",", b"[", b"{", b":" if kind == "JSON" else b"="))) > _MOST_VALUES[kind]:
+        raise InputError(f"{path}: has more than {_MOST_VALUES[kind]:,} values; {remedy}.")
     try:
         value = decode(content)
     except RecursionError:
@@ -145,7 +151,7 @@ def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST
             pending += ((f"{place}.{key}".strip("."), part) for key, part in each.items())
             pending += ((place, key) for key in each)
         elif isinstance(each, list | tuple):
-            pending += ((place, part) for part in each)
+            pending += ((place, part) for part in each if not (isinstance(part, int | float) and abs(part) <= largest))
         elif isinstance(each, str) and not each.isprintable():
             raise InputError(f"{path}: `{shortened(place, 80)}` is not one line of text; {remedy}.")
         elif isinstance(each, float) and not math.isfinite(each) and largest == _LARGEST:

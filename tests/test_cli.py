@@ -15,7 +15,8 @@ from pages import words
 from synthetic_results import vehicle_result
 
 import jaxos4
-from jaxos4.cli import app, main
+from jaxos4.cli import main
+from jaxos4.cli._app import app
 from jaxos4.networks import NetworkEstimator
 
 TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alpha6": 133.33333, "alpha8": 76.923077}

@@ -14,7 +14,7 @@ from typer.main import get_command
 from experiments.__main__ import again, published, render, scripts
 from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.airframe import airframe_table
-from jaxos4.cli import app
+from jaxos4.cli._app import app
 from jaxos4.estimators import ESTIMATORS
 
 COMMANDS = get_command(app).commands

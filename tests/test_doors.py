@@ -15,6 +15,7 @@ import tomllib
 import tracemalloc
 import xml.etree.ElementTree as ElementTree
 
+import h5py
 import numpy as np
 import pytest
 import small_study
@@ -120,6 +121,18 @@ def test_a_key_of_many_parts_costs_little(key, save):
     tracemalloc.stop()
 
 
+@pytest.mark.parametrize("text", ["[" + 2_600_000 * "{}," + "{}]", '{"a":1' + 2_600_000 * ',"a":1' + "}"])
+def test_more_values_than_a_study_has_are_refused_before_they_are_read(text, save):
+    path = save(text, "r.json")
+    tracemalloc.start()
+    with pytest.raises(InputError, match="has more than 5,000,000 values; give a file of"):
+        read_result(path)
+    assert tracemalloc.get_traced_memory()[1] < 200e6
+    tracemalloc.stop()
+    with pytest.raises(InputError, match="has more than 500,000 values; correct that place"):
+        load_airframe(save("mass = [" + 600_000 * "1," + "]", "a.toml"))
+
+
 def result_with(change):
     result = json.loads(json.dumps(RESULT))
     change(result)
@@ -187,6 +200,33 @@ def test_a_dataset_that_no_study_wrote_is_refused(run, tmp_path, case):
     spoil(data).to_netcdf(tmp_path / "study" / "results.nc", engine="h5netcdf")
     refused(run("report", "study"), "study/results.nc: ", words)
     assert [path.name for path in (tmp_path / "study").iterdir()] == ["results.nc"]
+
+
+ELSEWHERE = {
+    "a pipe": lambda file: file.__setitem__("zz", h5py.ExternalLink("pipe", "/x")),
+    "a name": lambda file: file.__setitem__("zz", h5py.SoftLink("/zz")),
+    "a device": lambda file: file.create_dataset("zz", (4,), "f8", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)]),
+    "another file": lambda file: file.create_virtual_dataset("zz", virtual_layout()),
+}
+
+
+def virtual_layout():
+    layout = h5py.VirtualLayout((4,), "f8")
+    layout[:] = h5py.VirtualSource("pipe", "x", (4,))
+    return layout
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
+@pytest.mark.parametrize("case", ELSEWHERE)
+def test_a_dataset_that_leads_to_another_file_is_refused(case, tmp_path):
+    """A pipe would never answer."""
+    data = synthetic_study(flights=4, scales=(1.0,), estimators=("ibss", "hybrid"), spoiled=False)
+    data.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
+    os.mkfifo(tmp_path / "pipe")
+    with h5py.File(tmp_path / "results.nc", "r+") as file:
+        ELSEWHERE[case](file)
+    with pytest.raises(InputError, match=r"it has a link to another place|its arrays are in another file"):
+        read_results(tmp_path)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ardupilot_logs import T, angles, ekf, escs, everything, imu, outputs, rate
+from ardupilot_logs import TEXTS, T, angles, ekf, escs, everything, imu, outputs, rate
 from helpers import CRAZYFLIE
 from recorded_logs import check, commands, dataflash, speeds
 
@@ -26,6 +26,14 @@ def test_the_library_of_ardupilot_reads_the_same(save, capfd):
     capfd.readouterr()
     read = read_recording(path)
     np.testing.assert_allclose(read.states[:, [7, 9, 11]], np.array(found)[: read.time.size], atol=1e-9)
+
+
+@pytest.mark.parametrize("letter", TEXTS)
+def test_a_text_is_no_number(letter, save):
+    """It is as if the field was not there: no setting, and the next best source."""
+    found = read_recording(save(TEXTS[letter]))
+    assert found.specific_force is None
+    assert found.facts.gyro.source == "RATE"
 
 
 def test_the_fastest_message_and_the_first_sensor_are_read(save):

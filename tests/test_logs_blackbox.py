@@ -28,6 +28,49 @@ def test_what_is_assumed_of_units_is_said_unless_an_export_says_its_settings(sav
     assert not any("taken as" in note or "default" in note for note in notes)
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "count"),
+    [
+        ("gyro.scale", "0x3d79c190", 0.061),  # of Cleanflight: the bits of a float, in deg/s
+        ("gyro_scale", "0x3d79c190", 0.061),
+        ("gyro_scale", "0x3f800000", 1.0),
+        ("gyro_scale", "0x30925312", 0.061),  # of Baseflight, in rad/us
+        ("gyroScale", "1.0646508e-9", 0.061),  # of Explorer, in rad/us
+        ("gyroScale", "0.0001", 1.0),  # of Explorer, if it knows none
+        ("gyro_scale", "0x7fc00000", 1.0),  # not a number
+    ],
+)
+@pytest.mark.parametrize("raw", [False, True])
+def test_the_gyro_has_the_scale_in_the_settings(name, text, count, raw, save):
+    columns = recorded(T, scale=1 / count)
+    columns |= {name: np.rint(x).astype(int) for name, x in columns.items() if name.startswith("gyro")}
+    settings = SETTINGS | {"motor_poles": "14", name: text}
+    content = bbl(columns, settings=settings) if raw else blackbox_csv(columns, settings=settings)
+    check(read_log(save(content))[0], names=RATES, atol=np.deg2rad(count))
+
+
+@pytest.mark.parametrize(
+    ("time", "gyro", "force"), [("s", "deg/s", "g"), ("ms", "rad/s", "m/s/s"), ("us", "rad/s", "m/s2")]
+)
+def test_columns_that_blackbox_decode_has_converted_have_the_unit_in_their_name(time, gyro, force, save):
+    columns = recorded(T)
+    out = {f"time ({time})": columns.pop("time (us)") * {"s": 1e-6, "ms": 1e-3, "us": 1}[time]}
+    for name, values in columns.items():
+        if name.startswith("gyroADC"):
+            out[f"{name} ({gyro})"] = np.round(values * {"deg/s": 1, "rad/s": np.pi / 180}[gyro], 4)
+        elif name.startswith("accSmooth"):
+            out[f"{name} ({force})"] = np.round(values / 2048 * (1 if force == "g" else GRAVITY), 4)
+        else:
+            out[name] = values
+    out["vbatLatest (V)"] = np.full(T.size, 16.8)
+    flight, notes = read_log(save(blackbox_csv(out)))
+    check(flight, names=RATES)
+    assert not any("gyroADC is taken" in note or "accSmooth" in note for note in notes)
+    out = {name.replace("gyroADC[0] ", "gyroADC[0]  "): values for name, values in out.items()}
+    with pytest.raises(InputError, match="no body rates"):
+        read_log(save(blackbox_csv(out)))
+
+
 def test_the_unfiltered_gyro_is_preferred_and_what_is_missing_or_off_is_not_measured(save):
     columns = recorded(T) | {f"gyroUnfilt[{i}]": np.full(T.size, 57.2957795 * (i + 1)) for i in range(3)}
     flight, notes = read_log(save(blackbox_csv(columns, settings=SETTINGS | {"acc_1G": "0"})))

@@ -109,7 +109,12 @@ def test_arrays_and_objects_like_them_are_read():
     wide = read_recording(data, columns=MOTORS)
     dataset = xr.Dataset({n: ("time", x) for n, x in single.items() if n != "t"}, coords={"time": T, "name": "Bee"})
     dated = dataset.assign_coords(time=np.datetime64("2026-01-01", "ns") + (1e9 * T).round().astype("timedelta64[ns]"))
-    read = [read_recording(single), *(read_recording(d, columns={"columns": {"t": "time"}}) for d in (dataset, dated))]
+    matrices = single | {"p": single["p"][:, None]}  # of one column
+    read = [
+        read_recording(single),
+        read_recording(matrices),
+        *(read_recording(d, columns={"columns": {"t": "time"}}) for d in (dataset, dated)),
+    ]
     for each in read:
         for found in (each.omega, each.states, each.specific_force):
             assert found is not None

@@ -20,6 +20,8 @@ from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
 from recorded_logs import RPM, blackbox_csv, check, outcome, speeds, survives_damage
 
+from jaxos4 import logs
+from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import FORMATS, log_format, read_log
 
@@ -72,8 +74,9 @@ def test_a_damaged_log_and_any_bytes_after_a_part_of_the_header(name, path):
     law_of_junk()
 
 
+PX4_OF_2016 = ardupilot.SMALL.replace(b"Type,Length,Name,Format,Columns", b"Type,Length,Name,Format,Labels\0")
 UNREAD = {
-    "zip": (b"PK\x03\x04" + bytes(60), "is an archive (zip, or .xlsx, .npz); unpack it"),
+    "zip": (b"PK\x03\x04" + bytes(60), "is an archive (zip, tar, or .xlsx, .npz); unpack it"),
     "gzip": (b"\x1f\x8b\x08" + bytes(60), "is a compressed file; unpack it"),
     "HDF5": (b"\x89HDF\r\n\x1a\n" + bytes(60), "is an HDF5 file (netCDF, MATLAB 7.3); read it in Python"),
     "MATLAB": (b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "is a MATLAB file"),
@@ -84,6 +87,10 @@ UNREAD = {
     "ArduPilot text": (b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n", "give the .BIN file"),
     "telemetry": (b"\0\x05\xa1\xb2\xc3\xd4\xe5\xf6\xfd\x09", "is a telemetry log of MAVLink (.tlog)"),
     "DJI": (b"\x55\xaa".ljust(16, b".") + b"BUILD 2016", "is a log of DJI; decode it by DatCon"),
+    "PX4 before ULog": (PX4_OF_2016, "is a log of PX4 from before ULog (.px4log); convert it to CSV by sdlog2_dump.py"),
+    "zip of a CSV": (b"PK\x03\x04\x14" + bytes(25) + blackbox.SMALL, "is an archive"),
+    "zip of another": (b"PK\x03\x04\x14" + bytes(25) + columns.neurobem_csv(50), "is an archive"),
+    "tar of a CSV": (b"log.csv".ljust(257, b"\0") + b"ustar".ljust(255, b"\0") + blackbox.SMALL, "is an archive"),
     "other": (b"abc\x01\x02\x03", "is of a kind that is not known; export it as CSV"),
 }
 
@@ -94,6 +101,25 @@ def test_a_file_that_is_not_read_is_named_with_what_to_do(case, save):
     message = outcome(read, save(content))
     assert words in message
     assert message.endswith("Logs that are read: " + ", ".join(each.label for each in FORMATS) + ".")
+
+
+class Failing:
+    """A format of another package that was made for another version."""
+
+    label = "lab"
+
+    def recognises(self, begin):
+        raise AttributeError("no such version")
+
+
+@pytest.mark.parametrize("kind", [Failing(), None])
+def test_a_wrong_format_of_another_package_is_a_warning(kind, save, monkeypatch):
+    monkeypatch.setattr(logs, "_OTHERS", {"lab": kind})
+    path = save(flight_csv.csv().encode())
+    with pytest.warns(UserWarning, match=r"the log format lab of another package fails \(.*\); update or uninstall it"):
+        assert log_format(path) is logs.CSV
+    with pytest.warns(UserWarning, match="lab"), pytest.raises(InputError, match="flight CSV, lab"):
+        log_format(save(UNREAD["gzip"][0]))
 
 
 # The flight CSV

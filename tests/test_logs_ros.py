@@ -1,6 +1,7 @@
 """Bags of ROS 1 and 2 and MCAP, written by rosbags: the same flight as a CSV, presets, clocks, and damage."""
 
 import bz2
+import os
 import shutil
 import sqlite3
 import struct
@@ -120,9 +121,20 @@ def test_each_rotor_may_have_a_topic_of_its_own(tmp_path):
     for i, t in enumerate(late):
         messages[f"/motor_speed/{i}"] = ("other/msg/One", t, lambda k, i=i: {"data": speeds(late[i])[k, i]})
     path = bag(tmp_path / "four.bag", "bag", messages, {"other/msg/One": "std_msgs/Header header\nfloat64 data"})
-    flight, _ = read_log(path, columns={"columns": MAP | {f"omega{i + 1}": f"/motor_speed/{i}.data" for i in range(4)}})
+    given = {"columns": MAP | {f"omega{i + 1}": f"/motor_speed/{i}.data" for i in range(4)}}
+    flight, notes = read_log(path, columns=given)
     t = np.asarray(flight.time)[2:-4] + 0.002
     np.testing.assert_allclose(flight.omega[2:-4], speeds(t), atol=0.1)
+    # A zero of the telemetry is none of the rotor, and is not spread over its neighbours.
+    messages["/motor_speed/2"] = (
+        *messages["/motor_speed/2"][:2],
+        lambda k: {"data": speeds(late[2])[k, 2] * (k % 20 != 10)},
+    )
+    path = bag(tmp_path / "zeros.bag", "bag", messages, {"other/msg/One": "std_msgs/Header header\nfloat64 data"})
+    flight, more = read_log(path, columns=given)
+    np.testing.assert_allclose(flight.omega[2:-4], speeds(t), atol=1)
+    (note,) = set(more) - set(notes)
+    assert note.startswith("impossible values count as not measured, in /motor_speed/2.data: ")
 
 
 # Presets
@@ -341,3 +353,95 @@ def test_a_time_of_another_type_in_a_database_is_refused(bagged, tmp_path, cell)
     with pytest.raises(InputError) as refused:
         read_log(path, columns={"columns": MAP, "time": "recorded"})
     assert str(refused.value).isprintable()
+
+
+# Bags that somebody made to harm
+
+
+def compressed(folder, bagged, content):
+    """A folder whose database is compressed as a whole."""
+    shutil.copytree(bagged["db3"].parent, folder)
+    metadata = folder / "metadata.yaml"
+    text = metadata.read_text().replace("mode: ''", "mode: file").replace("format: ''", "format: zstd")
+    metadata.write_text(text.replace(".db3.db3", ".db3.db3.zstd"))
+    (database,) = folder.glob("*.db3")
+    database.with_name(f"{database.name}.zstd").write_bytes(content)
+    database.unlink()
+    return folder
+
+
+def view(database):
+    database.execute("ALTER TABLE message_definitions RENAME TO kept")
+    endless = "WITH RECURSIVE g(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM g)"
+    database.execute(f"CREATE VIEW message_definitions AS {endless} SELECT kept.* FROM kept, g")
+
+
+def fields(database, count=20_000):
+    text = "".join(f"float64 a{i}\n" for i in range(count))
+    database.execute("UPDATE message_definitions SET encoded_message_definition = ?", (text,))
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [(view, "holds 'message_definitions', which is no table"), (fields, "are longer than 65,536 characters")],
+)
+def test_a_database_cannot_keep_the_reader_busy(harm, words, bagged, tmp_path):
+    path = Path(shutil.copy(bagged["db3"], tmp_path / "flight.db3"))
+    with sqlite3.connect(path) as database:
+        harm(database)
+    with pytest.raises(InputError, match=words):
+        read_log(path, columns={"columns": MAP})
+    packed = compressed(tmp_path / "packed", bagged, zstd.compress(path.read_bytes()))
+    with pytest.raises(InputError, match=words):
+        read_log(packed, columns={"columns": MAP})
+
+
+def test_pages_that_are_used_again_and_again_end(bagged, tmp_path):
+    """70 entries of a page lead to the same next page, whose entries do the same: 70^8 rows in 5 kB."""
+    path = Path(shutil.copy(bagged["db3"], tmp_path / "flight.db3"))
+    with sqlite3.connect(path) as database:
+        (root,) = database.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'messages'").fetchone()
+        (size,) = database.execute("PRAGMA page_size").fetchone()
+        (count,) = database.execute("PRAGMA page_count").fetchone()
+    content, cells = bytearray(path.read_bytes()), 70
+    leaf = count + 8
+    for number, child in ((root, count + 1), *((count + i, count + i + 1) for i in range(1, 8))):
+        cell = struct.pack(">IB", child, 1)
+        at = [size - 5 * (i + 1) for i in range(cells)]
+        page = struct.pack(">BHHHBI", 5, 0, cells, at[-1], 0, child) + struct.pack(f">{cells}H", *at)
+        content[size * (number - 1) : size * number] = page.ljust(size - 5 * cells, b"\0") + cells * cell
+    row = bytes([7, 1, 5, 0, 1, 1, 12, 1, 1])  # of seven bytes: the key, topic 1 at time 1, without data
+    head = struct.pack(">BHHHBH", 13, 0, 1, size - len(row), 0, size - len(row))
+    content += head.ljust(size - len(row), b"\0") + row
+    content[28:32] = struct.pack(">I", leaf)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be decoded .*interrupted"):
+        read_log(path, columns={"columns": MAP})
+
+
+def test_a_folder_holds_files_of_a_usual_size(bagged, tmp_path):
+    pipe = compressed(tmp_path / "pipe", bagged, b"")
+    os.mkfifo(pipe / "more.db3.zstd")
+    with pytest.raises(InputError, match="is a pipe or a device in the folder of a bag; remove it"):
+        read_log(pipe)
+    long = compressed(tmp_path / "long", bagged, b"")
+    with open(long / "metadata.yaml", "a") as file:
+        file.writelines(f"    k{i}: v\n" for i in range(60_000))
+    with pytest.raises(InputError, match="has more than 524,288 bytes; make it anew"):
+        read_log(long)
+    names = compressed(tmp_path / "names", bagged, b"")
+    text = (names / "metadata.yaml").read_text()
+    lists = "".join(f"  x{i}: &x{i} [{', '.join(9 * [f'*x{i - 1}'])}]\n" for i in range(1, 9))
+    (names / "metadata.yaml").write_text(text.replace("format: zstd\n", f"format: *x8\n  x0: &x0 a\n{lists}"))
+    with pytest.raises(InputError, match="names parts of itself"):
+        read_log(names)
+    # 200 kB that would be 6 GB on the disk.
+    bomb = compressed(tmp_path / "bomb", bagged, 6000 * zstd.compress(bytes(1 << 20)))
+    with pytest.raises(InputError, match="has more than 536,870,912 bytes when it is decompressed"):
+        read_log(bomb)
+
+
+def test_a_long_number_in_a_column_map_is_no_place(bagged):
+    given = {"columns": MAP | {"omega4": f"/motor_speed.angular_velocities[{'9' * 4400}]"}}
+    with pytest.raises(InputError, match="has no 9999.*there"):
+        read_log(bagged["mcap"], columns=given)

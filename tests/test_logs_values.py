@@ -8,10 +8,11 @@ import pytest
 import recorded_logs
 from flight_csvs import csv, read_flight_and_notes
 from helpers import CRAZYFLIE, refused
-from recorded_logs import RPM, VEHICLE, blackbox_csv, outcome, rates, speeds, table_csv
+from recorded_logs import FRD, RPM, VEHICLE, blackbox_csv, outcome, rates, speeds, table_csv
 
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs import Sampling, read_log, read_recording
+from jaxos4.logs import Recording, Sampling, read_log, read_recording
+from jaxos4.logs.values import plausible
 
 
 def test_an_accelerometer_that_never_changes_is_off(save):
@@ -104,6 +105,42 @@ def test_an_impossible_first_value_of_a_rotor_is_the_next_one(save):
     found = read_recording(save("\n".join(["t,omega1,omega2,omega3,omega4,p", *rows])))
     assert found.omega[[0, 1, 2, 8, 9, 10], 0].tolist() == [102, 102, 102, 108, 108, 110]
     assert found.notes == ("impossible values count as not measured, in omega1: 3 (first 200000 rad/s at 0 s)",)
+
+
+def ardupilot_of(t, gyro, accelerometer, rotors):
+    imu = ("IMU", "Bffffff", "I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ", t, (0 * t, gyro(t) @ FRD, accelerometer(t) @ FRD))
+    late = [t + 5e-4 * i for i in range(4)]  # a message for each motor, at times of its own
+    rows = [np.column_stack([np.full(t.size, i), rotors(late[i])[:, i] / RPM]) for i in range(4)]
+    return recorded_logs.dataflash([imu, ("ESC", "Bf", "Instance,RPM", np.concatenate(late), (np.concatenate(rows),))])
+
+
+@pytest.mark.parametrize("write", [*IMPOSSIBLE, ardupilot_of])
+def test_zeros_of_a_turning_rotor_are_counted_and_filled_however_many(write, save):
+    """A rotor that has stopped needs longer to turn again. Telemetry of ESC answers 0 now and then."""
+    t = ulog.grid(0.004, 5.0)
+    bad = np.flatnonzero(np.random.default_rng(0).uniform(size=t.size - 60) < 0.03) + 30
+
+    def read(rows):
+        return read_recording(save(write(t, rates, recorded_logs.force, spoilt(speeds, rows, 2, 0.0))))
+
+    clean, found, stopped = read([]), read(bad), read(200 + np.arange(40))  # for 0.16 s
+    (note,) = set(found.notes) - set(clean.notes)
+    assert note.startswith("impossible values count as not measured, in ")
+    assert f": {bad.size} (" in note
+    np.testing.assert_allclose(found.omega, clean.omega, atol=8)  # speeds change by 2 rad/s in a sample
+    assert stopped.notes == clean.notes
+    assert (stopped.omega[205:235, 2] == 0).all()
+
+
+def test_zeros_in_arrays_count_as_not_measured_unless_they_are_commands():
+    t = 0.004 * np.arange(500)
+    omega, states = speeds(t), np.full((t.size, 12), np.nan)
+    omega[100::50, 1], states[:, [7, 9, 11]] = 0, rates(t)
+    flight = Recording(t, omega, states)
+    found = plausible(flight)
+    assert found.impossible == {"rotor 2": (8, 0.0)}
+    np.testing.assert_array_equal(found.recording.omega[100::50, 1], omega[99:-1:50, 1])
+    assert plausible(flight._replace(commanded=True)).impossible == {}
 
 
 # How often motors and gyro were logged

@@ -263,6 +263,17 @@ def test_a_largest_value_is_no_limit(signal, flights):
     assert plausible(flight).clipped == {}
 
 
+@pytest.mark.parametrize("counts", [2, 6])
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_the_noise_of_a_gyro_at_rest_is_no_limit(counts, jitter, flights):
+    """A few counts of noise, at even times, or brought to even times from others."""
+    rng, flight = np.random.default_rng(2), copied(flights[0])
+    noise = np.floor(rng.uniform(0, counts, flight.time.size)) * 0.0175
+    dt = flight.time[1] - flight.time[0]
+    flight.states[:, P] = np.interp(flight.time, flight.time + jitter * dt * rng.uniform(-1, 1, noise.size), noise)
+    assert plausible(flight).clipped == {}
+
+
 def test_logs_of_two_vehicles(flights):
     heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, np.asarray(0.035))
     for i, contradicted in ((0, False), (1, True)):

@@ -99,9 +99,10 @@ def test_an_interrupt_that_python_drops_ends_a_study_too(whole, copy, run, monke
 
     def interrupted(path: pathlib.Path, data: bytes) -> int:
         InterruptedAtItsEnd()
+        time.sleep(10)  # the interrupt is raised again
         return write(path, data)
 
-    handler = signal.getsignal(signal.SIGINT)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     with monkeypatch.context() as patch:
         patch.setattr(pathlib.Path, "write_bytes", interrupted)
         patch.setattr(signal, "raise_signal", lambda _: None)  # would end the tests
@@ -109,7 +110,7 @@ def test_an_interrupt_that_python_drops_ends_a_study_too(whole, copy, run, monke
     assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     signal.signal(signal.SIGINT, handler)
     assert (code, err) == (130, "jaxos4: out: interrupted; run the same command again to continue.\n")
-    assert cells(copy) == cells(whole)
+    assert cells(copy).items() < cells(whole).items()
     assert not (copy / "results.nc").exists()
     assert run("study", "spec.toml", "--out", "out")[0] == 0
 

@@ -1,3 +1,3 @@
 """The command line: parses arguments, calls the library, prints. A command imports the library when it runs."""
 
-from ._app import app as app, main as main
+from ._main import main as main

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import re
 import secrets
 import shlex
@@ -133,6 +134,15 @@ Simulator = Literal["mujoco", "rotorpy", "sdf", "drone-models", "urdf"]
 Features = Literal["score", "raw"]
 Architecture = Literal["mlp", "cmac"]
 Criterion = Literal["D", "A", "worst"]
+
+
+def check_sizes(asked: dict[str, Any], *, most: float = 1e9) -> None:
+    """Refuses numbers of options that are far larger than any time, speed, size or count."""
+    for name, given in asked.items():
+        for value in given if isinstance(given, tuple) else (given,):
+            if name != "seed" and isinstance(value, int | float) and not math.isnan(value) and abs(value) > most:
+                option = OPTIONS.get(f"`{name}`", f"--{name.replace('_', '-')}")
+                raise InputError(f"{option}: must lie within +-{most:g}, got {value:.6g}.")
 
 
 def check_seed(seed: int) -> int:

@@ -123,12 +123,13 @@ def _publish(found: "jaxos4.Identification", out: Path | None, report: Path | No
     console = Console()
     if out is not None:
         write_json(found.to_dict(), out)
+    if report is not None:
+        with stages("drawing"):
+            jaxos4.report.write_flight_page(report, found)
     jaxos4.report.print_identification(console, found, verbose=verbose)
     if found.is_vehicle and found.has_answer and not verbose:
         console.print("--verbose shows all parameters, the noise, and how well rates are predicted", highlight=False)
     if report is not None:
-        with stages("drawing"):
-            jaxos4.report.write_flight_page(report, found)
         console.print(f"report: {report}", markup=False, highlight=False)
     end(found.result)
 
@@ -172,8 +173,6 @@ def train(
         progress("reading")
         subject = MODELS[model](jaxos4.load_airframe(airframe))
         recording = read_recording(flight, subject.airframe)
-    for note in recording.notes:
-        typer.echo(f"note: {note}")
     begin = time.perf_counter()
     with stages("training the network"), option_names(bracket=bracket):
         network = train_network(
@@ -186,6 +185,8 @@ def train(
             seed=seed,
         )
     jaxos4.save_network(network, out)
+    for note in recording.notes:
+        typer.echo(f"note: {note}")
     low, high = noise
     typer.echo(
         f"{out}: {architecture}, {features} features of the {network.channels}, noise {low:g} to {high:g} times the "

@@ -49,16 +49,14 @@ def export(
         found, target = read_result(result, inertia_z=inertia_z), TARGETS[to]
         progress("drawing and writing")
         written = export_vehicle(found, to, samples=samples, seed=seed)
+    if out is not None:
+        write_file(out, written.text)
     if folder is not None:
         files = {f"{number:06}{target.suffix}": text for number, text in enumerate(written.samples, start=1)}
         write_folder(files, folder)
         again = f"; {written.impossible} impossible draws were repeated" if written.impossible else ""
         typer.echo(f"{folder}: {samples} vehicles, drawn with seed {seed}{again}")
-    if out is None:
-        typer.echo(written.text, nl=False)
-    else:
-        write_file(out, written.text)
-        typer.echo(f"{out}: {target.label}")
+    typer.echo(written.text if out is None else f"{out}: {target.label}", nl=out is not None)
     for doubt in found.doubts:
         typer.echo(doubt, err=True)
     for note in written.notes:

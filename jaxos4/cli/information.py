@@ -55,10 +55,11 @@ def inspect(
         write_json(found.to_dict(), out)
     if airframe_out is not None:
         write_file(airframe_out, text)
-    print_inspection(console, found, recording.facts.format.label if recording.facts.format else "")
     if report is not None:
         with stages("drawing"):
             jaxos4.report.write_log_page(report, recording, vehicle, found=found, command=command(), words=in_options)
+    print_inspection(console, found, recording.facts.format.label if recording.facts.format else "")
+    if report is not None:
         console.print(f"report: {report}", soft_wrap=True)
     if airframe_out is not None:
         still = f"; weigh or measure, and fill in: {', '.join(missing)}"

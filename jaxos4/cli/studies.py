@@ -1,10 +1,7 @@
 """`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
 
 import shlex
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,38 +45,11 @@ def study(
 def run_with_bar(wanted: "jaxos4.study.Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
     """The Dataset of `jaxos4.study.carry_out`, with a progress bar. `device`: by default those of this process."""
     try:
-        with stages("compiling", wanted.count) as show, _kept_interrupt() as raise_it:
-
-            def progress(label: str, done: int) -> None:
-                raise_it()
-                show(label, done)
-
+        with stages("compiling", wanted.count) as progress:
             return jaxos4.study.carry_out(wanted, out, device or jaxos4.study.device_name(), progress=progress, **how)
     except KeyboardInterrupt:
         typer.echo(f"jaxos4: {out}: interrupted; run the same command again to continue.", err=True)
         raise
-
-
-@contextmanager
-def _kept_interrupt() -> Iterator[Callable[[], None]]:
-    """Keeps a Ctrl-C that arrives in a finaliser or a weak reference's callback, where Python drops any exception.
-
-    Yields a function that raises it.
-    """
-    dropped: list[Any] = []
-
-    def keep(what: Any) -> None:
-        (dropped.append if what.exc_type is KeyboardInterrupt else before)(what)
-
-    def raise_it() -> None:
-        if dropped:
-            raise KeyboardInterrupt
-
-    before, sys.unraisablehook = sys.unraisablehook, keep
-    try:
-        yield raise_it
-    finally:
-        sys.unraisablehook = before
 
 
 def _print_plan(wanted: "jaxos4.study.Study", out: Path) -> None:
@@ -118,7 +88,6 @@ def report(
 
     The report of a study is report.html, with figures/ as SVG.
     """
-    page = source.with_suffix(".html") if out is None else out
     if not source.exists():
         raise InputError(
             f"{source}: is not there; give the folder of a `jaxos4 study`, or a file of `jaxos4 estimate --out`."
@@ -128,13 +97,13 @@ def report(
             f"--csv: {source} is a result; `found.to_dataframe()` in Python makes its table. Leave it out."
         )
     if not source.is_dir():
-        check_outputs(source, out=page)
+        out = source.with_suffix(".html") if out is None else out
+        check_outputs(source, out=out)
     elif out is not None:
         raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
     with stages("loading the library") as progress:
         progress("reading")
-        figures: list[Path] = []
-        if source.is_dir():
+        if out is None:
             dataset = jaxos4.study.read_results(source)
             progress("drawing")
             if csv is not None:
@@ -144,6 +113,7 @@ def report(
         else:
             found = jaxos4.read_result(source)
             progress("drawing")
+            page, figures = out, []
             jaxos4.report.write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
@@ -207,9 +177,9 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
 
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
     dataset = run_with_bar(comparison(quick=quick), directory)
-    print_whole(Console(highlight=False), jaxos4.report.error_table(dataset))
     with stages("drawing"):
         page, *_ = jaxos4.report.write_report(dataset, directory)
+    print_whole(Console(highlight=False), jaxos4.report.error_table(dataset))
     typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")
 

@@ -3,7 +3,6 @@
 Each log format is one file and one line in `FORMATS`, or an entry point of another package in `jaxos4.log_formats`.
 """
 
-import itertools
 import os
 import re
 import warnings
@@ -14,7 +13,7 @@ import numpy as np
 
 from .._registry import Registry
 from ..airframe import Airframe
-from ..errors import printable
+from ..errors import in_words, printable
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from .ardupilot import ARDUPILOT
 from .assemble import recording_of
@@ -42,8 +41,12 @@ _OTHERS: Registry[LogFormat] = Registry("jaxos4.log_formats", {})
 
 # Files that no reader takes, by their first bytes: what they are, and how to make a log of them that is read.
 _IN_PYTHON = "read it in Python, and give its arrays to jaxos4.read_log"
+_ARCHIVE = rb"PK\x03\x04|.{257}ustar"
 _UNREAD = {
-    rb"PK\x03\x04": ("an archive (zip, or .xlsx, .npz)", f"unpack it, export its table as CSV, or {_IN_PYTHON}"),
+    _ARCHIVE: (
+        "an archive (zip, tar, or .xlsx, .npz)",
+        f"unpack it, export its table as CSV, or {_IN_PYTHON}",
+    ),
     rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|\x28\xb5\x2f\xfd|\x04\x22\x4d\x18": ("a compressed file", "unpack it"),
     rb"\x89HDF": ("an HDF5 file (netCDF, MATLAB 7.3)", f"{_IN_PYTHON} (xarray.open_dataset, h5py)"),
     rb"MATLAB 5": ("a MATLAB file", f"{_IN_PYTHON} (scipy.io.loadmat), or export CSV by `writetable`"),
@@ -53,6 +56,10 @@ _UNREAD = {
     rb"\xff\xfe|\xfe\xff": ("text in UTF-16", "save it as CSV in UTF-8"),
     rb"FMT, ": ("a text log of ArduPilot", "give the .BIN file of which it was made"),
     rb"\0[\x03-\x07].{6}[\xfd\xfe]": ("a telemetry log of MAVLink (.tlog)", "give the log of the vehicle's own card"),
+    rb"\xa3\x95\x80.{,80}Labels": (
+        "a log of PX4 from before ULog (.px4log)",
+        "convert it to CSV by sdlog2_dump.py (of PX4 before version 1.10), and give a column map",
+    ),
     rb".{16}BUILD|.{242}DJI": ("a log of DJI", "decode it by DatCon, and give its CSV with a column map"),
     rb"[^\n]{0,4000}[\0-\x08\x0e-\x1f]": ("of a kind that is not known", "export it as CSV, and give a column map"),
 }
@@ -121,20 +128,34 @@ def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
 def log_format(path: Path) -> LogFormat:
     """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
 
-    Formats of other packages are asked before the last. A pipe can be read only once, so it always counts as the last.
+    Formats of other packages are asked before the last; one that fails is a `UserWarning`. A pipe can be read only
+    once, so it always counts as the last.
     Raises `InputError` if the file cannot be opened, or is evidently of another kind.
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
         begin = file.read(1 << 18) if file.seekable() else b""
-    formats = itertools.chain(FORMATS[:-1], _OTHERS.values())
-    kind = next((each for each in formats if each.recognises(begin)), FORMATS[-1])
+    # What an archive holds without compression is not its own format.
+    formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1]
+    kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin) or FORMATS[-1]
     unread = (each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL))
     if kind is FORMATS[-1] and (known := next(unread, None)):
         what, remedy = known
-        labels = ", ".join(each.label for each in (*FORMATS, *_OTHERS.values()))
+        labels = ", ".join((*(each.label for each in FORMATS), *_OTHERS))
         refuse(path, f"is {what}; {remedy}. Logs that are read: {labels}")
     return kind
+
+
+def _of_others(begin: bytes) -> LogFormat | None:
+    """The format of another package that recognises a log. A package that fails is skipped."""
+    for name in _OTHERS:
+        try:
+            if _OTHERS[name].recognises(begin):
+                return _OTHERS[name]
+        except Exception as error:  # noqa: BLE001 - whatever another package does
+            what = f"the log format {name} of another package fails ({in_words(error)}); update or uninstall it"
+            warnings.warn(what, UserWarning, stacklevel=4)
+    return None
 
 
 def as_recordings(

@@ -59,22 +59,25 @@ def read_ardupilot(path: Path) -> tuple[Table, tuple[str, ...]]:
     return log.table(rates, rotors, others, faster=faster)[1], tuple(log.notes)
 
 
-ARDUPILOT = LogFormat(
-    "ArduPilot", "ArduPilot DataFlash log", lambda begin: begin.startswith(_HEAD + bytes([_FMT])), read_ardupilot
-)
+def _recognises(begin: bytes) -> bool:
+    """Whether a log describes itself as one of ArduPilot; PX4's old logs have another word for columns."""
+    return begin.startswith(_HEAD + bytes([_FMT])) and b"Labels" not in begin[:_FMT_LENGTH]
+
+
+ARDUPILOT = LogFormat("ArduPilot", "ArduPilot DataFlash log", _recognises, read_ardupilot)
 
 
 def _rotors(log: Messages, outputs: list[int]) -> Series | None:
     """Speeds [rad/s], or commands [0..1] if they were not measured, or only rarely."""
-    every = (log.series("ESC", ("RPM",), output) for output in outputs)
-    escs = [each for each in every if each is not None and (each.values > 0).any()]
+    every = {f"ESC.RPM of output {output + 1}": log.series("ESC", ("RPM",), output) for output in outputs}
+    escs = {name: each for name, each in every.items() if each is not None and (each.values > 0).any()}
     commands = log.series("RCOU", [f"C{output + 1}" for output in outputs])
     if len(escs) == len(outputs):
-        t = escs[0].t
-        values = [np.interp(t, each.t, np.nan_to_num(each.values[:, 0])) * _RPM for each in escs]
+        t = next(iter(escs.values())).t
         rate = logged_rate(t)
         if commands is None or fast_enough(rate) or rate >= logged_rate(commands.t):
-            log.names.update((f"omega{i}", f"ESC.RPM of output {o + 1}") for i, o in enumerate(outputs, start=1))
+            log.names.update((f"omega{i}", name) for i, name in enumerate(escs, start=1))
+            values = [log.speeds_at(t, each, name) * _RPM for name, each in escs.items()]
             return Series(t, np.abs(np.column_stack(values)))
         log.notes.append(f"measured speeds (ESC) were logged at {rate:.2g} Hz only: commands are used")
     if commands is None:
@@ -121,7 +124,7 @@ def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> 
         with np.errstate(all="ignore"):  # a damaged float need not be finite
             fields = {f: records[f].astype(float) * unit for f, unit in units.items() if unit}
         messages[name] = _instances(fields)
-        if name == "PARM" and {"Name", "Value"} <= units.keys():
+        if name == "PARM" and "Name" in units and "Value" in fields:  # a text is no field
             names = (each.decode(errors="replace") for each in records["Name"].astype("S64").tolist())
             parameters = {n: x for n, x in zip(names, fields["Value"].tolist(), strict=True) if abs(x) < 1e9}
     return Messages(path, messages, _REMEDY, notes, parameters=parameters)

@@ -9,6 +9,7 @@ import csv
 import itertools
 import math
 import re
+import struct
 from typing import NamedTuple
 
 import numpy as np
@@ -25,8 +26,13 @@ _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
 _LONGEST_HEADER = 5000, 1 << 16  # lines of settings, and characters of one
 _DEGREE = math.pi / 180
 _NONE = np.zeros(0)
-_TIMES = ("time (us)", "time")
+_UNITS = {  # of `blackbox_decode`, behind the name of a field
+    "time": {"us": 1e-6, "ms": 1e-3, "s": 1.0},
+    "gyroADC": {"deg/s": _DEGREE, "rad/s": 1.0},
+    "accSmooth": {"g": STANDARD_GRAVITY, "m/s/s": 1.0, "m/s2": 1.0},
+}
 _GYROS = ("gyroUnfilt", "gyroADCafterRpm", "gyroADC")
+_GYRO_SCALES = ("gyro.scale", "gyro_scale", "gyroScale")  # of Cleanflight, of its successors, in Explorer's exports
 _SPEEDS = ("omegaUnfiltered", "omega", "eRPM")  # of Indiflight in rad/s
 _ATTITUDES = {"quat": 4, "imuQuaternion": 3, "attitude": 3}  # of Indiflight, Betaflight, INAV: this many numbers
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
@@ -34,15 +40,20 @@ _VOLTAGE, _KNOWN_UNIT = "vbatLatest", re.compile(r"Betaflight ([4-9]|\d{2,})\.")
 _EXPORT = "export it as CSV by Blackbox Explorer"
 _DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
-_KNOWN = (
-    *_TIMES,
+_RAW = (
+    "time",
     *(f"{name}[{i}]" for name in (*_GYROS, "accSmooth") for i in range(3)),
     *(f"{name}[{i}]" for name, count in _ATTITUDES.items() for i in range(count)),
     _VOLTAGE,
     *(f"{name}[{i}]" for name in (*_SPEEDS, "motor") for i in range(8)),
 )
+_CONVERTED = {
+    f"{name} ({unit})": (name, factor)
+    for name in _RAW
+    for unit, factor in _UNITS.get(name.partition("[")[0], {}).items()
+}
 # Sessions are joined to the longest one if these settings are equal.
-_USED = ("acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
+_USED = (*_GYRO_SCALES, "acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
 
 Settings = dict[str, str]
 Columns = dict[str, np.ndarray]
@@ -51,7 +62,8 @@ Columns = dict[str, np.ndarray]
 class _Log(NamedTuple):
     """A blackbox log: its own columns `raw` and `settings`, and our `columns`, the log's `names` of them, `notes`.
 
-    `header`: the row of the CSV's header; `None` for a log that was not decoded.
+    - `header`: the row of the CSV's header; `None` for a log that was not decoded.
+    - `converted`: of columns that `blackbox_decode` has converted, the whole name ("gyroADC[0] (deg/s)") and the unit.
     """
 
     path: Path
@@ -61,11 +73,13 @@ class _Log(NamedTuple):
     columns: Columns
     names: dict[str, str]
     notes: list[str]
+    converted: dict[str, tuple[str, float]]
 
     def add(self, names: dict[str, str], factor: float) -> None:
-        """Add columns, by the log's names of them."""
-        self.names.update(names)
-        self.columns.update((column, self.raw[name] * factor) for column, name in names.items())
+        """Add columns, by the log's names of them. `factor`: of raw values."""
+        for column, name in names.items():
+            self.names[column], unit = self.converted.get(name, (name, factor))
+            self.columns[column] = self.raw[name] * unit
 
     def vector(self, name: str, count: int) -> np.ndarray | None:
         """The fields `name[0]`, ..., shape (rows, count), if all were logged and they change."""
@@ -75,9 +89,11 @@ class _Log(NamedTuple):
         return np.column_stack([self.raw[each] for each in names])
 
     def setting(self, name: str, least: float, most: float) -> float | None:
-        """A setting, or the last of several, if it is a number within these limits."""
+        """A setting, or the last of several, if it is a number within these limits. 0x: the bits of a float."""
+        text = self.settings.get(name, "").split(",")[-1].strip()
         try:
-            value = float(self.settings.get(name, "").split(",")[-1])
+            bits = re.fullmatch("0x([0-9a-fA-F]{8})", text)
+            value = struct.unpack(">f", bytes.fromhex(bits[1]))[0] if bits else float(text)
         except ValueError:
             return None
         return value if least <= value <= most else None
@@ -91,14 +107,16 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
         log = _decoded(path)
     else:
         settings, skip = _settings_above(path)
-        columns = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan")).columns
+        columns = read_table(path, (*_RAW, *_CONVERTED), skip=skip, missing=("NaN", "nan")).columns
         logged = {name: column for name, column in columns.items() if not np.isnan(column).all()}
-        log = _Log(path, skip + 1, settings, logged, {}, {}, [])
+        converted = {own: (name, unit) for name, (own, unit) in _CONVERTED.items() if name in logged}
+        raw = logged | {own: logged[name] for own, (name, _) in converted.items()}
+        log = _Log(path, skip + 1, settings, raw, {}, {}, [], converted)
     raw, first_row = log.raw, None if log.header is None else log.header + 1
-    time = next((name for name in _TIMES if name in raw), None)
-    if time is None:
+    if "time" not in raw:
         refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
-    log.names["t"], log.columns["t"] = time, (raw[time] - np.nan_to_num(raw[time][0])) * 1e-6
+    raw["time"] = raw["time"] - np.nan_to_num(raw["time"][0])
+    log.add({"t": "time"}, 1e-6)
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
@@ -189,13 +207,13 @@ def _decoded(path: Path, *, between: float = 1.0) -> _Log:
         columns["time"] += begin
         begin = columns["time"][-1] + 1e6 * between
     joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
-    return _Log(path, None, longest, joined, {}, {}, notes)
+    return _Log(path, None, longest, joined, {}, {}, notes, {})
 
 
 def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
     """The columns of one session with the time from 0, or `None`, and a remark on what is lost."""
     try:
-        columns, damaged, ended = decode_frames(settings, frames, _KNOWN)
+        columns, damaged, ended = decode_frames(settings, frames, _RAW)
     except BadHeader as error:
         return None, f"{error}: it is ignored"
     later = in_order(columns["time"])
@@ -211,10 +229,21 @@ def _add_rates(log: _Log) -> None:
     field = next((name for name in _GYROS if log.raw.keys() >= {f"{name}[{i}]" for i in range(3)}), None)
     if field is None:
         refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
+    names = {name: f"{field}[{i}]" for i, name in enumerate(RATES)}
     fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
-    log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}"])
-    unit = _DEGREE / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-    log.add({name: f"{field}[{i}]" for i, name in enumerate(RATES)}, unit)
+    log.notes.extend([] if log.settings or names["p"] in log.converted else [f"{field} is taken as deg/s: {fine}"])
+    unit = _gyro_unit(log) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
+    log.add(names, unit)
+
+
+def _gyro_unit(log: _Log) -> float:
+    """One count of the gyro [rad/s]: the setting holds deg/s, or, of Baseflight and in exports, rad/us."""
+    for name in _GYRO_SCALES:
+        if (scale := log.setting(name, 1e-3, 10)) is not None:
+            return scale * _DEGREE
+        if (scale := log.setting(name, 1e-11, 1e-6)) is not None:
+            return scale * 1e6
+    return _DEGREE
 
 
 def _add_rotors(log: _Log, *, usual: int = 14) -> None:
@@ -255,11 +284,11 @@ def _add_force(log: _Log) -> None:
         log.notes.append("the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked")
         return
     one = log.setting("acc_1G", 1, 65535)
-    if one is None:
+    if one is None and names[0] not in log.converted:
         median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
         one = min((256, 512, 1024, 2048, 4096, 8192), key=lambda g: abs(math.log(g / max(median, 1e-9))))
         log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
-    log.add(dict(zip(FORCES, names, strict=True)), STANDARD_GRAVITY / one)
+    log.add(dict(zip(FORCES, names, strict=True)), STANDARD_GRAVITY / (one or 1))
 
 
 def _add_attitude(log: _Log) -> None:

@@ -175,6 +175,8 @@ def array_table(data: Any, columns: ColumnMap) -> Table:
         values = np.asarray(data[name])
         if values.dtype.kind == "M":
             values = (values - values.flat[0]) / np.timedelta64(1, "s") if values.size else np.empty(0)
+        if values.shape[1:] == (1,):  # a matrix of one column
+            values = values.ravel()
         if values.dtype.kind in "fiu" and values.ndim in (1, 2):
             every = np.atleast_2d(values.T).astype(float)
             raw |= {f"{name}[{i}]" if values.ndim == 2 else str(name): own for i, own in enumerate(every)}

@@ -17,10 +17,15 @@ class Limits(NamedTuple):
 
     - `part`: of a chunk or a message, in memory. Recorders write about a megabyte; a bomb has gigabytes.
     - `file`: of a file that is compressed as a whole, on the disk. A bag of an hour has a few gigabytes.
+    - `times`, `small`: such a file may be so many times as large as it was, or `small`. Bags shrink 2 to 20 times.
+    - `metadata`: of metadata.yaml, whose parser takes 14 s for a megabyte. A topic has about a kilobyte in it.
     """
 
     part: int = 1 << 28
     file: int = 1 << 34
+    times: int = 100
+    small: int = 1 << 29
+    metadata: int = 1 << 19
 
 
 LIMITS = Limits()
@@ -29,9 +34,18 @@ _MCAP, _CHUNK_OF_MCAP, _ATTACHMENT_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, 9, 
 
 
 def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
-    """Raises `InputError` for a bag, file or folder, that decompresses to more than `limits`. Readers report damage."""
+    """Raises `InputError` for a bag, file or folder, that decompresses to more than `limits`. Readers report damage.
+
+    What is in a folder must be files: a pipe or a device has no end.
+    """
     place = FilePath(path)
-    for each in sorted(file for file in place.iterdir() if file.is_file()) if place.is_dir() else [place]:
+    for each in sorted(place.iterdir()) if place.is_dir() else [place]:
+        if each.is_dir() or not each.exists():
+            continue
+        if each.parent == place and not each.is_file():
+            refuse(each, "is a pipe or a device in the folder of a bag; remove it")
+        if each.name == "metadata.yaml":
+            _check_metadata(each, limits)
         with opened(each, "rb") as file:
             begin = file.read(8)
             if begin.startswith(_MCAP):
@@ -44,9 +58,20 @@ def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
                 _check_whole(each, file, limits)
 
 
+def _check_metadata(path: FilePath, limits: Limits) -> None:
+    """The same for a text in YAML, which may not refer to itself either: lists of lists of it could have any length."""
+    with opened(path, "rb") as file:
+        content = file.read(limits.metadata + 1)
+    if len(content) > limits.metadata:
+        refuse(path, f"has more than {limits.metadata:,} bytes; make it anew by `ros2 bag reindex`")
+    if re.search(rb"[:,[{-]\s*[*&]\w", content):
+        refuse(path, "names parts of itself (& and *), which no recorder does; make it anew by `ros2 bag reindex`")
+
+
 def _check_whole(path: FilePath, packed: IO[bytes], limits: Limits) -> None:
     """The same for a file that may be compressed as a whole. It is decompressed once, a part at a time."""
-    end = limits.file + 1
+    most = min(limits.file, max(limits.small, limits.times * path.stat().st_size))
+    end = most + 1
     try:
         with _zstd().ZstdFile(packed) as file:
             if file.read(8).startswith(_MCAP):
@@ -57,7 +82,7 @@ def _check_whole(path: FilePath, packed: IO[bytes], limits: Limits) -> None:
     except Exception:  # noqa: BLE001 - of a damaged file, a decompressor raises any
         return
     if too_large:
-        what = f"has more than {limits.file:,} bytes when it is decompressed"
+        what = f"has more than {most:,} bytes when it is decompressed"
         refuse(path, f"{what}; record it again in several files (--max-bag-size)")
 
 

@@ -20,7 +20,7 @@ from .sampling import (
     unwrap,
 )
 from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFacts, Path, Sampling, Table, refuse
-from .values import without_impossible
+from .values import dropped, without_impossible
 
 RATES, ANGLES, FORCES = ("p", "q", "r"), ("phi", "theta", "psi"), ("ax", "ay", "az")
 _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
@@ -97,6 +97,16 @@ class Messages:
                     best, found = logged_rate(series.t), Series(series.t, series.values * factor)
                     self.name(columns, kind, fields)
         return found
+
+    def speeds_at(self, t: RowPositions, series: Series, source: str) -> RowPositions:
+        """The speeds of one rotor, interpolated at other times without the zeros of its telemetry."""
+        values = series.values[:, 0]
+        zeros = dropped(series.t, values)
+        if zeros.any():
+            count = np.count_nonzero(zeros)
+            self.notes.append(f"impossible values count as not measured, in {source}: {count} (0 while it turns)")
+        known = np.isfinite(values) & ~zeros
+        return np.interp(t, series.t[known], values[known])
 
     def name(self, columns: Sequence[str], kind: str, fields: Sequence[str]) -> None:
         """Note which fields hold these columns."""

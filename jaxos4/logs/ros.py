@@ -3,16 +3,18 @@
 A column's source is `/topic.field.field[0]`. A topic may have a namespace before the name in the column map.
 """
 
+import contextlib
 import functools
 import math
+import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from ..errors import InputError, in_words
+from ..errors import InputError, in_words, shortened
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
 from .compression import check_parts, check_sizes
 from .messages import ANGLES, RATES, Fields, Messages, Names
@@ -37,6 +39,7 @@ _FIELD = re.compile(r"[^.\[\]]+")
 _STAMPS = (("timestamp_sample", 1000), ("timestamp", 1000))  # of PX4, and their unit [ns]
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
 _REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
+_LONGEST_DEFINITIONS = 1 << 16  # characters: those of our topics have a few thousand, and their parser is slow
 _NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag record -s mcap`), or convert it"
 
 
@@ -56,7 +59,8 @@ def read_ros(path: Path, columns: ColumnMap | None = None) -> tuple[Table, tuple
         refuse(path, "reading a ROS bag needs rosbags; install jaxos4[ros]")
     try:
         reader = _reader(path)
-        reader.open()
+        with _only_tables(path):
+            reader.open()
         if getattr(getattr(reader, "metadata", None), "compression_mode", "") == "message":
             every = (message for store in reader.storages for *_, message in store.messages(store.connections))
             check_parts(path, (("zstd", message) for message in every))
@@ -92,6 +96,35 @@ def _reader(path: Path) -> Any:
         return Reader2(place)
     kinds = {_ROS1: Reader1, _MCAP: McapReader, _SQLITE: Sqlite3Reader}
     return next(reader for magic, reader in kinds.items() if begin.startswith(magic))(place)
+
+
+@contextlib.contextmanager
+def _only_tables(path: Path) -> Iterator[None]:
+    """Databases that are opened inside must consist of tables, and answer in a time that their size explains.
+
+    A view can have rows without end, and so can damaged pages. A sound bag takes less than two steps for a byte.
+    """
+    import apsw
+
+    def check(database: apsw.Connection) -> None:
+        most, done = 1_000_000 + 100 * os.path.getsize(database.filename), 0
+
+        def stop(*, steps: int = 10_000) -> bool:
+            nonlocal done
+            done += steps
+            return done > most
+
+        database.set_progress_handler(stop, 10_000)
+        tables = ("TABLE", "INDEX", "UNIQUE INDEX")
+        others = " AND ".join(f"sql NOT LIKE 'CREATE {each} %'" for each in tables)
+        for (name,) in database.execute(f"SELECT name FROM sqlite_schema WHERE {others}"):
+            refuse(path, f"its database holds {quoted(str(name))}, which is no table; {_REPAIR}")
+
+    apsw.connection_hooks.append(check)
+    try:
+        yield
+    finally:
+        apsw.connection_hooks.remove(check)
 
 
 def _refuse_damage(path: Path, error: Exception) -> NoReturn:
@@ -156,6 +189,8 @@ def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[byt
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     types = dict(get_typestore(Stores.LATEST).fielddefs)
+    if sum(len(text) for text in {each.msgdef.data for each in connections}) > _LONGEST_DEFINITIONS:
+        refuse(path, f"the definitions of its messages are longer than {_LONGEST_DEFINITIONS:,} characters; {_REPAIR}")
     for each in connections:
         if not _TYPE.fullmatch(each.msgtype):
             refuse(path, f"has a type of messages {quoted(each.msgtype)}; {_REPAIR}")
@@ -170,7 +205,7 @@ def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[byt
 
 def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
     """A function that takes a number out of a message; NaN if an array is shorter. It raises `InputError`."""
-    steps = [int(each) if each.isdecimal() else each for each in _FIELD.findall(field)]
+    steps = [int(each) if each.isdecimal() and len(each) < 10 else each for each in _FIELD.findall(field)]
     wrong = functools.partial(refuse, path, column=f"{topic}.{field}", kind="field")
 
     def get(message: Any) -> float:
@@ -182,7 +217,8 @@ def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
                 return math.nan
             except (AttributeError, TypeError):
                 fields = [name for name in getattr(value, "__dataclass_fields__", ()) if name[:2] != "__"]
-                wrong(f"has no {step} there, but {', '.join(fields) or 'a number'}; correct the column map")
+                what = f"has no {shortened(str(step), 40)} there, but {', '.join(fields) or 'a number'}"
+                wrong(f"{what}; correct the column map")
         try:
             return float(value)
         except (TypeError, ValueError):
@@ -235,9 +271,18 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
             return None
         log.names.update((name, chosen[name]) for name in names)
         t = found[names[0]].t
-        same = (found[name] for name in names)
-        values = [s.values[:, 0] if s.t is t else np.interp(t, s.t, s.values[:, 0]) for s in same]
-        return Series(t, np.column_stack(values))
+
+        def at(name: str) -> np.ndarray:
+            series = found[name]
+            if series.t is t:
+                return series.values[:, 0]
+            return (
+                log.speeds_at(t, series, chosen[name])
+                if name in SPEED_NAMES
+                else np.interp(t, series.t, series.values[:, 0])
+            )
+
+        return Series(t, np.column_stack([at(name) for name in names]))
 
     def turning(names: Sequence[str]) -> Series | None:
         """The samples with all four rotors; `None` if one of them never turns."""

@@ -51,10 +51,23 @@ PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
 """The pitch of a log: one that was not read from a file may be any number."""
 
 
+_RESTART = 0.1  # s; a rotor that has stopped needs longer to turn again
+
+
+def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
+    """Whether each speed is a 0 of the telemetry: the rotor turns so shortly before and after that it did not stop."""
+    out, turning, zeros = np.zeros(speeds.size, dtype=bool), np.flatnonzero(speeds > 0), np.flatnonzero(speeds == 0)
+    after = np.searchsorted(turning, zeros)
+    between = (after > 0) & (after < turning.size)
+    zeros, after = zeros[between], after[between]
+    out[zeros[t[turning[after]] - t[turning[after - 1]] < _RESTART]] = True
+    return out
+
+
 def without_impossible(
     table: Table, limits: Mapping[str, Limit] = LIMITS, *, most: float = 0.01, farthest: float = 10.0
 ) -> Table:
-    """The table without the values outside of `limits`: they count as not measured.
+    """The table without the values outside of `limits`, or `dropped`: they count as not measured.
 
     - `most`: the share of the values of a column that can be impossible. More are a wrong unit: `InputError`.
     - `farthest`: a rotor turns at most this many times as fast as in all but this share of its flight.
@@ -64,10 +77,11 @@ def without_impossible(
         values, largest = columns.get(name, np.empty(0)), limit.largest
         if name in SPEED_NAMES and (values > 0).any():
             largest = min(largest, farthest * float(np.quantile(values[values > 0], 1 - most)))
-        wrong = (values < limit.least) | (values > largest)
+        beyond = (values < limit.least) | (values > largest)
+        wrong = beyond | dropped(columns["t"], values) if name in SPEED_NAMES and values.size else beyond
         if name == "t" or not wrong.any():
             continue
-        index, count = int(np.argmax(wrong)), int(np.count_nonzero(wrong))
+        count, index = int(np.count_nonzero(beyond)), int(np.argmax(beyond if beyond.any() else wrong))
         first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
         if count > most * every:
             low = values[index] < limit.least
@@ -77,7 +91,7 @@ def without_impossible(
             table.refuse(what + advice, index=index, column=name)
         columns[name] = np.where(wrong, np.nan, values)
         before, begin = impossible.get(name, (0, f"{first} at {table.columns['t'][index]:.6g} s"))
-        impossible[name] = before + count, begin
+        impossible[name] = before + int(np.count_nonzero(wrong)), begin
     return table._replace(columns=columns, impossible=impossible)
 
 
@@ -103,6 +117,7 @@ class Rules(NamedTuple):
       just below, within a share `near` of the range. A signal without limits has a single largest value. A value that
       is held counts once.
     - `levels`: with more repeated values than this, a signal is coarse, and the level below the largest counts as near.
+      If so few values are most of the signal, it is at rest: they are counts of noise, and not the end of a range.
     """
 
     fewest: int = 20
@@ -118,12 +133,17 @@ RULES = Rules()
 
 
 def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
-    """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before."""
+    """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before.
+
+    A rotor's measured speed is taken out if it is `dropped`, too.
+    """
     channels, omega = recording.channels.copy(), recording.omega.copy()
     impossible, clipped = {}, {}
     names = (*CHANNEL_NAMES, *(f"rotor {i + 1}" for i in range(4)))
     for name, column in zip(names, (*channels.T, *omega.T), strict=True):
         wrong = _isolated(column, rules)
+        if name.startswith("rotor") and not recording.commanded:
+            wrong |= dropped(recording.time, column)
         if wrong.any():
             worst = column[wrong][np.argmax(np.abs(column[wrong]))]
             impossible[name] = int(wrong.sum()), float(worst)
@@ -176,6 +196,8 @@ def _stuck(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarr
     edges = np.flatnonzero(np.diff(np.concatenate([[0], top.astype(int), [0]])))
     at_top = np.ceil((edges[1::2] - edges[::2]) / usual).sum()
     levels, counts = np.unique(x, return_counts=True)
+    if 2 * np.sort(counts)[-rules.levels :].sum() > x.size:
+        return out
     levels = levels[counts > 1]
     if levels.size > rules.levels:
         near = max(near, 1.01 * float(np.median(np.diff(levels))))

@@ -27,7 +27,12 @@ if hasattr(signal, "alarm"):
 def read(_, node):
     global most
     dict(node.attrs)
-    if isinstance(node, h5py.Dataset):
+    if isinstance(node, h5py.Group):
+        if not all(isinstance(node.get(name, getlink=True), h5py.HardLink) for name in node):
+            sys.exit("it has a link to another place")
+    elif isinstance(node, h5py.Dataset):
+        if node.external or node.is_virtual:
+            sys.exit("its arrays are in another file")
         most -= node.nbytes
         if most < 0:
             sys.exit("it announces more than it holds")

@@ -63,4 +63,11 @@ BAD = {
     "too fast": (dataflash([("RATE", "fff", "R,P,Y", FEW, (9e3 * rates(FEW),)), outputs(FEW)]), "rad/s, beyond"),
     "damaged all over": (dataflash([imu(FEW)]) + b"\xa3\x95\x01" * 1100, "damaged in more than 1000 places"),
 }
+TEXTS = {
+    letter: everything(FEW)
+    .replace(b"QNf".ljust(16, b"\0"), b"QN" + letter.ljust(14, b"\0"))
+    .replace(b"QBffffff".ljust(16, b"\0"), b"QB" + 6 * letter + bytes(8))
+    for letter in (b"n", b"a")
+}
+"""Logs whose PARM and IMU have a text, or one that does not fit, for each number."""
 SMALL = dataflash([imu(FEW), angles(FEW), outputs(FEW)], {"FRAME_CLASS": 1.0})
