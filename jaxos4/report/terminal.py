@@ -9,9 +9,17 @@ from rich.console import Console
 from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
-from ..identification.physical import PhysicalQuantity, physical_quantities
+from ..identification.physical import PhysicalQuantity, physical_quantities, possible
 from ..identification.results import COLOURED, Identification
-from ..identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED, reason_lines, status_lines
+from ..identification.verdict import (
+    CONTRADICTED,
+    IDENTIFIED,
+    MISSING,
+    RESERVED,
+    TOLERANCE,
+    reason_lines,
+    status_lines,
+)
 from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
 from .text import Listing, say
@@ -68,8 +76,9 @@ def quantity_rows(rows: Sequence[PhysicalQuantity]) -> tuple[list[tuple[str, ...
 
 
 def _verdicts(found: Identification) -> Section:
+    """From the best status to the worst; the other way round if what was asked is refused, as the last line says."""
     tabled = {row.judged for row in physical_quantities(found)} if found.is_vehicle else ()
-    yield from status_lines(found.verdicts, tabled)
+    yield from status_lines(found.verdicts, tabled)[:: 1 if found.successful else -1]
 
 
 def _quantities(found: Identification) -> Section:
@@ -160,13 +169,13 @@ def _inertias(found: Identification) -> Section:
     body = found.rigid_body
     inertias = [
         f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
-        if abs(row.estimate) > NINETY_FIVE * row.std
-        else f"{name} below noise"
+        if name in possible(body)
+        else f"{name} {'below noise' if abs(row.estimate) <= NINETY_FIVE * row.std else 'impossible'}"
         for name, row in body.constants.items()
     ]
     verdict = ""
     if body.consistency_p is not None:
-        if body.consistency_p < _SIGNIFICANCE:
+        if body.consistency_p < TOLERANCE.consistent:
             verdict = f"; the alphas are not those of one rigid body, p = {body.consistency_p:.1g}"
         elif not body.is_rigid_body:
             verdict = "; no rigid body has such inertias: one exceeds the sum of the other two"
