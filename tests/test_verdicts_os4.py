@@ -10,7 +10,7 @@ from helpers import standard_flight
 
 import jaxos4
 from jaxos4.airframe import OS4
-from jaxos4.excitation import multisine
+from jaxos4.excitation import doublet, multisine
 from jaxos4.flight import RATES
 from jaxos4.identification.doubts_of_values import doubts_of_alphas
 from jaxos4.identification.physical import physical_quantities
@@ -124,3 +124,16 @@ def test_coloured_residuals_are_a_reservation():
     # Kalman filters and regressions do not find the best fit, so their residuals say nothing.
     other = jaxos4.identify(flight, jaxos4.PublishedOS4(), estimator="rls")
     assert not any("not white" in str(doubt) for doubt in other.doubts)
+
+
+def test_an_alpha_that_is_not_excited_does_not_refuse_the_others():
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, doublet(OS4), dt=0.01)
+    found = jaxos4.identify(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0)), model)
+    assert found.result == "unidentifiable"
+    refused = {name for name, verdict in found.verdicts.items() if not verdict.trusted}
+    assert refused == {"alpha1", "alpha4", "alpha7"}
+    assert found.verdicts["alpha3"].status == IDENTIFIED
+    first, second, *_ = found.summary(width=200).splitlines()
+    assert first == "not identified: alpha1; alpha4; alpha7."
+    assert second.startswith("identified with a reservation: ")
