@@ -114,7 +114,7 @@ def flights_of(kind: str, flights: int, duration: float, seed: int, gust: float 
     flown: list[jaxos4.Flight | None] = []
     for first in range(0, flights, CHUNK):
         some = slice(first, first + CHUNK)
-        batch = _fly(stacked(loops[some]), jnp.stack(keys[some]), duration, soft=effect.soft)
+        batch = _fly(stacked(loops[some]), jnp.stack(keys[some]), duration, soft=kind != ALL and EFFECTS[kind].soft)
         for k in range(len(keys[some])):
             flight = jax.tree.map(lambda x, k=k: np.asarray(x)[k], batch)
             flown.append(None if turned_over(flight) else flight)
