@@ -172,7 +172,7 @@ def print_tables(rows: list[Row]) -> None:
     letters = ", ".join(f"{letter}: {status}" for status, letter in LETTERS.items())
     title = f"estimate over truth, error in standard deviations, verdict ({letters})"
     print_table(title, ("case", "effect", *names, "results"), lines, width=240)
-    print_table("counts of Ix, Iy and Iz", ("", "values", "results"), counts(rows))
+    print_table("counts of Ix, Iy and Iz", ("", "values", "results"), ((a, str(n), b) for a, n, b in counts(rows)))
     groups = {effect: [row for row in rows if row["effect"] == effect] for effect in (row["effect"] for row in rows)}
     several = {effect: some for effect, some in groups.items() if len(some) > 2}
     headings = "effect", "", "flights", "mean error [%]", "mean z", "rms z", "held [%]", "half-width [%]", "trusted [%]"
