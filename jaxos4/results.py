@@ -22,8 +22,8 @@ class RESULTS(eqx.Enumeration):
         "train a network for this flight"
     )
     implausible = (
-        "physics, the airframe file or the data contradict the estimate: correct what is named, and do not use the "
-        "numbers"
+        "physics, the airframe file or the data contradict the estimate: correct what is named, and do not use "
+        "contradicted numbers"
     )
     no_skill = (
         "the fit predicts measurements that were not fitted no better than constant rates: fly with more excitation, "

@@ -192,3 +192,27 @@ def test_a_battery_sags_linearly():
     omega, _, force = fly(LEVEL, loop={"sag": sag})
     np.testing.assert_allclose(omega, HOVER, rtol=1e-9)
     np.testing.assert_allclose(force[:, 2], GRAVITY * (1 - sag * TIME / TIME[-1]), rtol=1e-9)
+
+
+def test_a_battery_sags_under_load():
+    """Level commands above hover load it: with slow rotors, the speed is that of the command times the voltage."""
+    sag, more = 0.1, 1.15
+    omega, _, force = fly(LEVEL + [0, 0, 0, (more**2 - 1) * GRAVITY], loop={"load_sag": sag})
+    np.testing.assert_allclose(omega, more * HOVER, rtol=1e-9)
+    # The share of hover at which x = more (1 - sag (x^3 - 1)).
+    share = np.roots([more * sag, 0, 1, -more * (1 + sag)])
+    (share,) = share[np.isreal(share)].real
+    np.testing.assert_allclose(force[TIME > 1, 2], share**2 * GRAVITY, rtol=1e-6)
+    np.testing.assert_allclose(fly(LEVEL, loop={"load_sag": sag})[2][:, 2], GRAVITY, rtol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.003, 0.0105])
+def test_the_log_and_its_controller_see_the_gyro_late(delay):
+    _, exact, _ = fly(gyro_filter=0.003)
+    _, states, _ = fly(gyro_filter=0.003, gyro_delay=delay)
+    for axis in RATES:
+        expected = np.interp(TIME - delay, TIME, exact[:, axis])
+        np.testing.assert_allclose(states[2:, axis], expected[2:], atol=1e-9)
+    assert np.abs(states - exact)[:, RATES].max() > 0.01
+    answers = [fly(gyro_delay=late, controller_gyro_noise=None)[0] for late in (0.0, delay)]
+    assert np.std(answers[1] - answers[0]) > 0.3

@@ -57,6 +57,17 @@ def test_effects(tmp_path):
         assert abs(case["summary"]["thrust"]["mean"]) < 0.05
 
 
+def test_a_soft_flight_has_no_steps_and_the_mix_of_effects_stays_what_it_was():
+    effects = load("closed_loop", "effects")
+    hard, soft = (effects.flights_of(kind, 1, 8.0, 22, gust=0.0)[0] for kind in ("gusts", "soft"))
+    jumps = [np.abs(np.diff(flight.omega, axis=0)).max() / flight.omega.std() for flight in (hard, soft)]
+    assert jumps[1] < 0.5 * jumps[0]
+    assert {"battery", "filtered gyro", "soft", "soft, fast controller"} == set(effects.EFFECTS) - set(effects.MIXED)
+    mixed = effects.effect_of(effects.ALL, np.random.default_rng(0))
+    assert "load_sag" not in mixed.loop
+    assert (mixed.log_every, mixed.soft) == (4, False)
+
+
 def test_verdicts(capsys, tmp_path):
     """Good and spoiled flights are judged, and counted."""
     cases = {"gusts": None, "force clipped 0.8": True}

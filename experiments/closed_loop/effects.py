@@ -1,10 +1,11 @@
 """Which effects of real flights make moments of inertia wrong, one at a time and all together?
 
 The flights are those of `run.py`: a quadrotor as small as a Crazyflie, 20 s of random references, gusts of 5 rad/s^2.
-Each case adds one effect, of the size in `EFFECTS`. In the case `all`, each flight has every effect, with a random
-share of its size. Clock offsets and flapping have random signs. The airframe that is given, also to the controller, has
-a thrust coefficient that is 20 % wrong and moments of inertia that are 25 % wrong. The motors of `motors` are those of
-a Crazyflie. The true thrust of `sag` is that at the begin of the flight; on average it is 5 % smaller.
+Each case adds one effect, of the size in `EFFECTS`. In the case `all`, each flight has every effect of `MIXED`, with a
+random share of its size. Clock offsets and flapping have random signs. The airframe that is given, also to the
+controller, has a thrust coefficient that is 20 % wrong and moments of inertia that are 25 % wrong. The motors of
+`motors` are those of a Crazyflie. The true thrust of `sag` is that at the begin of the flight; on average it is 5 %
+smaller. The battery of `battery` sags under load.
 """
 
 import functools
@@ -22,15 +23,17 @@ import jaxos4
 from experiments.closed_loop.run import CHUNK, DELAY, DT, LAG, LARGEST, VEHICLE, stacked, turned_over
 from experiments.fits import fit, given_airframe, print_summaries, summary
 from experiments.monte_carlo import Row, monte_carlo
+from jaxos4.excitation import STANDARD_TONES
 
 GUST = 5.0  # [rad/s^2]
+VERTICAL_TONES = (0.4, 0.8, 1.2)  # of the vertical acceleration [Hz]
 
 
 class Effect(NamedTuple):
     """Settings of `Air`, `Sensors` and `ClosedLoop`, and those that cannot be mixed in one batch.
 
     `motor`: by how much `thrust_curve` and `motor_braking` are below 1. `fastest`: the largest speed of the rotors as a
-    share of that of `VEHICLE`.
+    share of that of `VEHICLE`. `soft`: references are sines instead of steps.
     """
 
     air: dict = {}
@@ -40,9 +43,10 @@ class Effect(NamedTuple):
     fastest: float = 1.0
     log_every: int = 1
     logged: str = "commands"
+    soft: bool = False
 
 
-EFFECTS = {
+MIXED = {
     "gusts": Effect(),
     "own gyro": Effect(sensors={"controller_gyro_noise": 0.0}),
     "fast controller": Effect(log_every=4),
@@ -57,6 +61,12 @@ EFFECTS = {
     "sag": Effect(loop={"sag": 0.1}),
     "saturation": Effect(fastest=0.78),
 }
+EFFECTS = MIXED | {
+    "battery": Effect(loop={"load_sag": 0.06}),
+    "filtered gyro": Effect(sensors={"gyro_filter": 0.0016, "gyro_delay": 0.0015}),
+    "soft": Effect(soft=True),
+    "soft, fast controller": Effect(soft=True, log_every=4),
+}
 ALL = "all"
 _SIGNED = ("clock_offset", "flapping")
 
@@ -64,7 +74,7 @@ _SIGNED = ("clock_offset", "flapping")
 def effect_of(kind: str, random: np.random.Generator) -> Effect:
     """The effect of one flight."""
     single = kind != ALL
-    every = [EFFECTS[kind]] if single else list(EFFECTS.values())
+    every = [EFFECTS[kind]] if single else list(MIXED.values())
 
     def drawn(settings: dict) -> dict:
         shares = {name: 1.0 if single else random.uniform() for name in settings}
@@ -80,7 +90,8 @@ def effect_of(kind: str, random: np.random.Generator) -> Effect:
         sensors["controller_gyro_noise"] = 0.02 * random.uniform() if random.uniform() < 0.5 else None
     fastest = min(e.fastest for e in every)
     fastest = fastest if single else 1 - random.uniform() * (1 - fastest)
-    return Effect(air, sensors, loop, motor, fastest, max(e.log_every for e in every), every[0].logged)
+    fixed = max(e.log_every for e in every), every[0].logged, every[0].soft
+    return Effect(air, sensors, loop, motor, fastest, *fixed)
 
 
 def flights_of(kind: str, flights: int, duration: float, seed: int, gust: float = GUST) -> list[jaxos4.Flight | None]:
@@ -103,18 +114,28 @@ def flights_of(kind: str, flights: int, duration: float, seed: int, gust: float 
     flown: list[jaxos4.Flight | None] = []
     for first in range(0, flights, CHUNK):
         some = slice(first, first + CHUNK)
-        batch = _fly(stacked(loops[some]), jnp.stack(keys[some]), duration)
+        batch = _fly(stacked(loops[some]), jnp.stack(keys[some]), duration, soft=kind != ALL and EFFECTS[kind].soft)
         for k in range(len(keys[some])):
             flight = jax.tree.map(lambda x, k=k: np.asarray(x)[k], batch)
             flown.append(None if turned_over(flight) else flight)
     return flown
 
 
+def sines(*, duration: float, dt: float, key: jax.Array) -> jaxos4.closed_loop.References:
+    """References of a soft flight: the tones of the standard multisine, with frequencies and phases of the flight."""
+    tones = np.array([*STANDARD_TONES, VERTICAL_TONES])
+    spread, phases = jax.random.uniform(key, (2, *tones.shape))
+    time = dt * np.arange(round(duration / dt) + 1)[:, None, None]
+    flown = np.clip(np.minimum(time, duration - time)[:, 0] - 0.5, 0, 1)  # level at both ends
+    waves = jnp.sin(2 * np.pi * (time * tones * (0.8 + 0.45 * spread) + phases)).mean(axis=2)
+    return flown * LARGEST * waves
+
+
 @eqx.filter_jit
-def _fly(loops: jaxos4.ClosedLoop, keys: jax.Array, duration: float) -> jaxos4.Flight:
+def _fly(loops: jaxos4.ClosedLoop, keys: jax.Array, duration: float, *, soft: bool) -> jaxos4.Flight:
     def one(loop: jaxos4.ClosedLoop, key: jax.Array) -> jaxos4.Flight:
-        settings = {"duration": duration, "dt": DT, "amplitude": LARGEST.tolist()}
-        references = jaxos4.random_references(**settings, key=jax.random.fold_in(key, 0))
+        settings = {"duration": duration, "dt": DT, "key": jax.random.fold_in(key, 0)}
+        references = sines(**settings) if soft else jaxos4.random_references(amplitude=LARGEST.tolist(), **settings)
         return jaxos4.fly_closed_loop(loop, references, dt=DT, key=jax.random.fold_in(key, 1))
 
     return eqx.filter_vmap(one)(loops, keys)

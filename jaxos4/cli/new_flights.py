@@ -1,5 +1,6 @@
 """`jaxos4 simulate` and `jaxos4 design`: a flight as CSV, and the best to fly; in open loop, or with a controller."""
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -26,6 +27,17 @@ GustOption = Annotated[
 ]
 LagOption = Annotated[float | None, Option(help="With --closed-loop: lag of the rotors [s]. Default: 0.05.")]
 DelayOption = Annotated[float | None, Option(help="With --closed-loop: delay of the commands [s]. Default: 0.01.")]
+LoadSagOption = Annotated[
+    float | None,
+    Option(help="With --closed-loop: share of a command that the battery loses for each further load of hover."),
+]
+GyroCutoffOption = Annotated[
+    float | None, Option(help="With --closed-loop: cut-off of the gyro's first-order filter [Hz]. Default: no filter.")
+]
+GyroDelayOption = Annotated[float | None, Option(help="With --closed-loop: delay of the gyro [s]. Default: 0.")]
+LogEveryOption = Annotated[
+    int | None, Option(help="With --closed-loop: runs of the controller in each sample of the log. Default: 1.")
+]
 SensorsOption = Annotated[
     options.Sensors | None,
     Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
@@ -37,7 +49,9 @@ _OPEN |= {"model": "published", "excitation": "multisine", "channels": "all", "i
 _PRESET = "os4"
 _CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
 _CLOSED |= {"sensors": None, "references": None}
+_CLOSED |= {"load_sag": None, "gyro_cutoff": None, "gyro_delay": None, "log_every": None}
 _RANGES = {"gust": (0, 1e6), "lag": (0, 1), "delay": (0, 1), "noise": (0, 1e6), "accuracy": (1e-6, 1e6)}
+_RANGES |= {"load_sag": (0, 0.5), "gyro_cutoff": (0.1, 1e6), "gyro_delay": (0, 1), "log_every": (1, 100)}
 
 
 def simulate(
@@ -63,6 +77,10 @@ def simulate(
     gust: GustOption = None,
     lag: LagOption = None,
     delay: DelayOption = None,
+    load_sag: LoadSagOption = None,
+    gyro_cutoff: GyroCutoffOption = None,
+    gyro_delay: GyroDelayOption = None,
+    log_every: LogEveryOption = None,
     sensors: SensorsOption = None,
     references: Annotated[
         Path | None, Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones.")
@@ -226,13 +244,22 @@ def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
             raise InputError(f"--{name.replace('_', '-')}: is for flights {how}.")
         low, high = _RANGES.get(name, (None, None))
         if low is not None and not low <= value <= high:
-            raise InputError(f"--{name}: must lie in {low:g} to {high:g}, got {value}.")
+            raise InputError(f"--{name.replace('_', '-')}: must lie in {low:g} to {high:g}, got {value}.")
     return dict(asked) | {name: default for name, default in own.items() if asked.get(name) is None}
 
 
 def make_loop(asked: Mapping[str, Any]) -> "jaxos4.ClosedLoop":
     """The vehicle in closed loop with these options; that of a result, if there is one."""
-    settings = options.given(rotor_lag=asked["lag"], rotor_delay=asked["delay"])
+    settings = options.given(
+        rotor_lag=asked["lag"],
+        rotor_delay=asked["delay"],
+        load_sag=asked["load_sag"],
+        log_every=asked["log_every"],
+    )
+    cutoff = asked["gyro_cutoff"]
+    gyro = options.given(gyro_filter=cutoff and 1 / (2 * math.pi * cutoff), gyro_delay=asked["gyro_delay"])
+    if gyro:
+        settings["sensors"] = jaxos4.Sensors(**gyro)
     if asked.get("result") is not None:
         from ..export import found_loop
 

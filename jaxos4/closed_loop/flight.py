@@ -56,11 +56,15 @@ def fly_standard(
     dt: float = 0.004,
     seed: int,
 ) -> Flight:
-    """Fly references, by default random ones, with all random numbers from `seed`: `jaxos4 simulate --closed-loop`."""
+    """Fly references, by default random ones, with all random numbers from `seed`: `jaxos4 simulate --closed-loop`.
+
+    There are at least four Runge-Kutta steps in each sample.
+    """
     first, flight = jax.random.split(jax.random.key(seed))
     if references is None:
         references = random_references(duration=duration, dt=dt, key=first)
-    return fly_closed_loop(loop, as_float(references), dt=dt, key=flight)
+    substeps = loop.log_every * -(-4 // loop.log_every)
+    return fly_closed_loop(loop, as_float(references), dt=dt, key=flight, substeps=substeps)
 
 
 class _Acting(NamedTuple):
@@ -167,6 +171,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     sense = loop.sensors and Sense.of(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
     mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
     allocation = mixer.T @ invert(mixer @ mixer.T)  # the mixer's inverse, without a call of LAPACK
+    hover_cube = jnp.asarray(airframe.hover_speed) ** 3
     # A command acts `late` runs after its own, and in the first `part` of a run the one before it still acts.
     late = jnp.floor(loop.rotor_delay / period).astype(int)
     part = loop.rotor_delay / period - late
@@ -185,8 +190,8 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         rates, attitude = jnp.stack(motion.rates), jnp.stack(motion.attitude) + error[3:6]
         seen = gyro = rates + error[:3]
         if sense is not None and signals is not None:
-            signals, seen = sense(signals, speeds, gyro, rates + drawn.own, specific)
-            gyro, specific = signals.filtered[:3], signals.filtered[6:]
+            signals, gyro, seen = sense(signals, k, speeds, gyro, rates + drawn.own, specific)
+            specific = signals.filtered[6:]
         command, integral = _control(loop, allocation, reference, seen, attitude, integral, period)
         commands = commands.at[k + 1].set(command)
         before, now = (commands[jnp.maximum(k + 1 - late - i, 0)] for i in (1, 0))
@@ -196,7 +201,8 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
             j, *gust_and_wind = row
             share = jnp.clip(steps * part - j, 0, 1)
             wanted = now + share * (before - now)
-            after = motor.step(speeds, wanted, h)
+            load = (speeds**3).mean() / hover_cube
+            after = motor.step(speeds, (1 - loop.load_sag * (load - 1)) * wanted, h)
             squares = (speeds * speeds + speeds * after + after * after) / 3
             residual, spin_up = (speeds + after) @ spins / 2, (after - speeds) @ spins / h
             forcing = acting(weak, squares, residual, spin_up, *gust_and_wind)
@@ -221,7 +227,7 @@ def _hovering(loop: ClosedLoop, allocation: Array, runs: int) -> _Carry:
     velocity = None if loop.air is None else (zero, zero, zero)
     motion = BodyMotion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
     still = jnp.zeros(9).at[8].set(airframe.gravity)
-    signals = None if loop.sensors is None else Signals(still, still, jnp.zeros(4))
+    signals = None if loop.sensors is None else Signals(still, still, jnp.zeros(4), jnp.zeros((runs, 3)))
     commands = jnp.broadcast_to(loop.motor.command(hover), (runs + 1, 4))
     return _Carry(motion, hover, jnp.zeros(3), commands, signals)
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Key, Scalar
 from ..flight import ANGLES, RATES, VELOCITY, Flight
@@ -24,18 +24,22 @@ class BodyMotion(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Gyro of the log, that of the controller, and accelerometer, raw and filtered; `angles` of the rotors [rad]."""
+    """Gyro of the log, that of the controller, and accelerometer, raw and filtered; `angles` of the rotors [rad].
+
+    `gyros`: the filtered gyro of the log in each run so far [rad/s].
+    """
 
     raw: Float[Array, "9"]
     filtered: Float[Array, "9"]
     angles: Float[Array, "4"]
+    gyros: Float[Array, "runs 3"]
 
 
 class Sense(NamedTuple):
-    """Vibration and first-order low-pass filters, y' = (x - y) / T, exact for signals linear in each run.
+    """Vibration, first-order low-pass filters, y' = (x - y) / T, exact for signals linear in each run, and a delay.
 
     `sine`, `cosine`: the amplitude of each rotor in hover in gyro and accelerometer. `decay`, `last`: of the filters of
-    `Signals`. `own`: whether the controller has a gyro of its own.
+    `Signals`. `own`: whether the controller has a gyro of its own. `late`: delay of the log's gyro [runs].
     """
 
     hover_speed: Scalar
@@ -44,6 +48,7 @@ class Sense(NamedTuple):
     decay: Float[Array, "9"]
     last: Float[Array, "9"]
     own: Bool[Array, ""]
+    late: Scalar
 
     @classmethod
     def of(cls, sensors: Sensors, hover_speed: Scalar, period: Scalar, key: Key) -> "Sense":
@@ -53,17 +58,27 @@ class Sense(NamedTuple):
         times = jnp.repeat(jnp.stack([sensors.gyro_filter, sensors.controller_gyro_filter, sensors.force_filter]), 3)
         decay, own = jnp.exp(-period / times), ~jnp.isnan(sensors.controller_gyro_noise)
         last = (1 - decay) * times / period
-        return cls(hover_speed, amplitude * jnp.cos(phases), amplitude * jnp.sin(phases), decay, last, own)
+        sine, cosine = amplitude * jnp.cos(phases), amplitude * jnp.sin(phases)
+        return cls(hover_speed, sine, cosine, decay, last, own, sensors.gyro_delay / period)
 
     def __call__(
-        self, signals: Signals, speeds: Float[Array, "4"], gyro: PerAxis, own_gyro: PerAxis, force: PerAxis
-    ) -> tuple[Signals, PerAxis]:
-        """The signals of the next run, and the body rates that the controller answers."""
+        self,
+        signals: Signals,
+        k: Int[Array, ""],
+        speeds: Float[Array, "4"],
+        gyro: PerAxis,
+        own_gyro: PerAxis,
+        force: PerAxis,
+    ) -> tuple[Signals, PerAxis, PerAxis]:
+        """The signals of the run after run `k`, and the body rates that are logged, and that the controller answers."""
         strength, (sin, cos) = jnp.square(speeds / self.hover_speed), sincos(signals.angles)
         shaken = (strength * sin) @ self.sine + (strength * cos) @ self.cosine
         raw = jnp.concatenate([gyro + shaken[:3], own_gyro, force + shaken[3:]])
         filtered = self.decay * signals.filtered + (self.last - self.decay) * signals.raw + (1 - self.last) * raw
-        return Signals(raw, filtered, signals.angles), jnp.where(self.own, filtered[3:6], filtered[:3])
+        gyros, whole = signals.gyros.at[k].set(filtered[:3]), jnp.floor(self.late).astype(int)
+        now, before = (gyros[jnp.maximum(k - whole - i, 0)] for i in (0, 1))
+        logged = now + (self.late - whole) * (before - now)
+        return Signals(raw, filtered, signals.angles, gyros), logged, jnp.where(self.own, filtered[3:6], logged)
 
 
 def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Array, Array], key: Key) -> Flight:

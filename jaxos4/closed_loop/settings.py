@@ -54,6 +54,7 @@ class Sensors(eqx.Module):
       axis, once for each revolution. The amplitude is proportional to the squared speed. Sampling causes aliasing.
     - `gyro_filter`, `force_filter`: time constants of the first-order low-pass filters before logging [s]. They filter
       the noise too.
+    - `gyro_delay`: of the filtered gyro [s], as the log and a controller that answers it see it.
     - `speed_noise`, `speed_step`: standard deviation and rounding step of the logged rotor speeds or commands [rad/s].
     - `clock_offset`: delay of the logged rotors behind the gyro [s]; negative: the rotors are logged earlier.
     - `dropouts`: the shares of samples that gyro and accelerometer lose (NaN), independently.
@@ -71,6 +72,7 @@ class Sensors(eqx.Module):
     gyro_vibration: Scalar = eqx.field(converter=setting("gyro_vibration"), default=0.0)
     force_vibration: Scalar = eqx.field(converter=setting("force_vibration"), default=0.0)
     gyro_filter: Scalar = eqx.field(converter=setting("gyro_filter"), default=0.0)
+    gyro_delay: Scalar = eqx.field(converter=setting("gyro_delay"), default=0.0)
     force_filter: Scalar = eqx.field(converter=setting("force_filter"), default=0.0)
     speed_noise: Scalar = eqx.field(converter=setting("speed_noise"), default=0.0)
     speed_step: Scalar = eqx.field(converter=setting("speed_step"), default=0.0)
@@ -97,6 +99,8 @@ class ClosedLoop(eqx.Module):
     - `offset`: a constant torque over the inertia, for each axis [rad/s^2].
     - `damping`: a moment against the body rate, for each axis [1/s].
     - `sag`: the share of their thrust and drag that the rotors lose during the flight, linearly in time.
+    - `load_sag`: a battery whose voltage falls with the load, which is the mean cube of the rotor speeds over that in
+      hover: the motors get the command times 1 - `load_sag` (load - 1).
     - `air`: wind, drag, inflow and flapping. `None`: the air exerts nothing, and the velocity is not simulated.
 
     The gusts, which are Ornstein-Uhlenbeck processes:
@@ -133,6 +137,7 @@ class ClosedLoop(eqx.Module):
     offset: PerAxis = eqx.field(converter=setting("offset", _BODY, low=-np.inf), default=0.0)
     damping: PerAxis = eqx.field(converter=setting("damping", _BODY, low=-np.inf), default=0.0)
     sag: Scalar = eqx.field(converter=setting("sag", high=1.0), default=0.0)
+    load_sag: Scalar = eqx.field(converter=setting("load_sag", high=1.0), default=0.0)
     air: Air | None = None
     gust: PerAxis = eqx.field(converter=setting("gust", _BODY), default=0.0)
     thrust_gust: Scalar = eqx.field(converter=setting("thrust_gust"), default=0.0)

@@ -14,6 +14,7 @@ from ..analysis.identifiability import identifiability
 from ..analysis.prediction import Predictions
 from ..analysis.traces import Traces, os4_traces
 from ..bracket import GAUSSIAN_PRIOR
+from ..estimate import AbstractEstimator
 from ..recording.motion import EXCITED
 from ..results import result_names
 from ..shooting import with_room
@@ -59,8 +60,8 @@ class Checked(NamedTuple):
     correlations: Correlations | None = None
 
 
-def check_os4(data: Data, answer: Answer, prior: float) -> Checked:
-    """The checks of a flight of an OS4. `prior`: how the estimator uses the bracket."""
+def check_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> Checked:
+    """The checks of a flight of an OS4, which this estimator searched."""
     names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
     missing, limits, fit, traces, correlations = {}, dict.fromkeys(names), {}, None, None
     if (found := answer.evaluation) is not None:
@@ -74,21 +75,22 @@ def check_os4(data: Data, answer: Answer, prior: float) -> Checked:
             traces, correlations = os4_traces(found), residual_correlations(errors, found.torques)
     table = {
         name: msgspec.structs.replace(row, noise_limit=limits[name])
-        for name, row in parameter_table(answer, prior, missing).items()
+        for name, row in parameter_table(answer, estimator.prior, missing).items()
     }
     if not answer.answered:
         return Checked(table, search, doubts=tuple(doubts_of_log(data.findings)))
     body = rigid_body(answer)
-    doubts = doubts_of_os4(data, search, table, body)
+    # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
+    doubts = doubts_of_os4(data, search, table, body, fit if estimator.shoots else {})
     judged = judge(os4_quantities(table, body), doubts)
-    # What an OS4 flight does not show is no fault of the answer.
-    wrong = [name for name, verdict in judged.verdicts.items() if verdict.status == CONTRADICTED]
+    # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
+    wrong = [name for name in table if judged.verdicts[name].status == CONTRADICTED]
     return Checked(
         parameters=table,
         rigid_body=body,
         verdicts=judged.verdicts,
         doubts=tuple(doubts),
-        result=judged.result(search, wrong if search == "successful" else judged.verdicts),
+        result=judged.result(search, wrong if search == "successful" else table),
         fit=fit,
         validation=None if data.held_out is None else validate_on(answer, data.held_out),
         traces=traces,

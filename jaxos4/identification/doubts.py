@@ -16,7 +16,16 @@ from ..results import meaning, result_names
 from .answers import Answer, drag_error, overwhelmed, thrust_excess
 from .data import Data
 from .doubts_of_values import ALL_INERTIAS, PLAUSIBLE, consequences, doubts_of_alphas, doubts_of_values
-from .results import Constant, Disturbance, ParameterEstimate, PredictionSkill, RigidBody, SampleTime
+from .results import (
+    COLOURED,
+    ChannelFit,
+    Constant,
+    Disturbance,
+    ParameterEstimate,
+    PredictionSkill,
+    RigidBody,
+    SampleTime,
+)
 from .sample_time import moved
 from .search import Optimum
 from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Doubt, Move, contradiction, refusal, reservation
@@ -27,10 +36,35 @@ _NOT_LOWEST = (
 )
 
 
-def doubts_of_os4(data: Data, search: str, table: Mapping[str, ParameterEstimate], body: RigidBody) -> list[Doubt]:
-    """The doubts about the alphas of an OS4. `search`: the name of the result code of the search."""
+def doubts_of_os4(
+    data: Data, search: str, table: Mapping[str, ParameterEstimate], body: RigidBody, fit: Mapping[str, ChannelFit]
+) -> list[Doubt]:
+    """The doubts about the alphas of an OS4.
+
+    **Arguments:** `search`: the name of the result code of the search. `fit`: of the channels whose residuals are white
+    if the model is right; see `coloured`.
+    """
     every = (*table, RIGID_BODY)
-    return [*doubts_of_log(data.findings, every), *doubts_of_alphas(table, body), *_doubts_of_search(search, every)]
+    # A flight that hardly depends on one alpha says nothing against the others.
+    unseen = [name for name, row in table.items() if row.estimate is None and search == "unidentifiable"]
+    return [
+        *doubts_of_log(data.findings, every),
+        *doubts_of_alphas(table, body),
+        *coloured(fit, every),
+        *_doubts_of_search(search, unseen or every),
+    ]
+
+
+def coloured(fit: Mapping[str, ChannelFit], quantities: Iterable[str]) -> Iterator[Doubt]:
+    """Residuals that are not white. A reservation, and no refusal: the noise of the sensors may be coloured."""
+    channels = {name: row.correlation for name, row in fit.items() if row.correlation > COLOURED}
+    if channels:
+        yield reservation(
+            f"the residuals of {', '.join(channels)} are not white (neighbours correlate by up to "
+            f"{max(channels.values()):.2g}): the model does not explain the flight, or the noise is coloured",
+            "check the scales, the axes and the time stamps of the log, or use another `subject`",
+            dict.fromkeys(quantities),
+        )
 
 
 def doubts_of_vehicle(

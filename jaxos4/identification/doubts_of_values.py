@@ -49,20 +49,28 @@ ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
 
 
 def doubts_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) -> Iterator[Doubt]:
-    """The alphas of an OS4 that no rigid body has."""
+    """The alphas of an OS4 that no rigid body has.
+
+    They contradict the rigid body. Only an alpha outside its bracket is contradicted itself: the bracket says which
+    values the alphas of this flight can have.
+    """
     gyro, moves = "check the scale, the axes and the signs of the gyro, and the time stamps", {RIGID_BODY: None}
     for name in (axis.coupling for axis in AXES):
         row = table[name]
         if row.estimate is not None and row.std is not None and abs(row.estimate) - TOLERANCE.sure * row.std > 1:
             cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as that of every rigid body"
-            yield contradiction(cause, gyro, {name: None, RIGID_BODY: None})
-    rotor = body.constants.get("J_R")
-    if rotor is not None and rotor.estimate + TOLERANCE.sure * rotor.std < 0:
-        cause = f"J_R = {rotor.estimate:.3g} kg m^2 is negative"
-        yield contradiction(cause, "check `rotor_spins`, and which rotor is which", moves)
+            yield contradiction(cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket))
+    rotor, largest = body.constants.get("J_R"), body.constants.get(YAW.inertia)
+    if rotor is not None and largest is not None:
+        remedy, room = "check `rotor_spins`, and which rotor is which", TOLERANCE.sure * rotor.std
+        if rotor.estimate + room < 0:
+            yield contradiction(f"J_R = {rotor.estimate:.3g} kg m^2 is negative", remedy, moves)
+        elif rotor.estimate - room > largest.estimate:
+            cause = f"J_R = {rotor.estimate:.3g} kg m^2 is larger than the {YAW.inertia} of the vehicle"
+            yield contradiction(cause, remedy, moves)
     if body.consistency_p is not None and body.consistency_p < TOLERANCE.consistent:
         cause = f"the alphas are not those of one rigid body (p = {body.consistency_p:.1g})"
-        yield contradiction(cause, f"{gyro}; or use another `subject`", moves)
+        yield contradiction(cause, f"use the alphas alone; if they should be of a rigid body, {gyro}", moves)
     elif body.is_rigid_body is False:
         cause = "one moment of inertia exceeds the sum of the other two, which no rigid body allows"
         yield contradiction(cause, "check `rotor_positions` and `drag_coefficient`", moves)

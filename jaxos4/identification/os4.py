@@ -70,7 +70,7 @@ class OS4Case:
     def check(self, solution: Solution, progress: Progress) -> Checked:
         """The estimate of each quantity, and the doubts about it."""
         del progress
-        return check_os4(solution.data, solution.answer, self.estimator.prior)
+        return check_os4(solution.data, solution.answer, self.estimator)
 
 
 def prepare_os4(

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..airframe import YAW
 from ..analysis.inertia import CenterOfMass, center_of_mass
 from ..models.terms import TERMS
 from ..results import NINETY_FIVE
-from .results import Identification
+from .results import Constant, Identification, RigidBody
 from .verdict import RIGID_BODY, Verdict
 
 CENTER = "center of mass"
@@ -41,7 +42,7 @@ class PhysicalQuantity(NamedTuple):
 def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
     """Moments of inertia, then thrust, motors, centre of mass, damping and drag; of an OS4 its alphas and J_R too.
 
-    A quantity that was not estimated is not in the table.
+    A quantity that was not estimated is not in the table, nor is one that `possible` leaves out.
     """
 
     def row(name: str, unit: str, value: float, std: float, judged: str, condition: str = "", ci95=None):
@@ -49,9 +50,10 @@ def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
         interval = ci95 or (value - half, value + half)
         return PhysicalQuantity(name, unit, value, std, interval, condition, judged, found.verdicts.get(judged))
 
+    constants = found.rigid_body.constants if found.is_vehicle else possible(found.rigid_body)
     rows = [
         row(name, each.unit, each.estimate, each.std, name if found.is_vehicle else RIGID_BODY, each.note or "")
-        for name, each in found.rigid_body.constants.items()
+        for name, each in constants.items()
     ]
     judged = _judged() if found.is_vehicle else {name: name for name in found.parameters}
     rows += [
@@ -66,6 +68,14 @@ def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
         ]
         rows.sort(key=lambda each: _ORDER.index(each.judged) if each.judged in _ORDER else -1)
     return rows
+
+
+def possible(body: RigidBody) -> dict[str, Constant]:
+    """The constants of a rigid body that are clearly positive; J_R only if it is not larger than Iz."""
+    vehicle = body.constants.get(YAW.inertia)
+    most = {} if vehicle is None else {"J_R": vehicle.estimate}
+    every = ((name, row, most.get(name, np.inf)) for name, row in body.constants.items())
+    return {name: row for name, row, limit in every if NINETY_FIVE * row.std < row.estimate <= limit}
 
 
 def centers_of_mass(found: Identification) -> list[CenterOfMass]:

@@ -10,13 +10,14 @@ from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
-from ..identification.physical import PhysicalQuantity, physical_quantities
+from ..identification.physical import PhysicalQuantity, physical_quantities, possible
 from ..identification.results import COLOURED, Identification
 from ..identification.verdict import (
     CONTRADICTED,
     IDENTIFIED,
     MISSING,
     RESERVED,
+    TOLERANCE,
     headline,
     reason_lines,
     statuses_of,
@@ -178,13 +179,13 @@ def _inertias(found: Identification) -> Section:
     body = found.rigid_body
     inertias = [
         f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
-        if abs(row.estimate) > NINETY_FIVE * row.std
-        else f"{name} below noise"
+        if name in possible(body)
+        else f"{name} {'below noise' if abs(row.estimate) <= NINETY_FIVE * row.std else 'impossible'}"
         for name, row in body.constants.items()
     ]
     verdict = ""
     if body.consistency_p is not None:
-        if body.consistency_p < _SIGNIFICANCE:
+        if body.consistency_p < TOLERANCE.consistent:
             verdict = f"; the alphas are not those of one rigid body, p = {body.consistency_p:.1g}"
         elif not body.is_rigid_body:
             verdict = "; no rigid body has such inertias: one exceeds the sum of the other two"

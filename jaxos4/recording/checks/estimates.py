@@ -56,7 +56,7 @@ class Turns(msgspec.Struct, frozen=True):
     explained: Float[np.ndarray, "3"]
 
 
-def attitude_turns(stretches: Sequence[Recording], *, fewest: int = 4, shortest: float = 1.0) -> Turns | None:
+def attitude_turns(stretches: Sequence[Recording], *, fewest: int = 4, shortest: float = 0.5) -> Turns | None:
     """Compare attitude and gyro in stretches of a flight.
 
     **Arguments:** `fewest`, `shortest`: the fewest batches, and the shortest [s].

@@ -1,0 +1,139 @@
+"""Verdicts of a flight of an OS4: what was asked are its alphas, and not the rigid body that they may contradict."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import standard_flight
+
+import jaxos4
+from jaxos4.airframe import OS4
+from jaxos4.excitation import doublet, multisine
+from jaxos4.flight import RATES
+from jaxos4.identification.doubts_of_values import doubts_of_alphas
+from jaxos4.identification.physical import physical_quantities
+from jaxos4.identification.results import Constant, ParameterEstimate, RigidBody
+from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, RESERVED
+
+pytestmark = pytest.mark.slow
+
+
+def drawn(number):
+    """A flight whose alphas lie inside 60 % of the default brackets, and these alphas."""
+    random, model = np.random.default_rng([7, number]), jaxos4.PublishedOS4()
+    alpha = np.asarray(model.alpha) + 0.6 * random.uniform(-1, 1, 8) * np.asarray(model.half_width)
+    flight = jaxos4.simulate(model, jnp.asarray(alpha), multisine(OS4), dt=0.01)
+    return alpha, jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(number))
+
+
+def changed(flight, *, scale=1.0, order=(0, 1, 2)):
+    """The states with body rates of another scale and order."""
+    states = np.array(flight.states)
+    states[:, RATES] = scale * states[:, RATES[list(order)]]
+    return {"states": states}
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_alphas_of_no_rigid_body_contradict_the_rigid_body_alone(number):
+    alpha, flight = drawn(number)
+    found = jaxos4.identify(flight, jaxos4.PublishedOS4())
+    assert found.successful
+    statuses = {name: verdict.status for name, verdict in found.verdicts.items()}
+    assert statuses.pop("rigid body") == CONTRADICTED
+    assert set(statuses.values()) <= {IDENTIFIED, RESERVED}  # below noise
+    assert "not those of one rigid body" in " ".join(found.verdicts["rigid body"].reasons)
+    assert {each.judged for each in physical_quantities(found) if not each.trusted} == {"rigid body"}
+    z = [(row.estimate - truth) / row.std for row, truth in zip(found.parameters.values(), alpha, strict=True)]
+    assert np.abs(z).max() < 3.5
+    assert np.mean(np.abs(z) < 1.96) >= 7 / 8
+    lines = found.summary(width=200).splitlines()
+    assert lines[0].startswith("identified: alpha1; ")
+    assert ": successful," in lines[-1]
+
+
+FAULTY = {
+    "rates halved": lambda flight: changed(flight, scale=0.5),
+    "time twice as fast": lambda flight: {"time": np.asarray(flight.time) / 2},
+    "time 1.25 times as fast": lambda flight: {"time": np.asarray(flight.time) / 1.25},
+    "roll and pitch exchanged": lambda flight: changed(flight, order=(1, 0, 2)),
+}
+
+
+@pytest.mark.parametrize("channels", ["all", "rates"])
+@pytest.mark.parametrize("fault", FAULTY)
+def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels):
+    """A flight of 2.5 s is long enough to compare attitude and gyro."""
+    _, flight = drawn(0)
+    settings = jaxos4.FlightSettings(channels=channels)
+    found = jaxos4.identify(
+        dataclasses.replace(flight, **FAULTY[fault](flight)), jaxos4.PublishedOS4(), settings=settings
+    )
+    assert found.result == "implausible"
+    assert {verdict.status for verdict in found.verdicts.values()} == {CONTRADICTED}
+    # The first line says what the last one says.
+    assert found.summary(width=200).splitlines()[0].startswith("contradicted: alpha1")
+
+
+def alpha_table(**alphas):
+    model = jaxos4.PublishedOS4()
+    lower, upper = model.alpha - model.half_width, model.alpha + model.half_width
+    rows = zip(model.parameter_names, *(np.asarray(x).tolist() for x in (model.alpha, lower, upper)), strict=True)
+    return {
+        name: ParameterEstimate(alphas.get(name, value), 0.01, 0.01, None, "1", "", bracket=(low, high))
+        for name, value, low, high in rows
+    }
+
+
+@pytest.mark.parametrize(
+    ("alphas", "rotor", "said"),
+    [
+        # Its bracket ends at 1.08: an alpha inside it is right, although no rigid body has it.
+        ({"alpha4": 1.05}, 0.0, {"alpha4 = 1.05": {"rigid body"}}),
+        ({"alpha4": 1.3}, 0.0, {"alpha4 = 1.3": {"alpha4", "rigid body"}}),
+        ({}, -60.0, {"J_R = -60 kg m^2 is negative": {"rigid body"}}),
+        ({}, 60.0, {"J_R = 60 kg m^2 is larger than the Iz": {"rigid body"}}),
+        ({}, 1.0, {}),
+        ({}, -1.0, {}),
+    ],
+)
+def test_an_alpha_is_contradicted_only_outside_its_bracket(alphas, rotor, said):
+    constants = {"Iz": Constant(0.013, 1e-5, "kg m^2"), "J_R": Constant(rotor, 1.0, "kg m^2")}
+    doubts = list(doubts_of_alphas(alpha_table(**alphas), RigidBody(constants, 0.5, True)))
+    assert len(doubts) == len(said)
+    for doubt, (cause, moves) in zip(doubts, said.items(), strict=True):
+        assert cause in doubt.cause
+        assert set(doubt.moves) == moves
+
+
+def test_a_rotor_inertia_below_noise_is_no_physical_value():
+    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(standard_flight(), key=jax.random.key(0))
+    found = jaxos4.identify(flight, jaxos4.PublishedOS4())
+    assert "J_R" in found.rigid_body.constants
+    assert [each.name for each in physical_quantities(found)][:4] == ["Ix", "Iy", "Iz", "alpha1"]
+    assert "J_R below noise" in found.summary(width=300)
+
+
+def test_coloured_residuals_are_a_reservation():
+    flight, slow = standard_flight(), jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.1)
+    found = jaxos4.identify(slow(flight, key=jax.random.key(1)), jaxos4.PublishedOS4())
+    assert found.successful
+    assert {verdict.status for verdict in found.verdicts.values()} == {RESERVED}
+    assert "the residuals of p, q" in found.verdicts["alpha3"].reasons[0]
+    # Kalman filters and regressions do not find the best fit, so their residuals say nothing.
+    other = jaxos4.identify(flight, jaxos4.PublishedOS4(), estimator="rls")
+    assert not any("not white" in str(doubt) for doubt in other.doubts)
+
+
+def test_an_alpha_that_is_not_excited_does_not_refuse_the_others():
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, doublet(OS4), dt=0.01)
+    found = jaxos4.identify(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0)), model)
+    assert found.result == "unidentifiable"
+    refused = {name for name, verdict in found.verdicts.items() if not verdict.trusted}
+    assert refused == {"alpha1", "alpha4", "alpha7"}
+    assert found.verdicts["alpha3"].status == IDENTIFIED
+    first, second, *_ = found.summary(width=200).splitlines()
+    assert first == "not identified: alpha1; alpha4; alpha7."
+    assert second.startswith("identified with a reservation: ")
