@@ -56,7 +56,7 @@ class Limits(msgspec.Struct, frozen=True):
     - `scale`: of attitude against gyro, relative. Inertias are wrong by the scale of the gyro.
     - `angle`: of a sensor about the vertical axis [rad]. 20 degrees change inertias by 8 %, 8 degrees by 1 %.
     - `tilt`: of the accelerometer against the thrust [rad]. Its errors and steady wind reach half of this.
-    - `delay`: between two sensors [s] that is noted. Gusts that a controller answers make errors of up to 8 ms.
+    - `delay`: between two sensors [s] that is noted. Damping and inflow make errors of up to 8 ms.
     - `late`: between two sensors [s] that contradicts. 20 ms change inertias by 10 %. The filter of an accelerometer
       can be 10 ms later than that of the gyro.
     - `late_attitude`: of the attitude after the gyro [s]. Filters and cameras are late by up to 20 ms.
@@ -80,10 +80,11 @@ class Limits(msgspec.Struct, frozen=True):
     - `along_earth`: slope of the horizontal force on the tilt: 1 along the earth's axes, 0 or less along the body's.
     - `steady`: in a hand or in rolls, the mean vector of the force is shorter than this share of its mean size.
     - `moves`: standard deviation of the rates of a vehicle that moves [rad/s]. `thrust_moves`: of its thrust, relative.
-    - `coherent`: the shares of roll or pitch acceleration, and of vertical force, that the rotors explain before their
-      delays count. The first one counts for the sum of roll and pitch before axes are judged.
-    - `filters`, `gusts`, `lags`: standard deviations of delays that are no error of a clock [s]: filters, gusts that a
-      controller answers, and the lag and delay of rotors that follow commands, about `usual_lag`.
+    - `explained`: the shares of the errors of predicted rates, and of the vertical force, that the rotors explain
+      before their delays count. The first one counts for the sum of roll and pitch before axes are judged.
+    - `filters`, `damping`, `lags`: standard deviations of delays that are no error of a clock [s]: filters, damping
+      that varies, and the lag and delay of rotors that follow commands, about `usual_lag`.
+    - `answered`: the delay that a gyro seems to have if the rotors do nothing but answer gusts [s].
     - `likelier`: difference of chi^2: a clock 20 times less likely to be wrong than another is not named.
     """
 
@@ -113,11 +114,12 @@ class Limits(msgspec.Struct, frozen=True):
     steady: float = 0.9
     moves: float = 0.05
     thrust_moves: float = 0.01
-    coherent: tuple[float, float] = (0.2, 0.03)
+    explained: tuple[float, float] = (0.02, 0.03)
     filters: float = 0.003
-    gusts: float = 0.004
+    damping: float = 0.004
     lags: float = 0.025
     usual_lag: float = 0.05
+    answered: float = 0.014
     likelier: float = 6.0
 
 

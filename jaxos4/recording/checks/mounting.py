@@ -14,8 +14,8 @@ from .evidence import Evidence, Finding
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
     """Gyro turned about the vertical axis: roll torque pitches the vehicle, and the attitude turns about other axes."""
     rotors, attitude = _by_rotors(evidence), _by_attitude(evidence)
-    limits, tilted = evidence.limits, thrust_direction(evidence)
-    if tilted is not None and tilted.name == "force_direction":
+    limits = evidence.limits
+    if tilted_force(evidence):
         return None  # the angle about z is known when this is corrected
 
     def turned(angle: tuple[float, float] | None) -> bool:
@@ -80,7 +80,7 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
 def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     """The angle of the gyro about z and its error [rad], by roll and pitch torque. `None`: unknown, or no rotation."""
     response, limits = evidence.response, evidence.limits
-    if response is None or response.coherent[:2].sum() < limits.coherent[0]:
+    if response is None or response.explained[:2].sum() < limits.explained[0]:
         return None
     sizes = np.hypot(*response.turning.value)
     (a, b), (c, d) = response.turning.value / sizes
@@ -153,6 +153,12 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
         ("thrust", *INERTIAS),
         True,
     )
+
+
+def tilted_force(evidence: Evidence) -> bool:
+    """Whether the accelerometer has other axes than the thrust."""
+    tilted = thrust_direction(evidence)
+    return tilted is not None and tilted.name == "force_direction"
 
 
 def wrong_thrust(evidence: Evidence) -> Finding | None:
