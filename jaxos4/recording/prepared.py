@@ -15,7 +15,8 @@ from ..logs import Recording
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
-from .motion import Ups, in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
+from .level import force_level
+from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
 from .stretches import Stretch, cut, nothing_usable
 from .windows import averaged, hold_out, joined, whole_windows
@@ -60,7 +61,7 @@ class Prepared(NamedTuple):
     - `time`: of each sample in its log [s].
     - `length`: of a window, in samples.
     - `available`: what every recording offers to the terms of a model, see `Term.needs`.
-    - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `_level`.
+    - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `force_level`.
       `None`: unknown.
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
@@ -150,8 +151,9 @@ def prepare(
     steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted, rules=rules)
     coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
     numbers = [number for number, _ in stretched]
+    rests = [rest for each in every if (rest := each.evidence.rest) is not None]
     return tuple(
-        _sampled(recordings, numbers, flown, airframe, step, holdout, rules)._replace(
+        _sampled(recordings, numbers, flown, airframe, step, holdout, rests, rules)._replace(
             notes=tuple(notes), findings=tuple(found), log_step=slowest
         )
         for step, flown in zip(steps, coarse, strict=True)
@@ -260,9 +262,13 @@ def _sampled(
     airframe: Airframe,
     step: float,
     holdout: float,
+    rests: Sequence[Float[np.ndarray, "3"]],
     rules: Preparation,
 ) -> Prepared:
-    """One flight of stretches that are averaged to samples of `step` [s]. `numbers`: of their recordings."""
+    """One flight of stretches that are averaged to samples of `step` [s].
+
+    `numbers`: of their recordings. `rests`: the specific force before take-off, where it is known.
+    """
     length = round(rules.window / step)
     if length < rules.fewest:
         least = rules.window / rules.fewest
@@ -285,7 +291,7 @@ def _sampled(
         time=np.concatenate([each.time for each in flown]),
         length=length,
         available=_available_inputs(everything, flown, airframe),
-        level=_level(fitted, ups, float(airframe.gravity)) if ups else None,
+        level=force_level(fitted, ups, rests, float(airframe.gravity)),
         force_noise=np.min([force_noise(in_body_axes(each, airframe), step) for each in recordings], axis=0),
         seconds=(_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
     )
@@ -304,32 +310,6 @@ def _available_inputs(whole: Recording, flown: Sequence[Recording], airframe: Ai
         VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
-
-
-def _level(
-    fitted: Recording,
-    every: Sequence[Ups],
-    gravity: float,
-    *,
-    gained: float = 1.0,
-    carried: float = 0.003,
-    upright: float = 0.5,
-) -> tuple[float, float] | None:
-    """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
-
-    A vehicle gains little velocity over a stretch, at most `gained` [m/s], so all forces together carry its weight, but
-    for the share `carried`. `upright`: the least mean cosine of the tilt.
-    """
-    force = fitted.specific_force
-    if force is None or not (known := np.isfinite(force).all(axis=1)).any():
-        return None
-    ups = [np.concatenate(each)[known] for each in zip(*every, strict=True)]
-    other, along = ((force[known] * up).sum(axis=1).mean() for up in ups)
-    cosine = ups[-1][:, 2].mean()
-    if cosine < upright or force[known, 2].mean() < 0:  # the second: the z axis points down
-        return None
-    drift = gained * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
-    return (along - gravity) / cosine, math.hypot(drift, carried * gravity, along - other) / cosine
 
 
 def _seconds(recording: Recording) -> float:

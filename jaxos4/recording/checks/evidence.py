@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ...airframe import Airframe
+from ...airframe import GRAVITY, Airframe
 from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
@@ -63,6 +63,9 @@ class Limits(msgspec.Struct, frozen=True):
     - `velocity`: of the horizontal acceleration by the velocity against that by force and attitude, relative.
       Velocities that are averaged while the vehicle yaws differ by 5 %.
     - `gravity`: of the mean specific force, relative to gravity. It is up to 10 % larger in brisk flight.
+    - `at_rest`: the same before take-off; accelerometers err by up to 3 %.
+    - `rest`, `still`: a vehicle at rest has constant force and rates for this time [s], to this standard deviation
+      [gravity, rad/s].
     - `thrust`, `commanded_thrust`: of the airframe's thrust, relative, by measured speeds and by commands. The fit
       measures the thrust by the accelerometer: errors of 20 % are harmless.
     - `vehicles`, `commanded_vehicles`: of the thrust between two logs of one vehicle, relative, by measured speeds and
@@ -98,6 +101,9 @@ class Limits(msgspec.Struct, frozen=True):
     late_attitude: float = 0.025
     velocity: float = 0.15
     gravity: float = 0.3
+    at_rest: float = 0.05
+    rest: float = 0.25
+    still: float = 0.1
     thrust: float = 0.35
     commanded_thrust: float = 1.0
     vehicles: float = 0.1
@@ -183,6 +189,23 @@ class Evidence:
         every = [each.specific_force for each in self.airborne if each.specific_force is not None]
         force = np.concatenate(every) if every else np.empty((0, 3))
         return force[np.isfinite(force).all(axis=1)]
+
+    @functools.cached_property
+    def rest(self) -> Float[np.ndarray, "3"] | None:
+        """The specific force at rest before the first stretch in flight [m/s^2]. `None`: never at rest, or moved."""
+        recording, begin = self.plausible.recording, min((float(each.time[0]) for each in self.stretches), default=0.0)
+        before = np.count_nonzero(recording.time < begin - RULES.margin)
+        length = max(round(self.limits.rest / recording.dt), 4)
+        if recording.specific_force is None or before < 4 * length:
+            return None
+        sensed = np.hstack([recording.specific_force, GRAVITY * recording.states[:, RATES]])[:before]
+        blocks = sensed[before % length :].reshape(-1, length, 6)
+        still = (blocks.std(axis=1) < self.limits.still * GRAVITY).all(axis=1)  # False for NaN
+        means = blocks[still, :, :3].mean(axis=1)
+        if len(means) < 4:
+            return None
+        alike = np.abs(means - np.median(means, axis=0)).max(axis=1) < self.limits.still * GRAVITY
+        return means[alike].mean(axis=0) if alike.mean() > 0.75 else None  # or else in a hand
 
     @functools.cached_property
     def turns(self) -> Turns | None:
