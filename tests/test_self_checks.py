@@ -148,6 +148,15 @@ def test_speeds_at_instants_that_are_far_apart_are_noted(rows, flights):
     assert not any(each.contradicted for each in found)
 
 
+@pytest.mark.parametrize("rows", [4, 8])
+def test_a_gyro_below_50_hz_does_not_judge_the_scale_of_the_attitude(rows, flights):
+    flight = scaled(RATES)(flights[1], 0.5)
+    slow = copied(flight)
+    slow.states[np.arange(flight.time.size) % rows > 0] = np.nan
+    names = [each.name for each in self_checks(slow, CRAZYFLIE)]
+    assert ("gyro_or_time_scale" in names) == (rows * flight.dt <= 0.02)
+
+
 def test_each_fault_of_one_sensor_says_nothing_of_another(flights):
     """A late attitude leaves the inertias alone, and so does one of another scale."""
     for fault in ("attitude late", "attitude scale"):

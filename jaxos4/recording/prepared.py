@@ -1,7 +1,8 @@
 """Recordings of one vehicle as one flight to fit: usable stretches, longer samples, whole windows, some held out."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import msgspec
@@ -19,6 +20,7 @@ from .level import force_level
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
 from .stretches import Stretch, cut, nothing_usable
+from .vibration import vibrating_rates
 from .windows import averaged, hold_out, joined, whole_windows
 
 HOLDOUT = 0.25
@@ -68,6 +70,8 @@ class Prepared(NamedTuple):
     - `notes`: what the reader changed, and which stretches are not used.
     - `findings`: what the logs show that concerns moments of inertia, or contradicts another quantity.
     - `log_step`: the longest sample of the logs [s].
+    - `motor_step`: the longest time between new values of the motors in the logs [s].
+    - `vibrates`: the rates with a line in the gyro's spectrum, and its frequency [Hz], see `vibrating_rates`.
     """
 
     fitted: Flight
@@ -82,6 +86,8 @@ class Prepared(NamedTuple):
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
+    motor_step: float = 0.0
+    vibrates: Mapping[str, float] = MappingProxyType({})
 
     @property
     def windows(self) -> int:
@@ -151,10 +157,15 @@ def prepare(
     steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted, rules=rules)
     coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
     numbers = [number for number, _ in stretched]
+    vibrates = {name: at for each in every for name, at in vibrating_rates(each.stretches).items()}
     rests = [rest for each in every if (rest := each.evidence.rest) is not None]
     return tuple(
         _sampled(recordings, numbers, flown, airframe, step, holdout, rests, rules)._replace(
-            notes=tuple(notes), findings=tuple(found), log_step=slowest
+            notes=tuple(notes),
+            findings=tuple(found),
+            log_step=slowest,
+            motor_step=max(slowest, *(each.evidence.motor_step for each in every)),
+            vibrates=vibrates,
         )
         for step, flown in zip(steps, coarse, strict=True)
     )

@@ -156,9 +156,9 @@ def _correlated(values: np.ndarray) -> float:
 
 
 def wrong_scale(evidence: Evidence) -> Finding | None:
-    """The attitude turns more or less than the gyro says."""
+    """The attitude turns more or less than the gyro says. A slow gyro misses turns between its samples."""
     turns, limits = evidence.turns, evidence.limits
-    if turns is None:
+    if turns is None or _gyro_step(evidence) > limits.slow_gyro:
         return None
     matrix, error = turns.matrix.value, np.diagonal(turns.matrix.error)
     clear = np.abs(matrix) > limits.standard_errors * turns.matrix.error  # others only add noise
@@ -187,6 +187,15 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
     axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(MOTIONS, scale, error, judged, strict=True) if j]
     cause = f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}"
     return Finding(name, cause, ", ".join(axes), remedy, quantities, True)
+
+
+def _gyro_step(evidence: Evidence) -> float:
+    """The longest median time between samples of p, q or r in flight [s]; 0 without any."""
+    steps = [0.0]
+    for flown in evidence.stretches:
+        seen = np.isfinite(flown.states[:, RATES])
+        steps += [float(np.median(np.diff(flown.time[one]))) for one in seen.T if np.count_nonzero(one) > 1]
+    return max(steps)
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
@@ -289,15 +298,15 @@ def _delays(evidence: Evidence) -> tuple[list[_Delay], bool]:
         differ |= abs(before) > max(limits.late, limits.standard_errors * gyro[1])
         felt = response.explained[2] > limits.explained[1] and math.isfinite(between[1])
         if felt and not tilted_force(evidence):  # the force along another axis is not the thrust's
-            late, error = _beyond(between[0], answered), between[1]
+            late, error = _beyond(between[0], answered + limits.damping), between[1]
             delays.append(_Delay((1, -1, 0, 0), late, error, limits.damping))
             differ |= abs(late) > max(limits.delay, limits.standard_errors * error)
     return delays, differ
 
 
 def _beyond(late: float, usual: float) -> float:
-    """The part of a delay that is not explained by a usual one, 0 to `usual`."""
-    return late - min(max(late, 0.0), usual)
+    """A delay; 0 if it is a usual one, which is 0 to `usual`."""
+    return 0.0 if 0.0 < late < usual else late
 
 
 def velocity_axes(evidence: Evidence) -> Finding | None:

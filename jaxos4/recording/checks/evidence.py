@@ -76,6 +76,7 @@ class Limits(msgspec.Struct, frozen=True):
     - `held`: the time for which motors keep their value [s]: half of the shortest lag of rotors.
     - `instants`: between rotor speeds at instants [s]. 16 ms make Ix 4 % too small and Iz 9 % too large for rotors with
       a lag of 25 ms, 8 ms less than 1 and 5 %.
+    - `slow_gyro`: the longest time between samples of a gyro whose integral is compared with the attitude [s]: 50 Hz.
     - `follows`: the share of the attitude's turns that a gyro explains before their scale and delay count, and
       `unrelated`: with less, a gyro that moves is of another flight than the attitude.
     - `vague`, `same_angle`: of a rotation about the vertical axis by the rotors [rad]. A larger error is that of
@@ -112,6 +113,7 @@ class Limits(msgspec.Struct, frozen=True):
     motions: float = 15.0
     held: float = 0.015
     instants: float = 0.0105
+    slow_gyro: float = 0.0202
     follows: float = 0.2
     unrelated: float = 0.1
     vague: float = 0.2
