@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxos4.recording import Recording
+from jaxos4.recording.level import force_level
 from jaxos4.recording.motion import measures_velocity, velocity_of
 from jaxos4.recording.noise import without_noise
 
@@ -159,3 +160,18 @@ def test_the_expected_speeds_do_not_shrink_a_slope():
 def test_too_short_recordings_are_kept():
     seen = recordings(5.0, samples=50)[0]
     assert without_noise([seen], CRAZYFLIE) == ([seen], 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("rest", "level", "spread"), [([], 0.5, 0.06), ([10.3], 0.5, 0.06), ([9.1], -0.71, 0.2)])
+def test_rest_before_take_off_decides_the_level_of_a_flight_that_disagrees(rest, level, spread):
+    """The flight feels 0.5 m/s^2 too much."""
+    samples = 5000
+    states = np.zeros((samples, 12))
+    force = np.tile([0.0, 0.0, G + 0.5], (samples, 1))
+    flight = Recording(0.004 * np.arange(samples), np.full((samples, 4), 1700.0), states, force)
+    up = np.tile([0.0, 0.0, 1.0], (samples, 1))
+    found = force_level(flight, [(up, up)], [np.array([0.0, 0.0, size]) for size in rest], G)
+    assert found is not None
+    assert found[0] == pytest.approx(level, abs=0.02)
+    assert found[1] <= spread + 1e-9
+    assert force_level(flight, [], [], G) is None

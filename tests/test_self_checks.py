@@ -148,6 +148,15 @@ def test_speeds_at_instants_that_are_far_apart_are_noted(rows, flights):
     assert not any(each.contradicted for each in found)
 
 
+@pytest.mark.parametrize("rows", [4, 8])
+def test_a_gyro_below_50_hz_does_not_judge_the_scale_of_the_attitude(rows, flights):
+    flight = scaled(RATES)(flights[1], 0.5)
+    slow = copied(flight)
+    slow.states[np.arange(flight.time.size) % rows > 0] = np.nan
+    names = [each.name for each in self_checks(slow, CRAZYFLIE)]
+    assert ("gyro_or_time_scale" in names) == (rows * flight.dt <= 0.02)
+
+
 def test_each_fault_of_one_sensor_says_nothing_of_another(flights):
     """A late attitude leaves the inertias alone, and so does one of another scale."""
     for fault in ("attitude late", "attitude scale"):
@@ -343,3 +352,49 @@ def test_real_flights(log, airframe, names, shared_flights):
     found = self_checks(read_recording(shared_flights / log, airframe), airframe)
     assert [each.name for each in found] == names
     assert not any(each.contradicted for each in found)
+
+
+def rested(flight, force, spoil):
+    """The flight after 3 s at rest with this specific force; `spoil` changes the specific force in flight."""
+    rows, rng = round(3.0 / flight.dt), np.random.default_rng(2)
+    still = np.full((rows, 15), np.nan)
+    still[:, RATES] = rng.normal(0.0, 0.02, (rows, 3))
+    still[:, FORCE] = np.asarray(force) + rng.normal(0.0, 0.05, (rows, 3))
+    channels = flight.channels.copy()
+    channels[:, FORCE] = spoil(channels[:, FORCE], flight.time)
+    channels[:, ANGLES] = np.nan
+    channels = np.concatenate([still, channels])
+    return flight._replace(
+        time=flight.dt * np.arange(len(channels)),
+        omega=np.concatenate([np.zeros((rows, 4)), flight.omega]),
+        states=channels[:, :12],
+        specific_force=channels[:, FORCE],
+    )
+
+
+DRAG = np.array([4.0, 0.0, 0.0])
+AT_REST = {
+    "drag is no mounting": ([0.0, 0.0, 9.81], lambda force, _: force - DRAG, []),
+    "an inverted vehicle is no scale": (
+        [0.0, 0.0, 9.0],
+        lambda force, t: force * np.where(t % 4 < 1, -0.3, 0.92)[:, None] - 0.75 * DRAG,
+        ["an error of 8 % (9 m/s^2 at rest"],
+    ),
+    "a slope is no mounting": ([3.4, 0.0, 9.2], lambda force, _: force, []),
+    "in g": ([0.0, 0.0, 1.0], lambda force, _: force / 9.81, ["in units of g"]),
+    "tilted": (
+        [0.0, 9.81 * np.sin(0.5), 9.81 * np.cos(0.5)],
+        lambda force, _: force @ Rotation.from_euler("x", -0.5).as_matrix().T,
+        ["at an angle", "sensor_rotation = [29, 0, 0]"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", AT_REST)
+def test_rest_before_take_off_judges_scale_and_mounting_of_the_accelerometer(case, flights):
+    force, spoil, words = AT_REST[case]
+    found = self_checks(rested(flights[0], force, spoil), CRAZYFLIE)
+    named = [str(each) for each in found if each.name in ("force_scale", "force_direction")]
+    assert len(named) == bool(words)
+    for word in words:
+        assert word in named[0]

@@ -9,10 +9,11 @@ from hypothesis import given, settings, strategies as st
 from sign_flights import flown, turned
 
 from jaxos4.errors import InputError
+from jaxos4.flight import RATES
 from jaxos4.logs import read_recording, write_flight
-from jaxos4.recording import Stretch, averaged, cut
+from jaxos4.recording import Recording, Stretch, averaged, cut
 from jaxos4.recording.checks import opposite_yaw, self_checks
-from jaxos4.recording.motion import opposite_axes as opposites, refused_note
+from jaxos4.recording.motion import opposite_axes as opposites, refused_note, rotor_signs
 from jaxos4.recording.prepared import at_limit, prepare
 
 
@@ -147,3 +148,24 @@ def test_no_flight_of_another_laboratory_is_refused(shared_flights):
         for airframe in (vehicle, turned(vehicle, "rotor_spins")):
             assert refused_note(opposites(parts, airframe)) == ""
         assert refused_note(opposites(parts, turned(vehicle, "rotor_positions")))
+
+
+@pytest.mark.parametrize("frequency", [5.0, 8.0, 11.0])
+@pytest.mark.parametrize("spins", [1.0, -1.0])
+def test_rotors_and_spins_are_found_in_motion_of_one_frequency(frequency, spins):
+    """Half a period later, torque and acceleration have opposite signs. `spins`: -1 if they are not the airframe's."""
+    rng, time = np.random.default_rng(0), 0.004 * np.arange(5000)
+    turns = 2 * np.pi * frequency * np.array([1.0, 1.07, 0.93])
+    phases, sizes = turns * time[:, None] + [0.0, 1.3, 2.6], np.array([30.0, 30.0, 10.0])
+    inertia = np.asarray(CRAZYFLIE.inertia, dtype=float) * [1.0, 1.0, spins]
+    wrench = np.column_stack([sizes * np.sin(phases) * inertia, np.full(time.size, 0.27)])
+    omega = np.sqrt(np.linalg.solve(np.asarray(CRAZYFLIE.mixer, dtype=float), wrench.T).T)
+    states = np.full((time.size, 12), np.nan)
+    states[:, RATES] = -sizes / turns * np.cos(phases) + 0.01 * rng.normal(size=(time.size, 3))
+    flight = Recording(time, omega, states, None, held=False)
+    found = rotor_signs([flight])
+    assert found is not None
+    forward, left = np.sign(np.asarray(CRAZYFLIE.rotor_positions)[:, :2]).T
+    np.testing.assert_array_equal(found[:2], [forward, left])
+    np.testing.assert_array_equal(found[2], spins * np.asarray(CRAZYFLIE.rotor_spins))
+    assert list(opposites([flight], CRAZYFLIE)) == (["yaw"] if spins < 0 else [])

@@ -53,6 +53,11 @@ RAMP = -34.9 + 0.01 * np.arange(20)
 CASES = {
     "no fault": (hovering(), [""]),
     "ground": (hovering(rest=((0, 3), (17, 20))), ["on the ground", "", "on the ground"]),
+    "idle motors, falling": (
+        changed(at(10, 11), FORCE, 2, 0.5, rest=((10, 11),)),
+        ["", "motors idle", ""],
+    ),
+    "idle motors, no accelerometer": (hovering(rest=((0, 3),))._replace(specific_force=None), ["motors idle", ""]),
     "a burst on the ground": (hovering(rest=((0, 3), (3.3, 6))), ["on the ground", ""]),
     "a pause in the air": (hovering(rest=((10, 10.3),)), ["", IDLE, ""]),
     "full speed": (changed(at(5, 5.4), "omega", 2, 2500.0), ["", "rotor 3 at full speed", ""]),

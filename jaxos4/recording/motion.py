@@ -38,7 +38,9 @@ class SignRules(NamedTuple):
     - `step`: of the samples [s].
     - `smooth`, `slow`: samples; differences of means over them are the motion between about 2 and 20 Hz.
     - `causal`, `shifted`: delays of the gyro after the motors [s]: lag and delay of rotors, and the same with clocks
-      that may be shifted either way.
+      that may be shifted either way. In motion of one frequency, half a period more would turn the sign.
+    - `measured`: the same as `causal` if rotor speeds were measured, which have no lag.
+    - `together`: roll, pitch and yaw are measured by one clock, and so have one delay, but for this difference [s].
     - `seconds`: the least flight [s].
     - `opposite`, `clear`: the least correlation, and by how much it exceeds that of another sign or pair of rotors.
     - `wrong`: the same before a sign of the airframe is called wrong, by axis. A controller turns the sign at negative
@@ -50,6 +52,8 @@ class SignRules(NamedTuple):
     smooth: int = 3
     slow: int = 63
     causal: tuple[float, float] = (0.0, 0.048)
+    measured: tuple[float, float] = (0.0, 0.016)
+    together: float = 0.016
     shifted: tuple[float, float] = (-0.04, 0.06)
     seconds: float = 3.0
     opposite: float = 0.4
@@ -110,11 +114,17 @@ def opposite_axes(flown: Sequence[Recording], airframe: Airframe, *, signs: Sign
     torque are not judged. The clocks of motors and gyro may be shifted.
     """
     mixer = np.asarray(airframe.mixer, dtype=float)[:3]
-    found = np.diagonal(_correlations(flown, mixer, signs.shifted, signs), axis1=1, axis2=2)
+    found = np.diagonal(_correlations(flown, mixer, signs.shifted, signs), axis1=1, axis2=2).copy()
+    right = np.nan_to_num(found[:, :2]).max(axis=1)
+    if right.max() > signs.wrong[0][0]:
+        delays = np.linspace(*signs.shifted, len(found))
+        found[np.abs(delays - delays[np.argmax(right)]) > 1.01 * signs.together, 2] = np.nan
     hover = float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
     torques = [(each.omega[:-1] ** 2 @ mixer.T).std(axis=0) for each in flown]
     found = np.where(np.max(torques, axis=0, initial=0.0) < signs.torque * hover, np.nan, found)
-    ends = zip(MOTIONS, signs.wrong, -found.min(axis=0), found.max(axis=0), strict=True)
+    least = np.where(np.isnan(found), np.inf, found).min(axis=0, initial=np.inf)
+    most = np.where(np.isnan(found), -np.inf, found).max(axis=0, initial=-np.inf)
+    ends = zip(MOTIONS, signs.wrong, -least, most, strict=True)
     return {axis: float(wrong) for axis, (least, times), wrong, right in ends if wrong > max(least, times * right)}
 
 
@@ -136,7 +146,8 @@ def rotor_signs(flown: Sequence[Recording], *, signs: SignRules = SIGNS) -> tupl
     **Returns:** the signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from
     above; `None`: the vehicle hardly yawed). `None`: the flight does not show it, or the rotors are no X.
     """
-    found = _correlations(flown, _PAIRS, signs.causal, signs)
+    commanded = any(each.commanded for each in flown)
+    found = _correlations(flown, _PAIRS, signs.causal if commanded else signs.measured, signs)
     roll, pitch = (_pair(found[:, :, axis], signs) for axis in (0, 1))
     if roll is None or pitch is None or roll == pitch:
         return None

@@ -1,7 +1,8 @@
 """Recordings of one vehicle as one flight to fit: usable stretches, longer samples, whole windows, some held out."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import msgspec
@@ -15,9 +16,11 @@ from ..logs import Recording
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
-from .motion import Ups, in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
+from .level import force_level
+from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
 from .stretches import Stretch, cut, nothing_usable
+from .vibration import vibrating_rates
 from .windows import averaged, hold_out, joined, whole_windows
 
 HOLDOUT = 0.25
@@ -60,13 +63,15 @@ class Prepared(NamedTuple):
     - `time`: of each sample in its log [s].
     - `length`: of a window, in samples.
     - `available`: what every recording offers to the terms of a model, see `Term.needs`.
-    - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `_level`.
+    - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `force_level`.
       `None`: unknown.
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
     - `findings`: what the logs show that concerns moments of inertia, or contradicts another quantity.
     - `log_step`: the longest sample of the logs [s].
+    - `motor_step`: the longest time between new values of the motors in the logs [s].
+    - `vibrates`: the rates with a line in the gyro's spectrum, and its frequency [Hz], see `vibrating_rates`.
     """
 
     fitted: Flight
@@ -81,6 +86,8 @@ class Prepared(NamedTuple):
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
+    motor_step: float = 0.0
+    vibrates: Mapping[str, float] = MappingProxyType({})
 
     @property
     def windows(self) -> int:
@@ -150,9 +157,15 @@ def prepare(
     steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted, rules=rules)
     coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
     numbers = [number for number, _ in stretched]
+    vibrates = {name: at for each in every for name, at in vibrating_rates(each.stretches).items()}
+    rests = [rest for each in every if (rest := each.evidence.rest) is not None]
     return tuple(
-        _sampled(recordings, numbers, flown, airframe, step, holdout, rules)._replace(
-            notes=tuple(notes), findings=tuple(found), log_step=slowest
+        _sampled(recordings, numbers, flown, airframe, step, holdout, rests, rules)._replace(
+            notes=tuple(notes),
+            findings=tuple(found),
+            log_step=slowest,
+            motor_step=max(slowest, *(each.evidence.motor_step for each in every)),
+            vibrates=vibrates,
         )
         for step, flown in zip(steps, coarse, strict=True)
     )
@@ -260,9 +273,13 @@ def _sampled(
     airframe: Airframe,
     step: float,
     holdout: float,
+    rests: Sequence[Float[np.ndarray, "3"]],
     rules: Preparation,
 ) -> Prepared:
-    """One flight of stretches that are averaged to samples of `step` [s]. `numbers`: of their recordings."""
+    """One flight of stretches that are averaged to samples of `step` [s].
+
+    `numbers`: of their recordings. `rests`: the specific force before take-off, where it is known.
+    """
     length = round(rules.window / step)
     if length < rules.fewest:
         least = rules.window / rules.fewest
@@ -285,7 +302,7 @@ def _sampled(
         time=np.concatenate([each.time for each in flown]),
         length=length,
         available=_available_inputs(everything, flown, airframe),
-        level=_level(fitted, ups, float(airframe.gravity)) if ups else None,
+        level=force_level(fitted, ups, rests, float(airframe.gravity)),
         force_noise=np.min([force_noise(in_body_axes(each, airframe), step) for each in recordings], axis=0),
         seconds=(_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
     )
@@ -304,32 +321,6 @@ def _available_inputs(whole: Recording, flown: Sequence[Recording], airframe: Ai
         VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
-
-
-def _level(
-    fitted: Recording,
-    every: Sequence[Ups],
-    gravity: float,
-    *,
-    gained: float = 1.0,
-    carried: float = 0.003,
-    upright: float = 0.5,
-) -> tuple[float, float] | None:
-    """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
-
-    A vehicle gains little velocity over a stretch, at most `gained` [m/s], so all forces together carry its weight, but
-    for the share `carried`. `upright`: the least mean cosine of the tilt.
-    """
-    force = fitted.specific_force
-    if force is None or not (known := np.isfinite(force).all(axis=1)).any():
-        return None
-    ups = [np.concatenate(each)[known] for each in zip(*every, strict=True)]
-    other, along = ((force[known] * up).sum(axis=1).mean() for up in ups)
-    cosine = ups[-1][:, 2].mean()
-    if cosine < upright or force[known, 2].mean() < 0:  # the second: the z axis points down
-        return None
-    drift = gained * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
-    return (along - gravity) / cosine, math.hypot(drift, carried * gravity, along - other) / cosine
 
 
 def _seconds(recording: Recording) -> float:

@@ -17,10 +17,10 @@ from ..errors import InputError
 from ..flight import RATES, Flight
 from ..logs import Recording, as_recording
 
-ON_GROUND = "on the ground"
+ON_GROUND, IDLE = "on the ground", "motors idle"
 # Labels of samples; the last one that applies counts. The reason of a rotor at its limit names the rotor.
-_USABLE, _SHORT, _SATURATED, _LOST, _CRASHED, _GROUND = range(6)
-_REASONS = ("", "less than {:g} s between others", "", "nothing was measured", "an impact", ON_GROUND)
+_USABLE, _SHORT, _SATURATED, _LOST, _CRASHED, _IDLE, _GROUND = range(7)
+_REASONS = ("", "less than {:g} s between others", "", "nothing was measured", "an impact", IDLE, ON_GROUND)
 
 Samples = Bool[np.ndarray, " samples"]
 
@@ -43,8 +43,8 @@ class StretchRules(NamedTuple):
 
     - `shortest`: a usable stretch, and the rest of a vehicle that lies on its side or back.
     - `moment`: a rotor may rest or be at its limit for this long: about its lag.
-    - `carries`: the share of the weight; with less thrust for `sustained`, the vehicle is on the ground. Shorter pauses
-      of thrust happen in flight, shorter bursts on the ground.
+    - `carries`: the share of the weight; with less thrust for `sustained`, the vehicle does not fly. Shorter pauses of
+      thrust happen in flight, shorter bursts on the ground. The vehicle may fall; on the ground the force is `one_g`.
     - `margin`: between the ground and free flight.
     - `least_hover`: the share of full command; no vehicle has a thrust of 25 times its weight.
     - `gap`: the longest without a measurement, or five samples of a slow sensor.
@@ -102,15 +102,22 @@ def stretches(
     time, omega, dt, force = recording.time, recording.omega, recording.dt, recording.specific_force
     rates = recording.states[:, RATES]
     share = _thrust_share(recording, airframe, rules)
-    ground = _ground(share, dt, rules)
+    landed = np.zeros(time.size, dtype=bool)
     for begin, end in recording.facts.landed:  # as the vehicle itself says
-        ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
+        landed |= (time >= begin - dt / 2) & (time <= end + dt / 2)
+    ground = _ground(share, dt, rules) | landed
     saturations = _saturations(omega, airframe, dt, rules)
     labels = np.zeros(time.size, dtype=int)
     labels[np.any([where.any(axis=1) for where in saturations.values()], axis=0)] = _SATURATED
     labels[_lost(recording.states, dt, rules)] = _LOST
     labels[_crashed(rates, force, share, ground, dt, rules)] = _CRASHED
-    labels[ground] = _GROUND
+    labels[ground] = _IDLE
+    labels[landed] = _GROUND
+    weight = np.full(time.size, np.nan) if force is None else np.linalg.norm(force, axis=1) / STANDARD_GRAVITY
+    for begin, end in _runs(labels == _IDLE):
+        felt = weight[begin:end][np.isfinite(weight[begin:end])]
+        if felt.size and abs(np.median(felt) - 1) < rules.one_g:
+            labels[begin:end] = _GROUND
     if force is not None:
         labels[_resting(omega, force, rates, labels == _USABLE, dt, rules) & (labels != _LOST)] = _GROUND
     for begin, end in _runs(labels == _USABLE):
@@ -133,8 +140,8 @@ def stretches(
 def nothing_usable(every: Sequence[Stretch]) -> str:
     """Why none of these stretches of a flight can be used: the longest one, with its reason."""
     longest = max(every, key=lambda stretch: stretch.length)
-    no_flight = (ON_GROUND, "less than", _REASONS[_LOST])
-    grounded = longest.reason == ON_GROUND and all(each.reason.startswith(no_flight) for each in every)
+    no_flight = (ON_GROUND, IDLE, "less than", _REASONS[_LOST])
+    grounded = longest.reason in (ON_GROUND, IDLE) and all(each.reason.startswith(no_flight) for each in every)
     never = "the vehicle never flew" if grounded else "no part can be used"
     return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
 

@@ -11,7 +11,7 @@ from ...logs.table import counted
 from ..motion import excitation
 from .estimates import scaled_angles
 from .evidence import Evidence, Finding
-from .mounting import earth_axes
+from .mounting import earth_axes, tilted_force
 
 _ATTITUDE = (*INERTIAS, "attitude")
 _CLOCKS = {  # how to say that it is wrong, and what it concerns
@@ -156,9 +156,9 @@ def _correlated(values: np.ndarray) -> float:
 
 
 def wrong_scale(evidence: Evidence) -> Finding | None:
-    """The attitude turns more or less than the gyro says."""
+    """The attitude turns more or less than the gyro says. A slow gyro misses turns between its samples."""
     turns, limits = evidence.turns, evidence.limits
-    if turns is None:
+    if turns is None or _gyro_step(evidence) > limits.slow_gyro:
         return None
     matrix, error = turns.matrix.value, np.diagonal(turns.matrix.error)
     clear = np.abs(matrix) > limits.standard_errors * turns.matrix.error  # others only add noise
@@ -187,6 +187,15 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
     axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(MOTIONS, scale, error, judged, strict=True) if j]
     cause = f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}"
     return Finding(name, cause, ", ".join(axes), remedy, quantities, True)
+
+
+def _gyro_step(evidence: Evidence) -> float:
+    """The longest median time between samples of p, q or r in flight [s]; 0 without any."""
+    steps = [0.0]
+    for flown in evidence.stretches:
+        seen = np.isfinite(flown.states[:, RATES])
+        steps += [float(np.median(np.diff(flown.time[one]))) for one in seen.T if np.count_nonzero(one) > 1]
+    return max(steps)
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
@@ -278,18 +287,26 @@ def _delays(evidence: Evidence) -> tuple[list[_Delay], bool]:
         late, error = float(turns.delay.value), float(turns.delay.error)
         delays.append(_Delay((-1, 0, 1, 0), late, error, limits.filters))
         differ |= abs(late) > max(limits.late_attitude, limits.standard_errors * error)
-    if response is not None and response.coherent[:2].max() > limits.coherent[0]:
+    if response is not None and response.explained[:2].max() > limits.explained[0]:
         gyro, _, between = zip(response.delays.value.tolist(), response.delays.error.tolist(), strict=True)
-        late, usual = gyro[0], limits.gusts
+        answered = limits.answered * (1 - float(response.explained[:2].mean()))
+        late, usual = _beyond(gyro[0], answered), limits.damping
         if response.lag:  # commands: the rotors' own lag and delay are unknown
             late, usual = gyro[0] + response.lag - limits.usual_lag, limits.lags
         delays.append(_Delay((1, 0, 0, -1), late, gyro[1], usual))
-        before = min(gyro[0] + response.lag, 0.0) if response.lag else gyro[0]
+        before = min(gyro[0] + response.lag, 0.0) if response.lag else late
         differ |= abs(before) > max(limits.late, limits.standard_errors * gyro[1])
-        if response.coherent[2] > limits.coherent[1] and math.isfinite(between[1]):
-            delays.append(_Delay((1, -1, 0, 0), *between, limits.gusts))
-            differ |= abs(between[0]) > max(limits.delay, limits.standard_errors * between[1])
+        felt = response.explained[2] > limits.explained[1] and math.isfinite(between[1])
+        if felt and not tilted_force(evidence):  # the force along another axis is not the thrust's
+            late, error = _beyond(between[0], answered + limits.damping), between[1]
+            delays.append(_Delay((1, -1, 0, 0), late, error, limits.damping))
+            differ |= abs(late) > max(limits.delay, limits.standard_errors * error)
     return delays, differ
+
+
+def _beyond(late: float, usual: float) -> float:
+    """A delay; 0 if it is a usual one, which is 0 to `usual`."""
+    return 0.0 if 0.0 < late < usual else late
 
 
 def velocity_axes(evidence: Evidence) -> Finding | None:

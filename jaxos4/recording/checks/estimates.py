@@ -147,6 +147,8 @@ def interpolated(
     """
     known = np.isfinite(values)
     time, values = time[known], values[known]
+    if time.size < 2:
+        return np.full(at.shape, np.nan)
     if turns:
         values = np.unwrap(values)
     right = np.clip(np.searchsorted(time, at), 1, time.size - 1)

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ...airframe import Airframe
+from ...airframe import GRAVITY, Airframe
 from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
@@ -56,13 +56,16 @@ class Limits(msgspec.Struct, frozen=True):
     - `scale`: of attitude against gyro, relative. Inertias are wrong by the scale of the gyro.
     - `angle`: of a sensor about the vertical axis [rad]. 20 degrees change inertias by 8 %, 8 degrees by 1 %.
     - `tilt`: of the accelerometer against the thrust [rad]. Its errors and steady wind reach half of this.
-    - `delay`: between two sensors [s] that is noted. Gusts that a controller answers make errors of up to 8 ms.
+    - `delay`: between two sensors [s] that is noted. Damping and inflow make errors of up to 8 ms.
     - `late`: between two sensors [s] that contradicts. 20 ms change inertias by 10 %. The filter of an accelerometer
       can be 10 ms later than that of the gyro.
     - `late_attitude`: of the attitude after the gyro [s]. Filters and cameras are late by up to 20 ms.
     - `velocity`: of the horizontal acceleration by the velocity against that by force and attitude, relative.
       Velocities that are averaged while the vehicle yaws differ by 5 %.
     - `gravity`: of the mean specific force, relative to gravity. It is up to 10 % larger in brisk flight.
+    - `at_rest`: the same before take-off; accelerometers err by up to 3 %.
+    - `rest`, `still`: a vehicle at rest has constant force and rates for this time [s], to this standard deviation
+      [gravity, rad/s].
     - `thrust`, `commanded_thrust`: of the airframe's thrust, relative, by measured speeds and by commands. The fit
       measures the thrust by the accelerometer: errors of 20 % are harmless.
     - `vehicles`, `commanded_vehicles`: of the thrust between two logs of one vehicle, relative, by measured speeds and
@@ -73,6 +76,7 @@ class Limits(msgspec.Struct, frozen=True):
     - `held`: the time for which motors keep their value [s]: half of the shortest lag of rotors.
     - `instants`: between rotor speeds at instants [s]. 16 ms make Ix 4 % too small and Iz 9 % too large for rotors with
       a lag of 25 ms, 8 ms less than 1 and 5 %.
+    - `slow_gyro`: the longest time between samples of a gyro whose integral is compared with the attitude [s]: 50 Hz.
     - `follows`: the share of the attitude's turns that a gyro explains before their scale and delay count, and
       `unrelated`: with less, a gyro that moves is of another flight than the attitude.
     - `vague`, `same_angle`: of a rotation about the vertical axis by the rotors [rad]. A larger error is that of
@@ -80,10 +84,11 @@ class Limits(msgspec.Struct, frozen=True):
     - `along_earth`: slope of the horizontal force on the tilt: 1 along the earth's axes, 0 or less along the body's.
     - `steady`: in a hand or in rolls, the mean vector of the force is shorter than this share of its mean size.
     - `moves`: standard deviation of the rates of a vehicle that moves [rad/s]. `thrust_moves`: of its thrust, relative.
-    - `coherent`: the shares of roll or pitch acceleration, and of vertical force, that the rotors explain before their
-      delays count. The first one counts for the sum of roll and pitch before axes are judged.
-    - `filters`, `gusts`, `lags`: standard deviations of delays that are no error of a clock [s]: filters, gusts that a
-      controller answers, and the lag and delay of rotors that follow commands, about `usual_lag`.
+    - `explained`: the shares of the errors of predicted rates, and of the vertical force, that the rotors explain
+      before their delays count. The first one counts for the sum of roll and pitch before axes are judged.
+    - `filters`, `damping`, `lags`: standard deviations of delays that are no error of a clock [s]: filters, damping
+      that varies, and the lag and delay of rotors that follow commands, about `usual_lag`.
+    - `answered`: the delay that a gyro seems to have if the rotors do nothing but answer gusts [s].
     - `likelier`: difference of chi^2: a clock 20 times less likely to be wrong than another is not named.
     """
 
@@ -97,6 +102,9 @@ class Limits(msgspec.Struct, frozen=True):
     late_attitude: float = 0.025
     velocity: float = 0.15
     gravity: float = 0.3
+    at_rest: float = 0.05
+    rest: float = 0.25
+    still: float = 0.1
     thrust: float = 0.35
     commanded_thrust: float = 1.0
     vehicles: float = 0.1
@@ -105,6 +113,7 @@ class Limits(msgspec.Struct, frozen=True):
     motions: float = 15.0
     held: float = 0.015
     instants: float = 0.0105
+    slow_gyro: float = 0.0202
     follows: float = 0.2
     unrelated: float = 0.1
     vague: float = 0.2
@@ -113,11 +122,12 @@ class Limits(msgspec.Struct, frozen=True):
     steady: float = 0.9
     moves: float = 0.05
     thrust_moves: float = 0.01
-    coherent: tuple[float, float] = (0.2, 0.03)
+    explained: tuple[float, float] = (0.02, 0.03)
     filters: float = 0.003
-    gusts: float = 0.004
+    damping: float = 0.004
     lags: float = 0.025
     usual_lag: float = 0.05
+    answered: float = 0.014
     likelier: float = 6.0
 
 
@@ -181,6 +191,23 @@ class Evidence:
         every = [each.specific_force for each in self.airborne if each.specific_force is not None]
         force = np.concatenate(every) if every else np.empty((0, 3))
         return force[np.isfinite(force).all(axis=1)]
+
+    @functools.cached_property
+    def rest(self) -> Float[np.ndarray, "3"] | None:
+        """The specific force at rest before the first stretch in flight [m/s^2]. `None`: never at rest, or moved."""
+        recording, begin = self.plausible.recording, min((float(each.time[0]) for each in self.stretches), default=0.0)
+        before = np.count_nonzero(recording.time < begin - RULES.margin)
+        length = max(round(self.limits.rest / recording.dt), 4)
+        if recording.specific_force is None or before < 4 * length:
+            return None
+        sensed = np.hstack([recording.specific_force, GRAVITY * recording.states[:, RATES]])[:before]
+        blocks = sensed[before % length :].reshape(-1, length, 6)
+        still = (blocks.std(axis=1) < self.limits.still * GRAVITY).all(axis=1)  # False for NaN
+        means = blocks[still, :, :3].mean(axis=1)
+        if len(means) < 4:
+            return None
+        alike = np.abs(means - np.median(means, axis=0)).max(axis=1) < self.limits.still * GRAVITY
+        return means[alike].mean(axis=0) if alike.mean() > 0.75 else None  # or else in a hand
 
     @functools.cached_property
     def turns(self) -> Turns | None:

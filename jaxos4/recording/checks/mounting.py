@@ -14,8 +14,8 @@ from .evidence import Evidence, Finding
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
     """Gyro turned about the vertical axis: roll torque pitches the vehicle, and the attitude turns about other axes."""
     rotors, attitude = _by_rotors(evidence), _by_attitude(evidence)
-    limits, tilted = evidence.limits, thrust_direction(evidence)
-    if tilted is not None and tilted.name == "force_direction":
+    limits = evidence.limits
+    if tilted_force(evidence):
         return None  # the angle about z is known when this is corrected
 
     def turned(angle: tuple[float, float] | None) -> bool:
@@ -80,7 +80,7 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
 def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     """The angle of the gyro about z and its error [rad], by roll and pitch torque. `None`: unknown, or no rotation."""
     response, limits = evidence.response, evidence.limits
-    if response is None or response.coherent[:2].sum() < limits.coherent[0]:
+    if response is None or response.explained[:2].sum() < limits.explained[0]:
         return None
     sizes = np.hypot(*response.turning.value)
     (a, b), (c, d) = response.turning.value / sizes
@@ -123,24 +123,24 @@ def earth_axes(evidence: Evidence) -> Finding | None:
 
 
 def thrust_direction(evidence: Evidence) -> Finding | None:
-    """The mean specific force in flight is not along z, or not as large as gravity."""
-    force, limits = evidence.force, evidence.limits
-    if not force.size:
+    """The specific force is not along z, or not as large as gravity: at rest before take-off, or else in flight.
+
+    The mean in flight has drag and manoeuvres too. A vehicle that rests on a slope is not tilted in flight.
+    """
+    flown, rest, limits = evidence.force, evidence.rest, evidence.limits
+    if not flown.size and rest is None:
         return None
-    mean, sizes = force.mean(axis=0), np.linalg.norm(force, axis=1).mean()
+    mean = flown.mean(axis=0) if rest is None else rest
     size = float(np.linalg.norm(mean))
-    gravity = GRAVITY if evidence.airframe is None else float(evidence.airframe.gravity)
-    share = f"mean specific force {size:.3g} m/s^2"
-    if abs(size / gravity - 1) > limits.gravity:
-        if 0.8 < size < 1.25:
-            cause, remedy = "the accelerometer is in units of g", "multiply by 9.80665"
-        elif size <= 0.8:
-            cause, remedy = "gravity was subtracted from the accelerometer", "log what the accelerometer measures"
-        else:
-            cause, remedy = "the scale of the accelerometer is wrong", "give m/s^2: it measures gravity in hover"
-        return Finding("force_scale", cause, share, remedy, ("thrust",), True)
-    tilt = math.acos(min(max(mean[2] / max(size, 1e-300), -1.0), 1.0))
-    if tilt < limits.tilt or size < limits.steady * sizes:
+    if scale := _force_scale(evidence, size):
+        return scale
+    tilt, steady = _tilt(mean), limits.steady * np.linalg.norm(flown, axis=1).mean() if flown.size else math.inf
+    if tilt < limits.tilt:
+        return None
+    if rest is None:
+        if size < steady:
+            return None
+    elif not flown.size or _tilt(flown.mean(axis=0)) < limits.tilt:
         return None
     roll = math.atan2(mean[1], mean[2])
     level = _turn(1, -math.atan2(mean[0], math.hypot(mean[1], mean[2]))) @ _turn(0, roll)
@@ -148,11 +148,41 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
     return Finding(
         "force_direction",
         "the accelerometer is mounted at an angle, or has other axes: the thrust in flight is not along its z axis",
-        f"{math.degrees(tilt):.0f} degrees, along {along}",
+        f"{math.degrees(tilt):.0f} degrees, along {along}" + ("" if rest is None else ", at rest before take-off"),
         f"log x forward, y left, z up, or {_rotation_for(evidence, level)}: the angle about z is not known",
         ("thrust", *INERTIAS),
         True,
     )
+
+
+def _tilt(force: Float[np.ndarray, "3"]) -> float:
+    """The angle between a force and the z axis [rad]."""
+    return math.acos(min(max(float(force[2]) / max(float(np.linalg.norm(force)), 1e-300), -1.0), 1.0))
+
+
+def _force_scale(evidence: Evidence, size: float) -> Finding | None:
+    """A specific force of this size [m/s^2], of a vehicle at rest or else the mean in flight, that is not gravity."""
+    limits, resting = evidence.limits, evidence.rest is not None
+    gravity = GRAVITY if evidence.airframe is None else float(evidence.airframe.gravity)
+    off = abs(size / gravity - 1)
+    if off <= (limits.at_rest if resting else limits.gravity):
+        return None
+    share = f"{size:.3g} m/s^2 at rest before take-off" if resting else f"mean specific force {size:.3g} m/s^2"
+    if 0.8 < size < 1.25:
+        cause, remedy = "the accelerometer is in units of g", "multiply by 9.80665"
+    elif size <= 0.8:
+        cause, remedy = "gravity was subtracted from the accelerometer", "log what the accelerometer measures"
+    elif off <= limits.gravity:
+        cause, remedy = f"the accelerometer has an error of {100 * off:.0f} %", "calibrate it"
+    else:
+        cause, remedy = "the scale of the accelerometer is wrong", "give m/s^2: it measures gravity in hover"
+    return Finding("force_scale", cause, share, remedy, ("thrust",), off > limits.gravity)
+
+
+def tilted_force(evidence: Evidence) -> bool:
+    """Whether the accelerometer has other axes than the thrust."""
+    tilted = thrust_direction(evidence)
+    return tilted is not None and tilted.name == "force_direction"
 
 
 def wrong_thrust(evidence: Evidence) -> Finding | None:

@@ -1,45 +1,74 @@
-"""The response of gyro and accelerometer to the rotors: gains, axes and delays, by cross-spectra."""
+"""The response of gyro and accelerometer to the rotors: gains, axes and delays.
 
+A controller answers gusts. A cross-spectrum of torque and turns shows the controller then, as well as the vehicle: in
+soft flight, a gyro seems 6 to 14 ms late. Errors of a prediction from the past have no such bias, because no controller
+has answered them yet. Each delay of the gyro is tried, and the one with the smallest errors is right. Nothing answers
+the vertical force as fast, and a cross-spectrum shows the delay of the accelerometer. Damping and inflow are part of
+both, because they shift the phase like a delay.
+
+Reference: Ljung 1999, System Identification, ch. 13, the direct method in closed loop.
+"""
+
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ...airframe import Airframe
-from ...flight import CHANNEL_NAMES
+from ...flight import RATES
 from ...logs import Recording
-from ...logs.sampling import averages
+from ..motion import velocity_of
+from ..windows import averaged
 from .estimates import BATCHES, Measured, interpolated, peak
 
-_SENSED = [CHANNEL_NAMES.index(name) for name in ("p", "q", "az")]
-_ROLL_PITCH, _VERTICAL = slice(0, 2), slice(2, 3)
+Signals = Float[np.ndarray, "samples _signals"]
 
-Products = Complex[np.ndarray, "frequencies 6 6"]
+
+class Prediction(NamedTuple):
+    """Settings with which the response of the gyro is measured.
+
+    - `step`: of the samples [s]; shorter ones would see the start of a filter's answer only.
+    - `longest`: the longest step [s].
+    - `memory`: of the noise model, in samples.
+    - `lags`: of rotors that follow commands, of which one is chosen [s].
+    - `delays`: first and last [s].
+    - `rows`: as many predictions are enough.
+    - `passes`: of the fit of gains and of the noise model in turn.
+    """
+
+    step: float = 0.012
+    longest: float = 0.034
+    memory: int = 5
+    lags: tuple[float, ...] = (0.01, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1)
+    delays: tuple[float, float] = (-0.12, 0.12)
+    rows: int = 20_000
+    passes: int = 4
 
 
 class Spectra(NamedTuple):
-    """Settings with which the response to the rotors is measured.
+    """Settings with which the response of the accelerometer is measured.
 
     - `step`, `seconds`: of the samples, and how long those of one spectrum last [s].
-    - `gap`: the longest that is interpolated [s].
-    - `band`: [Hz]; gusts are slower; rotors, and noise of the gyro, leave little above.
-    - `lags`: of rotors that follow commands, of which one is chosen [s].
+    - `band`: [Hz]; wind and the height's control are slower; rotors, and noise of the gyro, leave little above.
     - `delays`: first and last, in steps of 1 ms [s].
-    - `fewest`: spectra; fewer have no standard error.
     """
 
     step: float = 0.004
     seconds: float = 2.0
-    gap: float = 0.05
     band: tuple[float, float] = (2.0, 15.0)
-    lags: tuple[float, ...] = (0.01, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1)
-    delays: tuple[float, float] = (-0.15, 0.18)
-    fewest: int = 6
+    delays: tuple[float, float] = (-0.12, 0.12)
 
 
-SPECTRA = Spectra()
+PREDICTION, SPECTRA = Prediction(), Spectra()
+FORGETS = 2.0
+"""Angle and velocity, on which damping and inflow act, are forgotten with this time constant [s]."""
+GAP = 0.05
+"""The longest gap that is interpolated [s]."""
+SECONDS = 6.0
+"""The least flight whose response is measured [s]."""
 
 
 class Response(msgspec.Struct, frozen=True):
@@ -47,104 +76,203 @@ class Response(msgspec.Struct, frozen=True):
 
     - `turning`: the matrix from roll and pitch torque to roll and pitch acceleration [1/(kg m^2)].
     - `delays`: of gyro and accelerometer after the rotors, and of the gyro after the accelerometer [s].
-    - `coherent`: the shares of roll acceleration, pitch acceleration and vertical force that the rotors explain. NaN:
-      not measured.
+    - `explained`: the shares that the rotors explain: of the squared errors with which roll and pitch rate are
+      predicted, and of the power of the vertical force. NaN: not measured.
     - `lag`: of the rotors [s]; 0 if their speeds were measured.
     """
 
     turning: Measured
     delays: Measured
-    coherent: Float[np.ndarray, "3"]
+    explained: Float[np.ndarray, "3"]
     lag: float
 
 
-def rotor_response(stretches: Sequence[Recording], airframe: Airframe, settings: Spectra = SPECTRA) -> Response | None:
+def rotor_response(
+    stretches: Sequence[Recording],
+    airframe: Airframe,
+    prediction: Prediction = PREDICTION,
+    spectra: Spectra = SPECTRA,
+) -> Response | None:
     """Compare gyro and accelerometer with the rotors. `None`: the flight is too short, too slow, or has no gyro."""
-    step = max(settings.step, *(each.dt for each in stretches))
-    if step > 0.5 / settings.band[1]:
+    if sum(float(np.ptp(each.time)) for each in stretches) < SECONDS:
         return None
-    spectra = [each for flown in stretches for each in _spectra(flown, airframe, step, settings)]
-    if len(spectra) < settings.fewest:
+    step = max(each.dt for each in stretches)
+    if step > prediction.longest:
         return None
-    frequency = np.fft.rfftfreq(round(settings.seconds / step), step)
-    inside = (frequency >= settings.band[0]) & (frequency <= settings.band[1])
-    omega = 2j * np.pi * frequency[inside]
-    # Rotor speeds are those of the step after their time. Angular accelerations are the derivatives of rates.
-    factors = np.stack([np.exp(-omega * step / 2)] * 3 + [omega, omega, np.ones_like(omega)])
-    groups = np.array_split(np.array(spectra)[:, :, inside] * factors, min(BATCHES, len(spectra)))
+    lags = prediction.lags if stretches[0].commanded else (0.0,)
+    flown = [averaged(each, [max(prediction.step, step)])[0] for each in stretches]
+    model = _Turning.of(flown[0].dt, prediction)
+    turns = {lag: model.products([_turns(each, airframe, lag) for each in flown], prediction.rows) for lag in lags}
+    answers = {lag: model.answer(products.sum(axis=0)) for lag, products in turns.items()}
+    lag = max(lags, key=lambda lag: float(-np.log1p(-np.nan_to_num(answers[lag][2])).sum()))
+    if np.isnan(answers[lag][1]):
+        return None
+    found = Measured.of(turns[lag], lambda products: np.append(*model.answer(products)[:2]))
+    turning, late = Measured(found.value[:4].reshape(2, 2), found.error[:4].reshape(2, 2)), found[4:]
+    felt, share = _felt([averaged(each, [max(spectra.step, step)])[0] for each in stretches], airframe, lag, spectra)
+    between = Measured(late.value - felt.value, np.hypot(late.error, felt.error))
+    value, error = (
+        np.concatenate([getattr(one, name) for one in (late, felt, between)]) for name in ("value", "error")
+    )
+    return Response(turning, Measured(value, error), np.append(answers[lag][2], share), lag)
+
+
+class _Turning(NamedTuple):
+    """The prediction of roll and pitch rate: its step [s], how many past errors count, the first and last delay.
+
+    A rate answers the integrals of both torques, and its slow motion, which has no delay. Delays are in samples.
+    """
+
+    step: float
+    order: int
+    first: int
+    last: int
+
+    @classmethod
+    def of(cls, step: float, settings: Prediction) -> "_Turning":
+        """That of samples of this step [s]."""
+        return cls(step, settings.memory, *(round(delay / step) for delay in settings.delays))
+
+    def products(self, every: Sequence[np.ndarray], rows: int) -> Float[np.ndarray, "batches columns columns"]:
+        """Sums of products of `_lagged` signals in batches. `rows`: about as many predictions are used."""
+        thin = max(sum(len(each) for each in every) // rows, 1)
+        table = np.concatenate([self._lagged(each)[::thin] for each in every])
+        return np.array([batch.T @ batch for batch in np.array_split(table, BATCHES)])
+
+    def _lagged(self, signals: Signals) -> Float[np.ndarray, "rows columns"]:
+        """Rates and slow motions, now and before; torques from the first delay to the last, and before.
+
+        Only complete rows.
+        """
+        spans = [(0, self.order)] * 4 + [(self.first, self.last + self.order)] * 2
+        signals = signals - np.nan_to_num(signals).sum(axis=0) / np.maximum(np.isfinite(signals).sum(axis=0), 1)
+        rows = np.arange(self.last + self.order, len(signals) + self.first)
+        columns = [x[rows[:, None] - np.arange(a, b + 1)] for x, (a, b) in zip(signals.T, spans, strict=True)]
+        table = np.hstack(columns)
+        return table[np.isfinite(table).all(axis=1)]
+
+    def _places(self) -> Int[np.ndarray, "delays rates signals past"]:
+        """By delay and rate: the columns of `_lagged` that hold it, both torques at this delay, and its slow motion."""
+        past, shifts = np.arange(self.order + 1), np.arange(self.last - self.first + 1)
+        torques = 4 * past.size + (past.size + shifts.size - 1) * np.arange(2)[:, None] + past
+        every = [[[past.size * i + past, *(torques + s), past.size * (2 + i) + past] for i in range(2)] for s in shifts]
+        return np.array(every)
+
+    def answer(
+        self, products: Float[np.ndarray, "columns columns"], passes: int = PREDICTION.passes
+    ) -> tuple[Float[np.ndarray, "4"], float, Float[np.ndarray, "2"]]:
+        """The gains from torques to rates, their delay [s], and the explained shares; NaN: not measured.
+
+        Errors are those of a prediction of the rates, less their inputs times their gains, from their past.
+        """
+        if not products.any():
+            return np.full(4, np.nan), math.nan, np.full(2, np.nan)
+        places = self._places()
+        size = np.sqrt(np.maximum(np.diagonal(products)[places[..., 0]], 1e-300))  # of each signal
+        sums = products[places[..., :, None, :, None], places[..., None, :, None, :]]
+        sums = sums / (size[..., :, None] * size[..., None, :])[..., None, None]
+        noise = np.zeros(places.shape[:2] + places.shape[3:])
+        noise[..., 0], noise[..., 1] = 1.0, -1.0  # torques that are not known add up in rates
+        alone, _ = _predicted(np.eye(size.shape[2])[0] + np.zeros(size.shape), sums)
+        weights, squares = np.zeros(size.shape), alone
+        for _ in range(passes):
+            weights = _least(np.einsum("koi,koabi->koab", noise, np.einsum("koj,koabij->koabi", noise, sums)))
+            squares, noise = _predicted(weights, sums)
+        shares = np.where(alone > 0, 1 - squares / np.maximum(alone, 1e-300), 0.0)
+        gains = (-weights * size[..., :1] / size)[..., 1:3]
+        # A controller turns the rotors against the motion, and so seems to cause a motion against the torque before it.
+        along, across = np.trace(gains, axis1=1, axis2=2), np.abs(gains[:, 0, 1] - gains[:, 1, 0])
+        best, after = peak(np.where(along > -across, -np.log1p(-shares).sum(axis=1), 0.0))
+        return gains[best].ravel(), (self.first + best + after) * self.step, shares[best]
+
+
+def _predicted(weights: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The squared errors of a prediction of weighted signals from their past, and its coefficients."""
+    residual = np.einsum("koa,koaij->koij", weights, np.einsum("kob,koabij->koaij", weights, sums))
+    noise = _least(residual)
+    return np.einsum("koi,koi->ko", noise, np.einsum("koij,koj->koi", residual, noise)), noise
+
+
+def _least(sums: Float[np.ndarray, "*some n n"]) -> Float[np.ndarray, "*some n"]:
+    """The weights with the least sum of squares; the first weight is 1."""
+    ridge = 1e-12 * np.trace(sums, axis1=-2, axis2=-1)[..., None, None] + 1e-300
+    others = np.linalg.solve(sums[..., 1:, 1:] + ridge * np.eye(sums.shape[-1] - 1), sums[..., 1:, :1])[..., 0]
+    return np.concatenate([np.ones_like(others[..., :1]), -others], axis=-1)
+
+
+def _turns(flown: Recording, airframe: Airframe, lag: float) -> Signals:
+    """Roll and pitch rate, their slow motion, and the integrals of roll and pitch torque of rotors with this lag."""
+    rates, many = flown.states[:, RATES[:2]], np.asarray(flown.within).shape[1]
+    rates = np.column_stack([interpolated(flown.time, flown.time, x, gap=GAP) for x in rates.T])
+    angles = flown.dt * _forgetting(np.nan_to_num(rates), flown.dt / FORGETS)
+    torques = _forced(flown, airframe, lag)[:, :2]
+    turned = flown.dt / many * np.cumsum(torques, axis=0)[many // 2 - 1 :: many]
+    return np.hstack([rates, np.vstack([angles[:1], angles[:-1]]), turned])
+
+
+def _forced(flown: Recording, airframe: Airframe, lag: float) -> Float[np.ndarray, "parts 3"]:
+    """Roll and pitch torque, and thrust per mass, in the parts of samples; of rotors with this lag [s]."""
+    parts = np.asarray(flown.within)
+    mixer = np.asarray(airframe.mixer, dtype=float)[[0, 1, 3]]
+    forced = np.square(parts).reshape(-1, 4) @ mixer.T / [1.0, 1.0, float(airframe.mass)]
+    forced -= forced.mean(axis=0)
+    share = flown.dt / parts.shape[1] / lag if lag else math.inf
+    return -math.expm1(-share) * _forgetting(forced, share) if lag else forced
+
+
+def _forgetting(values: Signals, share: float) -> Signals:
+    """The sum of the values until each sample; a sample later, the share exp(-`share`) of it is left."""
+    kept = np.exp(-share * np.arange(min(math.ceil(20 / share), len(values))))[:, None]
+    size = 1 << (len(values) + len(kept)).bit_length()
+    spectrum = np.fft.rfft(values, size, axis=0) * np.fft.rfft(kept, size, axis=0)
+    return np.fft.irfft(spectrum, size, axis=0)[: len(values)]
+
+
+def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float, settings: Spectra) -> tuple[Measured, float]:
+    """The delay of the accelerometer after the rotors [s], and the share of the vertical force that they explain."""
+    unknown = Measured(np.full(1, np.nan), np.full(1, np.nan)), math.nan
+    step, (low, high) = flown[0].dt, settings.band
+    spectra = [each for one in flown for each in _spectra(one, airframe, lag, settings)]
+    if len(spectra) < 2:
+        return unknown
+    frequency = np.fft.rfftfreq(2 * len(spectra[0][0]) - 2, step)
+    inside = (frequency >= low) & (frequency <= min(high, 0.5 / step))
+    groups = np.array_split(np.array(spectra)[..., inside], min(BATCHES, len(spectra)))
     sums = np.array([np.einsum("sif,sjf->fij", group.conj(), group) for group in groups])
-    whole = sums.sum(axis=0)
-    first, last = settings.delays
-    delays = 1e-3 * np.arange(round(1e3 * first), round(1e3 * last) + 1)
-    lags = settings.lags if stretches[0].commanded else (0.0,)
-    best = max(lags, key=lambda lag: np.nansum(_fit(whole, whole, omega, lag, delays)[2]))
+    power = np.real(sums.sum(axis=0)[:, 2, 2])
+    if not (power > 0).all():
+        return unknown
+    delays = 1e-3 * np.arange(round(1e3 * settings.delays[0]), round(1e3 * settings.delays[1]) + 1)
+    late = np.exp(-2j * np.pi * frequency[inside] * delays[:, None])
 
-    def fit(products: Products) -> Float[np.ndarray, "7"]:
-        turning, late, _ = _fit(products, whole, omega, best, delays)
-        return np.append(turning, late)
+    def shares(products: Complex[np.ndarray, "frequencies 3 3"]) -> Float[np.ndarray, " delays"]:
+        thrust, falls, force = np.moveaxis(products / power[:, None, None], 1, 0)
+        moved = np.real(falls[:, 1]).sum()
+        both, across = (np.real(late.conj() @ thrust[:, i]) for i in (2, 1))
+        # Inflow: a force that is proportional to the vertical velocity, at the time of the force.
+        left = np.real(thrust[:, 0]).sum() - across**2 / moved
+        inflow = np.real(falls[:, 2]).sum()
+        gain = (both - across * inflow / moved) / left
+        return np.where(gain > 0, gain**2 * left, 0.0) / np.real(force[:, 2]).sum()
 
-    found = Measured.of(sums, fit)
-    turning = Measured(found.value[:4].reshape(2, 2), found.error[:4].reshape(2, 2))
-    return Response(turning, found[4:], _fit(whole, whole, omega, best, delays)[2], best)
+    def fit(products: Complex[np.ndarray, "frequencies 3 3"]) -> Float[np.ndarray, "1"]:
+        best, after = peak(shares(products))
+        return np.array([delays[best] + 1e-3 * after])
+
+    return Measured.of(sums, fit), float(shares(sums.sum(axis=0)).max())
 
 
 def _spectra(
-    flown: Recording, airframe: Airframe, step: float, settings: Spectra
-) -> list[Complex[np.ndarray, "6 frequencies"]]:
-    """Spectra of roll and pitch torque, thrust per mass, roll and pitch rate and vertical force.
-
-    Thrust and force are 0 if the force was not measured.
-    """
-    time, omega, sensed = averages(flown.time, flown.omega, flown.channels[:, _SENSED], held=flown.held)(step)
-    for column in sensed.T:
-        if np.isfinite(column).sum() > 1:
-            column[:] = interpolated(time, time, column, gap=settings.gap)
-    mixer = np.asarray(airframe.mixer, dtype=float)[[0, 1, 3]]
-    forced = omega**2 @ mixer.T / [1.0, 1.0, float(airframe.mass)]
-    signals, length = np.hstack([forced, sensed]).T, round(settings.seconds / step)
-    found, weight = [], np.hanning(length)
-    for begin in range(0, time.size - length, length // 2):
-        own = signals[:, begin : begin + length]
-        spectra = np.fft.rfft(weight * (own - own.mean(axis=1, keepdims=True)))
-        if np.isnan(spectra[5]).any():
-            spectra[[2, 5]] = 0.0
-        if np.isfinite(spectra).all():
-            found.append(spectra)
-    return found
-
-
-def _fit(
-    products: Products,
-    all_products: Products,
-    omega: Complex[np.ndarray, " frequencies"],
-    lag: float,
-    delays: Float[np.ndarray, " delays"],
-) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Gains, delays and coherent shares by least squares, for rotors with this lag [s].
-
-    Outputs weigh by their power in the whole flight, `all_products`.
-    """
-    lagged = 1 / (1 + omega * lag)
-    late = np.exp(-omega * delays[:, None]).conj()
-    power = np.real(np.diagonal(all_products, axis1=1, axis2=2))
-    turning, found, coherent = np.full((2, 2), np.nan), np.full(3, np.nan), np.full(3, np.nan)
-    for place, rows in enumerate((_ROLL_PITCH, _VERTICAL)):
-        outputs = slice(3 + rows.start, 3 + rows.stop)
-        inverse = 1 / np.maximum(power[:, outputs], 1e-300)
-        inputs = np.real(products[:, rows, rows]) * np.square(np.abs(lagged))[:, None, None]
-        forced = np.einsum("fij,fo->oij", inputs, inverse)
-        both = np.real(
-            np.einsum("df,fio->doi", late, products[:, rows, outputs] * lagged.conj()[:, None, None] * inverse[:, None])
-        )
-        total = np.einsum("foo,fo->o", np.real(products[:, outputs, outputs]), inverse)
-        if (total <= 0).any() or np.linalg.cond(forced).max() > 1e12:
-            continue
-        gains = np.linalg.solve(forced, both[..., None])[..., 0]
-        shares = (gains * both).sum(axis=2) / total
-        best, after = peak(shares.sum(axis=1))
-        found[place] = delays[best] + after * (delays[1] - delays[0])
-        coherent[rows] = shares[best]
-        if rows is _ROLL_PITCH:
-            turning = gains[best]
-    found[2] = found[0] - found[1]
-    return turning, found, coherent
+    flown: Recording, airframe: Airframe, lag: float, settings: Spectra
+) -> list[Complex[np.ndarray, "3 frequencies"]]:
+    """Spectra of thrust per mass, vertical velocity and vertical force, where all were measured."""
+    moved = velocity_of(flown, forgets=FORGETS)
+    if moved is None or flown.specific_force is None:
+        return []
+    thrust = _forced(flown, airframe, lag)[:, 2].reshape(len(flown.time), -1).mean(axis=1)
+    force = interpolated(flown.time, flown.time, flown.specific_force[:, 2], gap=GAP)
+    signals, length = np.stack([thrust, moved[0][:, 2], force]), round(settings.seconds / flown.dt)
+    weight = np.hanning(length)
+    windows = [signals[:, i : i + length] for i in range(0, len(thrust) - length, length // 2)]
+    spectra = [np.fft.rfft(weight * (one - one.mean(axis=1, keepdims=True))) for one in windows]
+    return [each for each in spectra if np.isfinite(each).all()]
