@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar
 from ..models.state import Forcing, Rates, State
-from .batching import with_batch
+from ..batching import with_batch
 from .gains import (
     RATE_COUNT,
     Channels,

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import InitialState, Numeric, Parameters, Scalar
 from ..models.state import Forcing, State, Translation, unstack
 from .abstract import LocalModel, Shot
-from .batching import computed_once, with_batch
+from ..batching import computed_once, with_batch
 from .sparsity import Panel, panels_of, symmetric
 
 # A body rate [rad/s] that no quadrotor reaches and no gyro measures: a faster trajectory has diverged.
