@@ -108,6 +108,7 @@ class FlightModel(AbstractModel):
         return found
 
     @property
+    @eqx.filter_jit  # one program instead of a dozen small ones
     def alpha(self) -> Parameters:
         """alpha_1..8 of the airframe, then the centres of the terms' parameters."""
         return jnp.concatenate([self._rigid_body.alpha, self._of_terms(lambda parameter: parameter.center)])

@@ -7,7 +7,6 @@ innovation e alone. So e - gamma v is compared, with an unknown *feedthrough* ga
 """
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float, Int
 
 FEEDTHROUGHS = 2
@@ -67,6 +66,8 @@ def _unexplained(
     By normal equations, because the matrix of the regression would not fit into memory. A ridge keeps them regular if
     series differ by rounding only. The second pass removes what the ridge and the rounding of the first have left.
     """
+    from scipy.linalg import cho_factor, cho_solve  # slow to import
+
     rest = series[rows, :targets]
     starts = np.flatnonzero(np.diff(rows, prepend=-1) > 1)
     firsts = np.concatenate([np.arange(*ends, _BLOCK) for ends in zip(starts, [*starts[1:], len(rows)], strict=True)])
@@ -77,10 +78,10 @@ def _unexplained(
     ]
     products = _lagged_products(windows, lags)
     products.flat[:: len(products) + 1] += _ROUNDING**2 * len(rows)
-    factor = scipy.linalg.cho_factor(products)
+    factor = cho_factor(products)
     for _ in range(2):
         common = [sum(past[lag].T @ block for past, block in blocks) for lag in range(lags)]
-        coefficients = np.split(scipy.linalg.cho_solve(factor, np.concatenate(common)), lags)
+        coefficients = np.split(cho_solve(factor, np.concatenate(common)), lags)
         for past, block in blocks:
             block -= sum(map(np.matmul, past, coefficients))
     return rest
