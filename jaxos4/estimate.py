@@ -3,6 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable
+from statistics import NormalDist
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -82,16 +83,16 @@ class Estimate(eqx.Module):
             raise ValueError(f"`level` must lie between 0 and 1, got {level}.")
         if self.calibration is None:
             each = 1 - (1 - level) / self.parameters.shape[-1] if simultaneous else level
-            return _deviations(jnp.asarray(each, dtype=float)) * self.std
-        knots, quantile = _deviations(self.calibration.levels), _deviations(jnp.asarray(level, dtype=float))
+            return _deviations(each) * self.std
+        knots, quantile = jax.scipy.special.ndtri((1 + self.calibration.levels) / 2), _deviations(level)
         factors = self.calibration.simultaneous[..., None] if simultaneous else self.calibration.factors
         each_parameter = jax.vmap(functools.partial(jnp.interp, quantile), in_axes=(None, 1))
         return jnp.vectorize(each_parameter, signature="(l),(l,p)->(p)")(knots, factors) * self.std
 
 
-def _deviations(level: Float[Array, "*levels"]) -> Float[Array, "*levels"]:
+def _deviations(level: float) -> float:
     """Half-width, in standard deviations, of the interval that holds a share `level` of a Gaussian."""
-    return jax.scipy.special.ndtri((1 + level) / 2)
+    return NormalDist().inv_cdf((1 + level) / 2)  # that of JAX is slow to import and to trace
 
 
 def as_estimate(

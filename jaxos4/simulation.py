@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector, as_float, setting
+from .batching import in_blocks
 from .flight import STATE_NAMES, Flight, Inputs
 from .models.abstract import AbstractModel
 from .models.state import CASCADE_ORDER, Forcing, State, stack, unstack
@@ -110,6 +111,12 @@ def simulate(
 
 @eqx.filter_jit
 def _simulate(
+    model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
+) -> Flight:
+    return in_blocks(_flown, model, parameters, omega, dt, start, method)
+
+
+def _flown(
     model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
 ) -> Flight:
     scalars = tuple(parameters)

@@ -1,10 +1,14 @@
 """Sine and cosine in one polynomial evaluation that vectorises over a batch of lanes (see docs/measured.md)."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float
+
+from .batching import computed_once
 
 # pi/2 in short parts: k * part is exact for |k| < 2**20 (2**13 in single precision). Reference: Cody and Waite.
 _HALF_PI_DOUBLE = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
@@ -22,6 +26,24 @@ def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, ".
 
 @jax.custom_jvp
 def _sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    return _once(x) if jax.default_backend() == "cpu" else _polynomials(x)
+
+
+@custom_vmap
+def _once(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    number = x.ravel()[:1]
+    always = (number == number) | (number != number)  # unknown to XLA, as a number may be NaN
+    return computed_once(always, lambda: _polynomials(x))
+
+
+@_once.def_vmap
+def _once_for_batch(lanes: int, is_batched: list[bool], x: Float[Array, "..."]) -> tuple[Any, Any]:
+    """The same, because a conditional that JAX batches is none."""
+    del lanes, is_batched
+    return _once(x), (True, True)
+
+
+def _polynomials(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     quarter = jnp.round(x * (2 / math.pi))
     r = x
     for part in _HALF_PI_SINGLE if x.dtype == jnp.float32 else _HALF_PI_DOUBLE:

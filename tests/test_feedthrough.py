@@ -1,5 +1,7 @@
 """What the torque tells that the log does not: input innovations, and the likelihood given them."""
 
+import tracemalloc
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -56,6 +58,50 @@ def test_innovations_are_what_the_past_does_not_tell(rng):
         for lag in range(1, 11):
             past = np.column_stack([torque[10 - lag : SAMPLES - lag, :, axis], rates[10 - lag : SAMPLES - lag, axis]])
             np.testing.assert_allclose(own.T @ past / len(own), 0.0, atol=1e-9)
+
+
+def assert_same_directions(found, expected, *, atol):
+    """The sign of a direction is arbitrary."""
+    np.testing.assert_allclose(found * np.sign(np.sum(found * expected, axis=0)), expected, atol=atol)
+
+
+def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng):
+    """By the whole matrix of the regression. One stretch is too short for a row."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    stretch = np.repeat([0, 1, 2], [250, 8, SAMPLES - 258])
+    found, lags = input_innovations(torque, rates, stretch, DT), 10
+    rows = np.concatenate([np.arange(lags, 250), np.arange(258 + lags, SAMPLES)])
+    assert not np.delete(found, rows, axis=0).any()
+    for axis in range(3):
+        samples = np.column_stack([torque[:, :, axis], rates[:, axis]])
+        past = np.column_stack([np.ones(len(rows)), *(samples[rows - lag] for lag in range(1, lags + 1))])
+        now = torque[rows, :, axis]
+        rest = now - past @ np.linalg.lstsq(past, now)[0]
+        directions = np.sqrt(len(rows)) * np.linalg.svd(rest, full_matrices=False)[0][:, :FEEDTHROUGHS]
+        assert_same_directions(found[rows, :, axis], directions, atol=1e-9)
+
+
+@pytest.mark.parametrize("parts", [[0, 0, 1, 1], [0, 1, 2, 2]])
+def test_the_rounding_of_the_log_changes_no_innovation(rng, parts):
+    """Commands are held for some parts, so parts are equal but for rounding; those of later samples too."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    torque, rates = torque[:, parts], np.zeros_like(rates)
+    rounded = torque + 1e-11 * rng.normal(size=torque.shape)
+    found, again = (input_innovations(x, rates, np.zeros(SAMPLES, int), DT) for x in (torque, rounded))
+    assert found[10:].any(axis=(1, 2)).all()
+    assert_same_directions(again, found, atol=1e-6)
+
+
+def test_an_hour_of_samples_of_4_ms_needs_less_than_200_megabytes(rng):
+    """Memory is linear in the samples. The matrix of the regression would need five times as much."""
+    samples, hour = 50_000, 900_000
+    data = rng.normal(size=(samples, 4, 3)), rng.normal(size=(samples, 3)), np.zeros(samples, int)
+    tracemalloc.start()
+    try:
+        assert input_innovations(*data, dt=0.004)[25:].any(axis=(1, 2)).all()
+        assert tracemalloc.get_traced_memory()[1] < 200e6 * samples / hour
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_stretch_is_not_told_by_the_stretch_before(rng):

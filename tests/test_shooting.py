@@ -8,7 +8,7 @@ import pytest
 from helpers import noisy_states, numpy_residuals, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.models.state import CASCADE_ORDER, CHANNELS
+from jaxos4.models.state import CASCADE_ORDER, CHANNELS, Attitude
 
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
 known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
@@ -195,6 +195,28 @@ def test_a_loop_is_a_batch_in_which_a_failed_trajectory_costs_infinity_and_chang
 
 
 # Noise levels.
+
+
+def test_a_batch_of_two_blocks_has_the_derivatives_of_its_lanes():
+    problem, direction = problem_of(), jnp.asarray(jaxos4.DEFAULT_HALF_WIDTH)
+    points = off() + 0.01 * jnp.arange(20.0)[:, None] * direction
+
+    def derivatives(x):
+        return jax.jvp(problem.cost, (x,), (direction,)), jax.grad(problem.cost)(x)
+
+    (costs, slopes), gradients = jax.jit(jax.vmap(derivatives))(points)
+    np.testing.assert_allclose(slopes, gradients @ direction, rtol=1e-9)
+    for lane in (0, 19):
+        (cost, slope), gradient = jax.jit(derivatives)(points[lane])
+        np.testing.assert_allclose([costs[lane], slopes[lane]], [cost, slope], rtol=1e-9)
+        np.testing.assert_allclose(gradients[lane], gradient, rtol=1e-9)
+
+
+@pytest.mark.skipif("jax.default_backend() != 'cpu'")
+def test_the_sines_of_a_step_are_computed_once():
+    """A shot is half as fast if XLA repeats those of an angle for all states that depend on it."""
+    program = jax.jit(jax.vmap(problem_of().cost)).lower(jnp.tile(off(), (20, 1))).compile().as_text() or ""
+    assert program.count(" conditional(") == len(Attitude._fields)
 
 
 def test_reweighting_finds_the_noise_level_of_each_channel():

@@ -14,10 +14,9 @@ from ..excitation import References, random_references
 from ..flight import Flight
 from ..linalg import invert
 from ..models.os4 import CorrectedOS4
-from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
+from ..models.state import Attitude, Forcing, Orientation, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
-from ..trigonometry import sincos
 from .sensors import BodyMotion, Sense, Signals, log
 from .settings import ClosedLoop, PerAxis
 
@@ -102,13 +101,14 @@ class _Vehicle(NamedTuple):
         each = zip(turning, forcing.gust[:3], self.damping, state.rates, strict=True)
         turning = Rates(*(total + gust - damping * rate for total, gust, damping, rate in each))
         turning = turning._replace(r=turning.r - self.reaction * forcing.spin_up)
-        attitude = attitude_rates(state.rates, state.attitude)
+        orientation = Orientation.of(state.attitude)
+        attitude = attitude_rates(state.rates, orientation)
         if state.velocity is None or forcing.wind is None:
             return BodyMotion(turning, attitude, None)
         (u, v, w), (wind_x, wind_y, _) = state.velocity, forcing.wind
         along = Rates(self.flapping[0] * (v - wind_y), self.flapping[1] * (u - wind_x), jnp.zeros_like(u))
         turning = jax.tree.map(jnp.add, turning, along)
-        (sin_phi, cos_phi), (sin_theta, cos_theta) = sincos(state.attitude.phi), sincos(state.attitude.theta)
+        sin_phi, cos_phi, sin_theta, cos_theta, _, _ = orientation
         x, y, z = self.specific_force(state.velocity, forcing)
         moving = (
             x + self.gravity * sin_theta - q * w + r * v,

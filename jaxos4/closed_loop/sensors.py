@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Key, Scalar
 from ..flight import ANGLES, RATES, VELOCITY, Flight
-from ..models.state import Attitude, Rates, Vector, to_earth
+from ..models.state import Attitude, Orientation, Rates, Vector, to_earth
 from ..simulation import until_failure
 from ..trigonometry import sincos
 from .settings import ClosedLoop, PerAxis, Sensors
@@ -109,7 +109,7 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Ar
         lost = jax.random.uniform(lost_key, (len(measured), 2)) < sensors.dropouts
         rates, specific = jnp.split(jnp.where(jnp.repeat(lost, 3, axis=1), jnp.nan, measured), 2, axis=1)
     if sensors is not None and motion.velocity is not None:
-        velocity = jnp.stack(to_earth(motion.attitude, motion.velocity), axis=1)
+        velocity = jnp.stack(to_earth(Orientation.of(motion.attitude), motion.velocity), axis=1)
         noise = sensors.velocity_noise * jax.random.normal(keys[2], velocity.shape)
         states = states.at[:, VELOCITY].set(velocity + noise)
     states = states.at[:, RATES].set(rates)

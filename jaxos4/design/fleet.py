@@ -16,7 +16,7 @@ from ..closed_loop import ClosedLoop, References, fly_closed_loop
 from ..errors import InputError
 from ..flight import ANGLES, POSITION, VELOCITY, Flight
 from ..models.flight_model import FlightModel
-from ..models.state import Attitude, to_earth
+from ..models.state import Attitude, Orientation, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
@@ -69,7 +69,9 @@ def fly_batch(
         flight = fly_closed_loop(loop, references, dt=dt, key=key, substeps=substeps)
         vertical = flight.channels[:, -1]
         nothing = jnp.zeros_like(vertical)
-        force = jnp.stack(to_earth(Attitude(*flight.states[:, ANGLES].T), (nothing, nothing, vertical)), axis=1)
+        force = jnp.stack(
+            to_earth(Orientation.of(Attitude(*flight.states[:, ANGLES].T)), (nothing, nothing, vertical)), axis=1
+        )
         velocity = dt * jnp.cumsum(force.at[:, 2].add(-loop.airframe.gravity), axis=0)
         states = flight.states.at[:, POSITION].set(dt * jnp.cumsum(velocity, axis=0)).at[:, VELOCITY].set(velocity)
         return eqx.tree_at(lambda f: f.states, flight, states)

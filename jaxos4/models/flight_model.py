@@ -18,7 +18,7 @@ from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, ByRecording, OfAirframe, Parameter
 from .os4 import CorrectedOS4
 from .rotors import Batch, Grid, measured_speeds, of_stretches, squared
-from .state import Forcing, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
+from .state import Forcing, Orientation, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
 from .terms import COMMANDS, FULL_SCALE, TERMS, VELOCITY, VOLTAGE, Term, Values, clash, default_terms, required
 
 DEFAULT_TERMS = default_terms(frozenset({COMMANDS}))
@@ -108,6 +108,7 @@ class FlightModel(AbstractModel):
         return found
 
     @property
+    @eqx.filter_jit  # one program instead of a dozen small ones
     def alpha(self) -> Parameters:
         """alpha_1..8 of the airframe, then the centres of the terms' parameters."""
         return jnp.concatenate([self._rigid_body.alpha, self._of_terms(lambda parameter: parameter.center)])
@@ -248,13 +249,13 @@ class FlightModel(AbstractModel):
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
         """See `AbstractModel`. Terms use the measured body velocity, or else that of the state."""
-        t, attitude = state.translation, state.attitude
-        forcing = self._with_velocity(forcing, state)
+        t, orientation = state.translation, None if state.attitude is None else Orientation.of(state.attitude)
+        forcing = self._with_velocity(forcing, t, orientation)
         rates = self.angular_acceleration(state.rates, forcing, parameters)
-        angles = None if attitude is None else attitude_rates(state.rates, attitude)
+        angles = None if orientation is None else attitude_rates(state.rates, orientation)
         translation = None
-        if attitude is not None and t is not None:
-            ax, ay, az = to_earth(attitude, self.specific_force(forcing.thrust, forcing, parameters))
+        if orientation is not None and t is not None:
+            ax, ay, az = to_earth(orientation, self.specific_force(forcing.thrust, forcing, parameters))
             translation = Translation(t.vx, ax, t.vy, ay, t.vz, az - self.airframe.gravity)
         return State(rates, angles, translation)
 
@@ -266,8 +267,10 @@ class FlightModel(AbstractModel):
         states = tuple(jax.tree.leaves(state._replace(rates=rates)))
         if not self.force_axes:
             return states
+        orientation = None if state.attitude is None else Orientation.of(state.attitude)
+        forcing = self._with_velocity(forcing, state.translation, orientation)
         thrust = required(forcing.specific_thrust, "`forcing` must come from `FlightModel.forcing`.")
-        force = self.specific_force(thrust, self._with_velocity(forcing, state), parameters)
+        force = self.specific_force(thrust, forcing, parameters)
         for add, values in self._contributions("accelerometer", parameters, forcing):
             force = add(force, values)
         return (*states, *(force[axis] for axis in self.force_axes))
@@ -312,13 +315,12 @@ class FlightModel(AbstractModel):
 
         return {name: own(values) for name, values in found.items()}
 
-    def _with_velocity(self, forcing: Forcing, state: State) -> Forcing:
-        """Take the body velocity from `state` if a term needs it and it was not measured."""
-        t, attitude = state.translation, state.attitude
+    def _with_velocity(self, forcing: Forcing, t: Translation | None, orientation: Orientation | None) -> Forcing:
+        """Take the body velocity from the state if a term needs it and it was not measured."""
         needed = any(VELOCITY in term.needs for term in self._terms)
-        if not needed or forcing.velocity is not None or attitude is None or t is None:
+        if not needed or forcing.velocity is not None or orientation is None or t is None:
             return forcing
-        return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
+        return forcing._replace(velocity=to_body(orientation, (t.vx, t.vy, t.vz)))
 
 
 def without_recording(name: str) -> str:

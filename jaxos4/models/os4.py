@@ -16,7 +16,7 @@ from .._custom_types import Numeric, Scalar, as_float
 from ..airframe import INVERSES, OS4, Airframe, alpha_from_inertia
 from ..flight import Inputs
 from .abstract import DEFAULT_HALF_WIDTH, PARAMETER_NAMES, AbstractModel, Parameter
-from .state import Attitude, Forcing, Rates, State, Translation, attitude_rates, sines_and_cosines
+from .state import Forcing, Orientation, Rates, State, Translation, attitude_rates
 
 
 class AbstractOS4(AbstractModel):
@@ -25,7 +25,7 @@ class AbstractOS4(AbstractModel):
     gyroscopic_unit: ClassVar[str]
 
     @abc.abstractmethod
-    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+    def acceleration(self, orientation: Orientation, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
         """x'', y'', z'' [m/s^2]."""
 
     @property
@@ -82,10 +82,11 @@ class AbstractOS4(AbstractModel):
         rates = self.angular_acceleration(state.rates, forcing, parameters)
         if state.attitude is None:
             return State(rates)
-        attitude, t = attitude_rates(state.rates, state.attitude), state.translation
+        orientation, t = Orientation.of(state.attitude), state.translation
+        attitude = attitude_rates(state.rates, orientation)
         if t is None:
             return State(rates, attitude)
-        ax, ay, az = self.acceleration(state.attitude, forcing)
+        ax, ay, az = self.acceleration(orientation, forcing)
         return State(rates, attitude, Translation(t.vx, ax, t.vy, ay, t.vz, az))
 
     def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
@@ -119,9 +120,9 @@ class PublishedOS4(AbstractOS4):
             p * q * a7 + a8 * forcing.yaw,
         )
 
-    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+    def acceleration(self, orientation: Orientation, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
         """x'', y'', z'' [m/s^2]: Eqs. (7)-(9)."""
-        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
+        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = orientation
         return (
             (sin_phi * cos_psi - sin_psi * sin_theta * cos_phi) * forcing.thrust,
             (-sin_psi * sin_phi - sin_theta * cos_phi * cos_psi) * forcing.thrust,
@@ -154,9 +155,9 @@ class CorrectedOS4(AbstractOS4):
             p * q * a7 + a8 * forcing.yaw,
         )
 
-    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+    def acceleration(self, orientation: Orientation, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
         """The thrust along the body's z axis, rotated into the earth frame, and gravity."""
-        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
+        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = orientation
         return (
             (cos_psi * sin_theta * cos_phi + sin_psi * sin_phi) * forcing.thrust,
             (sin_psi * sin_theta * cos_phi - cos_psi * sin_phi) * forcing.thrust,

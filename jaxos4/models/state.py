@@ -35,6 +35,22 @@ class Attitude(NamedTuple):
     psi: Scalar
 
 
+class Orientation(NamedTuple):
+    """The sines and cosines of an attitude, which are slow to compute and which several equations use."""
+
+    sin_phi: Samples
+    cos_phi: Samples
+    sin_theta: Samples
+    cos_theta: Samples
+    sin_psi: Samples
+    cos_psi: Samples
+
+    @classmethod
+    def of(cls, attitude: Attitude) -> "Orientation":
+        """The orientation of an attitude."""
+        return cls(*sincos(attitude.phi), *sincos(attitude.theta), *sincos(attitude.psi))
+
+
 class Translation(NamedTuple):
     """Position [m] and velocity [m/s] in the earth frame, z up."""
 
@@ -98,32 +114,26 @@ def stack(state: State) -> Float[Array, "*batch states"]:
     return jnp.stack(jax.tree.leaves(state), axis=-1)
 
 
-def attitude_rates(rates: Rates, attitude: Attitude) -> Attitude:
+def attitude_rates(rates: Rates, orientation: Orientation) -> Attitude:
     """phi', theta', psi' [rad/s] from body rates: Eqs. (4)-(6). Singular at theta = +-90 degrees."""
-    sin_phi, cos_phi = sincos(attitude.phi)
-    sin_theta, cos_theta = sincos(attitude.theta)
+    sin_phi, cos_phi, sin_theta, cos_theta, _, _ = orientation
     yaw = (rates.q * sin_phi + rates.r * cos_phi) / cos_theta
     return Attitude(rates.p + sin_theta * yaw, rates.q * cos_phi - rates.r * sin_phi, yaw)
 
 
-def to_earth(attitude: Attitude, body: Vector) -> Vector:
+def to_earth(orientation: Orientation, body: Vector) -> Vector:
     """A vector from the body's axes to the earth's: R_z(psi) R_y(theta) R_x(phi)."""
-    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = orientation
     x, y, z = body
     y, z = y * cos_phi - z * sin_phi, y * sin_phi + z * cos_phi
     x, z = x * cos_theta + z * sin_theta, -x * sin_theta + z * cos_theta
     return x * cos_psi - y * sin_psi, x * sin_psi + y * cos_psi, z
 
 
-def to_body(attitude: Attitude, earth: Vector) -> Vector:
+def to_body(orientation: Orientation, earth: Vector) -> Vector:
     """A vector from the earth's axes to the body's: the inverse of `to_earth`."""
-    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = orientation
     x, y, z = earth
     x, y = x * cos_psi + y * sin_psi, -x * sin_psi + y * cos_psi
     x, z = x * cos_theta - z * sin_theta, x * sin_theta + z * cos_theta
     return x, y * cos_phi + z * sin_phi, -y * sin_phi + z * cos_phi
-
-
-def sines_and_cosines(attitude: Attitude) -> tuple[Samples, ...]:
-    """The sine and the cosine of phi, theta and psi."""
-    return (*sincos(attitude.phi), *sincos(attitude.theta), *sincos(attitude.psi))

@@ -1,5 +1,6 @@
 """The likelihoods of a flight: from unknowns to a cost with its gradient and information."""
 
+from ..batching import cores as cores, for_threads as for_threads, in_blocks as in_blocks, on_all_cores as on_all_cores
 from .abstract import (
     AbstractProblem as AbstractProblem,
     InitialGuess as InitialGuess,
@@ -11,7 +12,6 @@ from .abstract import (
     Unknowns as Unknowns,
     WindowUnknowns as WindowUnknowns,
 )
-from .batching import cores as cores, for_threads as for_threads, in_blocks as in_blocks, on_all_cores as on_all_cores
 from .innovations import InnovationsProblem as InnovationsProblem
 from .noise_unknowns import NoiseUnknowns as NoiseUnknowns
 from .problem import ShootingProblem as ShootingProblem

@@ -13,15 +13,16 @@ filter compares and estimates:
 See `docs/method/filter_error.md`.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 from jaxtyping import Float, Int
 
 FEEDTHROUGHS = 2
 """The largest number of input innovations of a body rate."""
 _COUNTS = (2, 2, 1)  # about roll, pitch and yaw; a second one of yaw would hide the reaction of the rotors
+# The share of a signal that rounding may have made.
 _ROUNDING = 1e-6
+# The rows of one matrix product: more would not fit the cache, and BLAS would divide so small a product among threads.
+_BLOCK = 2048
 
 
 def input_innovations(
@@ -36,37 +37,78 @@ def input_innovations(
 
     A linear regression on earlier samples of torque and rate about the same axis leaves combinations of the parts of a
     sample, in which most of the rest lies: two about roll and pitch, one about yaw (the second is 0). 0 at the
-    beginning of a stretch.
+    beginning of a stretch. The sign of a combination is arbitrary.
 
     - `torque`: in equal parts of each sample, in any unit. `rates`: measured [rad/s]; NaN counts as 0.
     - `stretch`: the number of the uninterrupted stretch of each sample.
     - `dt`: sample time [s]. `memory`: how far back the past reaches [s], at least three samples.
     """
-    lags = max(round(memory / dt), 3)
-    rows = np.arange(lags, len(torque))
+    lags, (samples, parts) = max(round(memory / dt), 3), torque.shape[:2]
+    found, rows = np.zeros((samples, FEEDTHROUGHS, 3)), np.arange(lags, samples)
     rows = rows[stretch[rows] == stretch[rows - lags]]
-    found = np.zeros((len(torque), FEEDTHROUGHS, 3))
+    if len(rows) <= 1 + lags * (parts + 1):
+        return found
     for axis in range(3):
-        past = np.concatenate(list(_past(torque[:, :, axis], np.nan_to_num(rates[:, axis]), rows, lags)), axis=1)
-        if len(past) <= past.shape[1]:
-            break
-        known = np.linalg.qr(past)[0]
-        rest = torque[rows, :, axis] - known @ (known.T @ torque[rows, :, axis])
-        directions, sizes, _ = np.linalg.svd(rest, full_matrices=False)
-        directions = np.where(sizes > _ROUNDING * torque[:, :, axis].std(), directions, 0.0)
+        series = np.ones((samples, parts + 2))
+        series[:, :parts] = _standard(torque[:, :, axis])
+        series[:, parts] = _standard(np.nan_to_num(rates[:, axis]))
+        rest = _unexplained(series, parts, rows, lags)
+        _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
+        is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
+        scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
         count = _COUNTS[axis]
-        found[rows, :count, axis] = np.sqrt(len(rows)) * directions[:, :count]
+        found[rows, :count, axis] = np.sqrt(len(rows)) * rest @ scaled[:, :count]
     return found
 
 
-def _past(
-    torque: Float[np.ndarray, "samples parts"],
-    rate: Float[np.ndarray, " samples"],
-    rows: Int[np.ndarray, " rows"],
-    lags: int,
-) -> Iterator[Float[np.ndarray, "rows some"]]:
-    scale = torque.std() or 1.0
-    yield np.ones((len(rows), 1))
-    for lag in range(1, lags + 1):
-        yield torque[rows - lag] / scale
-        yield rate[rows - lag, None]
+def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
+    """The columns less their means, in the unit of their standard deviation."""
+    about = columns - columns.mean(axis=0)
+    return about / (about.std() or 1.0)
+
+
+def _unexplained(
+    series: Float[np.ndarray, "samples series"], targets: int, rows: Int[np.ndarray, " rows"], lags: int
+) -> Float[np.ndarray, "rows targets"]:
+    """The first `targets` series at these rows, less a linear regression on the `lags` samples of all series before.
+
+    By normal equations, because the matrix of the regression would not fit into memory. A ridge keeps them regular if
+    series differ by rounding only. The second pass removes what the ridge and the rounding of the first have left.
+    """
+    from scipy.linalg import cho_factor, cho_solve  # slow to import
+
+    rest = series[rows, :targets]
+    starts = np.flatnonzero(np.diff(rows, prepend=-1) > 1)
+    firsts = np.concatenate([np.arange(*ends, _BLOCK) for ends in zip(starts, [*starts[1:], len(rows)], strict=True)])
+    windows = [series[block[0] - lags : block[-1] + 1] for block in np.split(rows, firsts[1:])]
+    blocks = [
+        ([window[lags - lag : -lag] for lag in range(1, lags + 1)], block)
+        for window, block in zip(windows, np.split(rest, firsts[1:]), strict=True)
+    ]
+    products = _lagged_products(windows, lags)
+    products.flat[:: len(products) + 1] += _ROUNDING**2 * len(rows)
+    factor = cho_factor(products)
+    for _ in range(2):
+        common = [sum(past[lag].T @ block for past, block in blocks) for lag in range(lags)]
+        coefficients = np.split(cho_solve(factor, np.concatenate(common)), lags)
+        for past, block in blocks:
+            block -= sum(map(np.matmul, past, coefficients))
+    return rest
+
+
+def _lagged_products(windows: list[Float[np.ndarray, "_ series"]], lags: int) -> Float[np.ndarray, "columns columns"]:
+    """The upper triangle of the normal equations: products of the samples 1 to `lags` before a row, summed over rows.
+
+    A window holds `lags` samples and then its rows. One sample further back in both, the sum is the same but for the
+    edges of the windows.
+    """
+    width, most = windows[0].shape[1], lags - 1
+    products, edges = np.zeros((lags, width, lags, width)), np.zeros((most, width, most, width))
+    for window in windows:
+        for lag in range(lags):
+            products[0, :, lag] += window[most:-1].T @ window[most - lag : -1 - lag]
+        first, last = window[:most][::-1], window[-lags:-1][::-1]
+        edges += np.multiply.outer(first, first) - np.multiply.outer(last, last)
+    for lag in range(most):
+        products[lag + 1, :, 1:] = products[lag, :, :-1] + edges[lag]
+    return products.reshape(lags * width, -1)

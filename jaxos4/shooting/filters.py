@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar
+from ..batching import with_batch
 from ..models.state import Forcing, Rates, State
-from .batching import with_batch
 from .gains import (
     RATE_COUNT,
     Channels,

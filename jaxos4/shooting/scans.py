@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import InitialState, Numeric, Parameters, Scalar
+from ..batching import computed_once, in_blocks, with_batch
 from ..models.state import Forcing, State, Translation, unstack
 from .abstract import LocalModel, Shot
-from .batching import computed_once, with_batch
 from .sparsity import Panel, panels_of, symmetric
 
 # A body rate [rad/s] that no quadrotor reaches and no gyro measures: a faster trajectory has diverged.
@@ -100,6 +100,17 @@ def shoot(
     length: Length = None,
 ) -> Shot:
     """Simulate one window and compare it with the measurements. `weights`: 1 / sigma of each channel."""
+    return in_blocks(_shoot, advance, rows, weights, parameters, initial_state, length)
+
+
+def _shoot(
+    advance: Advance,
+    rows: Rows,
+    weights: tuple[Scalar, ...],
+    parameters: Parameters,
+    initial_state: InitialState,
+    length: Length,
+) -> Shot:
     scalars = tuple(parameters)
 
     def step(carry: tuple[State, Shot], row: Rows) -> tuple[State, Shot]:

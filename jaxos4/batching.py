@@ -30,7 +30,8 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *ar
     """`function(*arguments)`, of which `jax.vmap` computes a batch by `of_batch`.
 
     `of_batch` takes the number of lanes, the arguments that differ between lanes, with the lanes first, and those that
-    they share, each `None` in the place of the other. It returns the results with the lanes first.
+    they share, each `None` in the place of the other. It returns the results with the lanes first. Derivatives are
+    those of `function`, of a batch too.
     """
     arrays, settings = eqx.partition(arguments, eqx.is_array)
 
@@ -45,12 +46,20 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *ar
     def together(lanes: int, many: Any, shared: Any) -> Any:
         return of_batch(lanes, many, eqx.combine(shared, settings))
 
+    @jax.custom_jvp
+    def differentiable(arrays: Any) -> Any:
+        return one(arrays)
+
+    @differentiable.defjvp
+    def derivative(primals: Any, tangents: Any) -> Any:
+        return jax.jvp(lambda arrays: function(*eqx.combine(arrays, settings)), primals, tangents)
+
     @one.def_vmap
     def batch(lanes: int, is_batched: list, arrays: Any) -> tuple[Any, Any]:
         out = together(lanes, *eqx.partition(arrays, is_batched[0]))
         return out, jax.tree.map(lambda _: True, out)
 
-    return one(arrays)
+    return differentiable(arrays)
 
 
 def in_blocks(function: Callable, *arguments: Any) -> Any:
