@@ -104,14 +104,9 @@ def shoot(
 
 
 def _shoot(
-    advance: Advance,
-    rows: Rows,
-    weights: tuple[Scalar, ...],
-    parameters: Parameters,
-    initial_state: InitialState,
-    length: Length,
+    advance: Advance, rows: Rows, weights: tuple[Scalar, ...], at: Parameters, start: InitialState, length: Length
 ) -> Shot:
-    scalars = tuple(parameters)
+    scalars = tuple(at)
 
     def step(carry: tuple[State, Shot], row: Rows) -> tuple[State, Shot]:
         state, shot = carry
@@ -120,7 +115,7 @@ def _shoot(
         return following, Shot(shot.cost + _half_square(_errors(row, predicted, weights, feasible)), feasible)
 
     nothing = Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
-    return _fold(step, (unstack(initial_state), nothing), rows, length)[1]
+    return _fold(step, (unstack(start), nothing), rows, length)[1]
 
 
 def shoot_with_derivatives(
