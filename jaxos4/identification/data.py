@@ -1,7 +1,7 @@
 """`Data`: what is known of flights before a search, with its provenance."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
@@ -85,6 +85,7 @@ class Data(Generic[L]):
     - `provenance`: data, settings and versions. `seconds`: how long the fitted measurements of a vehicle last [s].
     - `held_out`: what is not fitted, if there is anything.
     - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
+    - `vibrates`: the body rates that vibrate, each with its frequency [Hz].
     """
 
     likelihood: L
@@ -95,6 +96,7 @@ class Data(Generic[L]):
     held_out: HeldOut | None = None
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
+    vibrates: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def room(self) -> int:

@@ -8,13 +8,16 @@ from functools import partial
 
 import numpy as np
 
-from ..airframe import AXES, YAW
+from ..airframe import AXES, INERTIAS, YAW
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import decisive_horizon
+from ..estimate import REACH
+from ..models.abstract import AbstractModel
 from ..recording.checks import Finding
 from ..results import meaning, result_names
-from .answers import Answer, drag_error, overwhelmed, thrust_excess
+from .answers import Answer, overwhelmed
 from .data import Data
+from .doubts_of_iz import doubts_of_iz
 from .doubts_of_values import ALL_INERTIAS, PLAUSIBLE, consequences, doubts_of_alphas, doubts_of_values
 from .results import (
     COLOURED,
@@ -26,7 +29,7 @@ from .results import (
     RigidBody,
     SampleTime,
 )
-from .sample_time import moved
+from .sample_time import moved, white_limit
 from .search import Optimum
 from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Doubt, Move, contradiction, refusal, reservation
 
@@ -97,12 +100,12 @@ def doubts_of_vehicle(
         *doubts_of_log(data.findings),
         *few_parts(data.seconds),
         *_doubts_of_weak_axes(weak),
-        *(_doubts_of_drag(answer) if YAW.inertia in constants else ()),
+        *doubts_of_iz(answer, table, constants),
         *doubts_of_values(answer.problem.model, judged, constants, fixed, data.log_step, follow),
         *doubts_of_predictions(skill, still),
-        *_doubts_of_sample_time(answer, sample_times, constants),
+        *_doubts_of_sample_time(data, answer, sample_times, constants),
         *stronger_or_weaker(response, constants),
-        *_doubts_of_search(search, quantities),
+        *(_doubts_of_limits(answer) if search == "at_bound" else _doubts_of_search(search, quantities)),
     ]
 
 
@@ -121,6 +124,16 @@ def _doubts_of_search(search: str, quantities: Iterable[str]) -> Iterator[Doubt]
         yield refusal(search, cause, remedy, dict.fromkeys(quantities))
 
 
+def _doubts_of_limits(answer: Answer) -> Iterator[Doubt]:
+    """Parameters that a search ended at their limit with, and the quantities that depend on them."""
+    model, own, values = answer.problem.model, answer.problem.unknowns, np.asarray(answer.estimate.parameters)
+    off = np.abs(values[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
+    for i in (place for place in answer.free if off[place] > 0.99 * REACH):
+        concerned = dict.fromkeys(model_quantities(model, own.names[i]))
+        cause = f"{own.names[i]} = {values[i]:.3g} {own.units[i]} is at the limit of the search around its bracket"
+        yield refusal("at_bound", cause, "correct the airframe, or give a wider `bracket`", concerned)
+
+
 def _doubts_of_weak_axes(weak: Mapping[str, str]) -> Iterator[Doubt]:
     """Axes on which disturbances are larger than the torque of the rotors; see `overwhelmed`."""
     inertias = {axis.motion: axis.inertia for axis in AXES}
@@ -128,17 +141,16 @@ def _doubts_of_weak_axes(weak: Mapping[str, str]) -> Iterator[Doubt]:
         yield refusal("unidentifiable", why, f"fly more {motion}, or in calmer air", {inertias[motion]: None})
 
 
-def _doubts_of_drag(answer: Answer) -> Iterator[Doubt]:
-    """A ratio of drag to thrust that nobody measured: Iz is proportional to it."""
-    excess, moves = thrust_excess(answer), {YAW.inertia: None}
-    measure = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
-    if answer.problem.model.airframe.guesses_drag:
-        yield refusal("unidentifiable", "`drag_coefficient` is a guess, to which Iz is proportional", measure, moves)
-    elif drag_error(answer):
-        more = "more" if excess > 0 else "less"
-        cause = f"the rotors give {100 * abs(excess):.0f} % {more} thrust than the airframe says, so that the ratio of "
-        said = f"{cause}its drag to its thrust, to which Iz is proportional, may be off as much", measure
-        yield refusal("unidentifiable", *said, moves)
+def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
+    """The quantities that depend on a parameter directly: by what it acts on."""
+    (parameter,) = (each for each in model.parameters if each.name == name)
+    own = tuple(quantity for quantity, names in model.quantities.items() if name in names)
+    if parameter.in_forcing or parameter.scales_torque:
+        return *INERTIAS, *own
+    of_axes = {"roll": ("alpha1", "alpha2", "alpha3"), "pitch": ("alpha4", "alpha5", "alpha6")}
+    of_axes |= {"yaw": ("alpha7", "alpha8", "rotor_reaction")}
+    of_axis = (each.inertia for each in AXES if name in of_axes[each.motion] or name.startswith(each.motion))
+    return *of_axis, *own
 
 
 def few_parts(seconds: float) -> Iterator[Doubt]:
@@ -157,22 +169,30 @@ def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Cons
     for axis, found in zip(AXES, response, strict=True):
         agreement, row = found.agreement(), constants.get(axis.inertia)
         if row is not None and agreement.excludes_one(TOLERANCE.share):
-            share, (low, high) = abs(1 / agreement.ratio - 1), agreement.interval
+            ratio, (low, high) = agreement.ratio, agreement.interval
+            share = max(ratio, 1 / ratio) - 1
             yield reservation(
-                f"from {agreement.low:g} to {agreement.high:g} Hz, {axis.motion} answers the rotors "
-                f"{agreement.ratio:.2f} ({low:.2f} to {high:.2f}) times as strongly as the model",
+                f"from {agreement.low:g} to {agreement.high:g} Hz, the vehicle {axis.motion}s {_compared(ratio)} the "
+                f"model (95 %: {low:.2f} to {high:.2f} times)",
                 f"fly more {axis.motion}, or look at its frequency response for what the model lacks",
                 {axis.inertia: Move(share, share * row.estimate / row.std)},
             )
 
 
+def _compared(ratio: float) -> str:
+    """How strong a motion is that is `ratio` times that of the model."""
+    if 0.5 <= ratio <= 2:
+        return f"{100 * abs(ratio - 1):.0f} % {'more' if ratio > 1 else 'less'} strongly than"
+    return f"{ratio:.2g} times as strongly as"
+
+
 def _doubts_of_sample_time(
-    answer: Answer, sample_times: Sequence[SampleTime], constants: Mapping[str, Constant]
+    data: Data, answer: Answer, sample_times: Sequence[SampleTime], constants: Mapping[str, Constant]
 ) -> Iterator[Doubt]:
     """A gyro that vibrates; an inertia that is another one at the next longer sample time, or else the next shorter."""
     step, steps = float(answer.problem.flight.dt), [each.sample_time for each in sample_times]
     if step not in steps or len(steps) < 2:
-        yield from vibration(answer.disturbances, step)
+        yield from vibration(answer.disturbances, step, vibrates=data.vibrates)
         return
     place = steps.index(step)
     own, other = sample_times[place], sample_times[place + 1 if place + 1 < len(steps) else place - 1]
@@ -181,7 +201,13 @@ def _doubts_of_sample_time(
         name: Move(abs(two.estimate / one.estimate - 1), abs(two.estimate - one.estimate) / max(one.std, two.std))
         for name, one, two in both
     }
-    yield from vibration(answer.disturbances, step, moves)
+    yield from vibration(answer.disturbances, step, moves, data.vibrates)
+    if white_limit(own) < abs(own.correlation) <= PLAUSIBLE.vibration:
+        yield reservation(
+            f"innovations of the body rates correlate by {own.correlation:.2g}, and by more at other sample times",
+            "log faster, or before the filters of the gyro",
+            moves,
+        )
     for name in (each for each in moved(own, other) if each in constants):
         values = [f"{each.constants[name].estimate:.3g} at {1e3 * each.sample_time:.3g} ms" for each in (own, other)]
         yield contradiction(
@@ -192,11 +218,15 @@ def _doubts_of_sample_time(
 
 
 def vibration(
-    disturbances: Mapping[str, Disturbance], sample_time: float, moves: Mapping[str, Move] = {}
+    disturbances: Mapping[str, Disturbance],
+    sample_time: float,
+    moves: Mapping[str, Move] = {},
+    vibrates: Mapping[str, float] = {},
 ) -> Iterator[Doubt]:
-    """A gyro whose noise is not white, usually by vibration: the controller answers it, and filter error is biased.
+    """A gyro whose noise is not white: the controller answers it, and filter error is biased.
 
     **Arguments:** `sample_time`: of the fitted data [s]. `moves`: of the moments of inertia to another sample time.
+    `vibrates`: the rates that vibrate, each with its frequency [Hz].
     """
     longer = f"average to longer samples by `sample_time` {2 * sample_time:g}, or " * (
         2 * sample_time <= PLAUSIBLE.longest_sample
@@ -204,9 +234,11 @@ def vibration(
     for axis in AXES:
         row = disturbances.get(axis.rate)
         if row is not None and abs(row.correlation) > PLAUSIBLE.vibration:
+            frequency = vibrates.get(axis.rate)
+            why = "the model lacks an effect, or the gyro vibrates"
             yield contradiction(
                 f"the noise of {axis.rate} is not white (innovations correlate by {row.correlation:.2g}): "
-                "the gyro vibrates",
+                f"{why if frequency is None else f'the gyro vibrates at {frequency:.0f} Hz'}",
                 f"{longer}damp the vibration, or log faster",
                 {axis.inertia: moves.get(axis.inertia)},
             )

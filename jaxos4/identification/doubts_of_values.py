@@ -14,7 +14,7 @@ from .answers import Answer
 from .results import Constant, ParameterEstimate, RigidBody
 from .search import Optimum, deviations
 from .uncertainty import PROFILE
-from .verdict import RIGID_BODY, TOLERANCE, Doubt, Move, Moves, contradiction, refusal
+from .verdict import RIGID_BODY, TOLERANCE, Doubt, Move, Moves, contradiction, refusal, reservation
 
 Estimated = Mapping[str, tuple[float, float]]
 """Value and standard deviation of each parameter that has an estimate."""
@@ -102,6 +102,26 @@ def doubts_of_values(
         yield from _impossible_inertias(constants, model.airframe)
     yield from _turns(estimated, stds, model.airframe)
     yield from _unseen(estimated, log_step, follow)
+    yield from _odd_motors(model, parameters, wrong, follow)
+
+
+def _odd_motors(
+    model: AbstractModel,
+    parameters: Mapping[str, ParameterEstimate],
+    wrong: Mapping[Parameter, Doubt],
+    follow: Consequences,
+) -> Iterator[Doubt]:
+    """Parameters of the motors outside their brackets: what is unusual of a motor may be a fault of the model."""
+    for parameter in (each for each in model.parameters if each.in_forcing and each not in wrong):
+        row = parameters.get(parameter.name)
+        if row is not None and row.is_outside_bracket and row.estimate is not None and isinstance(row.bracket, tuple):
+            usual = float(np.clip(row.estimate, *row.bracket))
+            yield reservation(
+                f"{parameter.name} = {row.estimate:.2g} is unusual (expected: {row.bracket[0]:.2g} to "
+                f"{row.bracket[1]:.2g})",
+                "log rotor speeds, or the battery's voltage at 10 Hz or more",
+                follow(parameter.name, usual),
+            )
 
 
 def contradicted(
@@ -219,7 +239,7 @@ def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) 
         if name in couplings:
             variance[i] = stds[name] ** 2 + PLAUSIBLE.coupling**2
         elif name in inverses:  # the others need the inertia of the rotors too
-            variance[i] = stds[name] ** 2
+            variance[i] = np.inf if name == YAW.inverse and airframe.guesses_drag else stds[name] ** 2
     p_value, without_yaw = (_p_value(model, alpha, variance, unknown) for unknown in ([], [YAW.place]))
     if p_value < TOLERANCE.consistent:
         yield contradiction(

@@ -1,11 +1,12 @@
 """The quantities that get a verdict: of a vehicle, and of an OS4."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ..airframe import AXES, YAW
 from ..models.abstract import PARAMETER_NAMES
+from ..models.terms import SAG
 from ..results import NINETY_FIVE
 from .answers import Answer
 from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
@@ -34,14 +35,27 @@ def vehicle_quantities(
             half, condition = NINETY_FIVE * row.std, f", {row.note}" if row.note else ""
             value = f"{row.estimate:.4g} +- {half:.2g} {row.unit} (95 %){condition}"
             notes = _notes(answer, {alpha: table[alpha]}, shares)
-            found[axis.inertia] = Quantity(value, half / row.estimate, reservations=notes)
+            remedy = f"fly more {axis.motion}, or longer"
+            if shares.get(SAG, 0.0) > TOLERANCE.prior:
+                remedy = f"log rotor speeds, or the battery's voltage at 10 Hz or more, or {remedy}"
+            found[axis.inertia] = Quantity(value, half / row.estimate, reservations=notes, remedy=remedy)
     for quantity, names in model.quantities.items():
         unseen = [name for name in names if name in answer.fixed and answer.fixed[name].note == PRIOR_NOTE]
         which = f"the flights say less about {', '.join(unseen)} than the bracket; fly with more motion"
         rows = {name: table[name] for name in names if name in table}
         reservations = ((which,) if unseen else ()) + _notes(answer, rows, shares)
-        found[quantity] = Quantity("", 0.0, "" if rows else which, reservations)
+        wide = tuple(_too_wide(rows, dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))))
+        missing = which if not rows else "; ".join(wide) if len(wide) == len(rows) else ""
+        axes = {axis.inertia for axis in AXES for name in names if name.startswith(axis.motion) and axis != YAW}
+        found[quantity] = Quantity("", 0.0, missing, (*reservations, *wide), requires=tuple(sorted(axes)))
     return found | {PREDICTIONS: prediction_horizons(skill, still)}
+
+
+def _too_wide(rows: dict[str, ParameterEstimate], half_widths: dict[str, float]) -> Iterator[str]:
+    """The parameters whose 95 % intervals are wider than their brackets."""
+    for name, row in rows.items():
+        if row.std is not None and NINETY_FIVE * row.std > half_widths[name]:
+            yield f"{name} is known to +-{NINETY_FIVE * row.std:.2g} {row.unit} only; fly with more motion"
 
 
 def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:

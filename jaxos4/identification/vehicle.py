@@ -18,9 +18,10 @@ from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
 from ..logs import Recording
 from ..models.flight_model import FlightModel
-from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
+from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
 from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
+from ..recording.voltage import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import input_innovations
 from .answers import Solution
@@ -159,6 +160,10 @@ def _data(
     if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
         value, error = prepared.level  # the flight says how the accelerometer errs along z
         bracket = {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
+    if voltage is not None and SAG in model.parameter_names and not isinstance(bracket, Bracket):
+        unseen = max(map(unseen_sag, recordings))  # a logged voltage contains the rest
+        center, half_width = (float(each[model.parameter_names.index(SAG)]) for each in (model.alpha, model.half_width))
+        bracket = {SAG: [unseen * (center - half_width), unseen * (center + half_width)], **(bracket or {})}
     if airframe.guesses_drag and not isinstance(bracket, Bracket):
         name, center = YAW.inverse, 1 / float(airframe.inertia[2])
         bracket = {name: [-GUESS_REACH * center, (2 + GUESS_REACH) * center], **(bracket or {})}
@@ -193,6 +198,7 @@ def _data(
         held_out=held_out,
         findings=prepared.findings,
         log_step=prepared.log_step,
+        vibrates=prepared.vibrates,
         clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),
     )
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..airframe import AXES, INERTIAS
+from ..airframe import INERTIAS
 
 IDENTIFIED = "identified"
 RESERVED = "identified with a reservation"
@@ -32,8 +32,9 @@ class Tolerance(msgspec.Struct, frozen=True):
     """Limits of a verdict: the change that a doubt may cause, and the accuracy that is needed.
 
     - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, unless it is a mere
-      `reservation`; by more than one of them makes a reservation, by less is a note. Errors of discretisation reach
-      3 %, and an interval allows for one standard deviation. Moves of reservations add up; see `judge`.
+      `reservation` that moves it by less than its own size; by more than one of them makes a reservation, by less is a
+      note. Errors of discretisation reach 3 %, and an interval allows for one standard deviation. Moves of reservations
+      add up; see `judge`.
     - `vague`, `unknown`: half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a
       reservation, or is not identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
     - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
@@ -103,7 +104,8 @@ class Doubt(msgspec.Struct, frozen=True):
             return IDENTIFIED
         if (move := self.moves[name]) is None:
             return self.severity
-        worst = RESERVED if self.severity == RESERVED else CONTRADICTED
+        # Nobody can use a value that may be off by more than itself.
+        worst = RESERVED if self.severity == RESERVED and move.share <= 1 else CONTRADICTED
         return (IDENTIFIED, RESERVED, worst)[move.limits_exceeded(tolerance)]
 
 
@@ -146,12 +148,16 @@ class Quantity(NamedTuple):
     - `value`: see `Verdict`. `spread`: half of its 95 % interval, as a share of it; 0 if it can be 0.
     - `missing`: why there is no estimate, and what to do; empty if there is one.
     - `reservations`: caveats that are not doubts.
+    - `remedy`: what to do if the interval is too long.
+    - `requires`: the quantities without which it cannot be trusted either.
     """
 
     value: str = ""
     spread: float = 0.0
     missing: str = ""
     reservations: tuple[str, ...] = ()
+    remedy: str = "fly more, or longer"
+    requires: tuple[str, ...] = ()
 
 
 class Judgement(NamedTuple):
@@ -181,19 +187,24 @@ def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt], tolerance
         for place, status in enumerate(_statuses_left(doubts, name, tolerance)):
             causes[status].append(_reason(doubts[place], name))
             # A reservation that contradicts together with another decides nothing by itself.
-            if status not in _TRUSTED and doubts[place].severity != RESERVED:
-                refusals[name].append((place, doubts[place].result))
+            if status not in _TRUSTED and doubts[place].status_left(name, tolerance) not in _TRUSTED:
+                is_reservation = doubts[place].severity == RESERVED
+                refusals[name].append((place, "implausible" if is_reservation else doubts[place].result))
         causes[RESERVED] += quantity.reservations
         if quantity.missing and not causes[MISSING]:
             causes[MISSING].append(quantity.missing)
-        motion = next((axis.motion for axis in AXES if axis.inertia == name), "motion")
-        known = f"it is known to {100 * quantity.spread:.0f} % only; fly more {motion}, or longer"
+        known = f"it is known to {100 * quantity.spread:.0f} % only; {quantity.remedy}"
         if quantity.spread > tolerance.unknown:
             causes[MISSING].append(known)
         elif quantity.spread > tolerance.vague:
             causes[RESERVED].append(known)
         status = next((each for each in STATUSES[:0:-1] if causes[each]), IDENTIFIED)
         verdicts[name] = Verdict(status, quantity.value, tuple(causes[status]) if status != IDENTIFIED else ())
+    for name, quantity in quantities.items():
+        lacking = [each for each in quantity.requires if each in verdicts and not verdicts[each].trusted]
+        if lacking and verdicts[name].trusted:
+            why = f"it cannot be trusted without {' and '.join(lacking)}"
+            verdicts[name] = Verdict(MISSING, quantity.value, (why,))
     return Judgement(verdicts, refusals)
 
 

@@ -33,6 +33,8 @@ _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
 VERTICAL_BIAS = _FORCE_BIASES[2]
 """The parameter that is the constant error of the accelerometer along z."""
+SAG = "battery_sag"
+"""The parameter that is the share of the battery's voltage that the load of hover takes."""
 
 T = TypeVar("T")
 Values = Mapping[str, Float[Array, "..."]]
@@ -137,7 +139,7 @@ _BENT = f"is not between 0 (thrust linear in the command) and {STEEPEST:g}: no m
 _CLIMB = "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`"
 _GROWS = "is negative: no inflow makes thrust grow with the velocity along z"
 _CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, and fly climbs and descents"))
-_SPARSE = "1/s is more than rotors give (1): motors were logged too rarely", "log on board, faster, or rotor speeds"
+_SPARSE = "1/s is more than rotors give (1)", "log motors at 100 Hz or more, on board; else the model lacks an effect"
 _DAMPED = _limits((-_INF, 2.5, *_SPARSE))
 _OFF = "m/s^2: a levelled accelerometer is off by less than 0.6, so the thrust does not match the weight"
 _LEVEL = _limits((-0.6, 0.6, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
@@ -170,7 +172,7 @@ def _scaled(share: Callable[[Values, Grid], Float[Array, " samples"]]) -> Callab
 
 def _drive(omega: RotorSpeeds, values: Values, batch: Batch, airframe: Airframe) -> Speeds:
     full = jnp.asarray(airframe.max_rotor_speed)
-    lag, curve, braking, sag = (values[p] for p in ("rotor_lag", "thrust_curve", "motor_braking", "battery_sag"))
+    lag, curve, braking, sag = (values[p] for p in ("rotor_lag", "thrust_curve", "motor_braking", SAG))
     return driven(omega, Motor(lag, curve, braking, full, sag, jnp.asarray(airframe.hover_speed)), batch)
 
 
@@ -247,7 +249,7 @@ _OWN: dict[str, Term] = {
             Parameter("thrust_curve", "1", 0.1, center=0.85, contradiction=_limits((0.0, STEEPEST, _BENT, _CLIMB))),
             Parameter("motor_braking", "1", 0.6, center=0.5, nonnegative=True, plain=1.0),
             # Lithium cells have 8 to 30 mOhm Ah, and vehicles hover at 7 to 10 C: 2 to 6 % of 3.8 V.
-            Parameter("battery_sag", "1", 0.04, center=0.04, nonnegative=True),
+            Parameter(SAG, "1", 0.04, center=0.04, nonnegative=True),
         ),
         # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),

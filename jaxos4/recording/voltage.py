@@ -1,0 +1,31 @@
+"""How much of a battery's sag under load a logged voltage shows."""
+
+import math
+
+import numpy as np
+
+from ..logs import Recording
+
+_MANOEUVRE = 0.2  # s; the load of the rotors changes within about this time
+_SAG = 0.04  # the share of the voltage that a load takes: a coarser voltage does not show it
+_LEAST = 0.1  # even a voltage in each row is measured before or after the load, and with noise
+
+
+def unseen_sag(recording: Recording) -> float:
+    """The share of the sag that the logged voltage does not show, 0 to 1: by its rate and by its resolution.
+
+    A voltage that is logged slowly is held or interpolated between its measurements; both are counted by the changes of
+    its slope.
+    """
+    voltage = recording.voltage
+    if voltage is None or voltage.size < 3:
+        return 1.0
+    steps, usual = np.diff(voltage), float(np.median(np.abs(voltage)))
+    changes = np.abs(np.diff(steps)) > 1e-9 * usual
+    is_held = np.count_nonzero(steps) <= np.count_nonzero(changes) / 2 + 1
+    measured = np.count_nonzero(steps if is_held else changes)
+    if not measured:
+        return 1.0
+    period = float(recording.time[-1] - recording.time[0]) / measured
+    resolution = float(np.abs(steps[steps != 0]).min()) / usual
+    return float(np.clip(max(1 - math.exp(-period / _MANOEUVRE), resolution / _SAG), _LEAST, 1.0))
