@@ -40,21 +40,26 @@ def in_loop(rng, *, pilot):
     return torque, rates
 
 
+def of_axes(torque, rates, stretch, dt=DT, count=FEEDTHROUGHS):
+    """The input innovations about the three axes."""
+    each = (input_innovations(torque[:, :, i], rates[:, i], stretch, dt, count) for i in range(3))
+    return np.stack([*each], axis=-1)
+
+
 def test_a_torque_that_follows_from_the_past_has_no_innovation(rng):
     torque, rates = in_loop(rng, pilot=0.0)
-    assert not input_innovations(torque, rates, np.zeros(SAMPLES, int), DT).any()
+    assert not of_axes(torque, rates, np.zeros(SAMPLES, int)).any()
 
 
 def test_innovations_are_what_the_past_does_not_tell(rng):
     """They have a mean square of 1 and no correlation with the past, and hold most of what the pilot did."""
     torque, rates = in_loop(rng, pilot=1.0)
-    found = input_innovations(torque, rates, np.zeros(SAMPLES, int), DT)
+    found = of_axes(torque, rates, np.zeros(SAMPLES, int))
     assert found.shape == (SAMPLES, FEEDTHROUGHS, 3)
     assert not found[:10].any()
-    assert not found[:, 1, 2].any()  # one about yaw
-    for axis, count in enumerate((2, 2, 1)):
-        own = found[10:, :count, axis]
-        np.testing.assert_allclose(own.T @ own / len(own), np.eye(count), atol=1e-9)
+    for axis in range(3):
+        own = found[10:, :, axis]
+        np.testing.assert_allclose(own.T @ own / len(own), np.eye(FEEDTHROUGHS), atol=1e-9)
         for lag in range(1, 11):
             past = np.column_stack([torque[10 - lag : SAMPLES - lag, :, axis], rates[10 - lag : SAMPLES - lag, axis]])
             np.testing.assert_allclose(own.T @ past / len(own), 0.0, atol=1e-9)
@@ -69,7 +74,7 @@ def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng):
     """By the whole matrix of the regression. One stretch is too short for a row."""
     torque, rates = in_loop(rng, pilot=1.0)
     stretch = np.repeat([0, 1, 2], [250, 8, SAMPLES - 258])
-    found, lags = input_innovations(torque, rates, stretch, DT), 10
+    found, lags = of_axes(torque, rates, stretch), 10
     rows = np.concatenate([np.arange(lags, 250), np.arange(258 + lags, SAMPLES)])
     assert not np.delete(found, rows, axis=0).any()
     for axis in range(3):
@@ -87,7 +92,7 @@ def test_the_rounding_of_the_log_changes_no_innovation(rng, parts):
     torque, rates = in_loop(rng, pilot=1.0)
     torque, rates = torque[:, parts], np.zeros_like(rates)
     rounded = torque + 1e-11 * rng.normal(size=torque.shape)
-    found, again = (input_innovations(x, rates, np.zeros(SAMPLES, int), DT) for x in (torque, rounded))
+    found, again = (of_axes(x, rates, np.zeros(SAMPLES, int)) for x in (torque, rounded))
     assert found[10:].any(axis=(1, 2)).all()
     assert_same_directions(again, found, atol=1e-6)
 
@@ -98,7 +103,7 @@ def test_an_hour_of_samples_of_4_ms_needs_less_than_200_megabytes(rng):
     data = rng.normal(size=(samples, 4, 3)), rng.normal(size=(samples, 3)), np.zeros(samples, int)
     tracemalloc.start()
     try:
-        assert input_innovations(*data, dt=0.004)[25:].any(axis=(1, 2)).all()
+        assert of_axes(*data, 0.004)[25:].any(axis=(1, 2)).all()
         assert tracemalloc.get_traced_memory()[1] < 200e6 * samples / hour
     finally:
         tracemalloc.stop()
@@ -107,18 +112,18 @@ def test_an_hour_of_samples_of_4_ms_needs_less_than_200_megabytes(rng):
 def test_a_stretch_is_not_told_by_the_stretch_before(rng):
     torque, rates = in_loop(rng, pilot=1.0)
     stretch = np.repeat([0, 1], SAMPLES // 2)
-    found = input_innovations(torque, rates, stretch, DT)
+    found = of_axes(torque, rates, stretch)
     begins = SAMPLES // 2 + np.arange(10)
     assert not found[begins].any()
     torque[: SAMPLES // 2], rates[: SAMPLES // 2] = 0.0, 0.0
-    alone = input_innovations(torque[SAMPLES // 2 :], rates[SAMPLES // 2 :], stretch[SAMPLES // 2 :], DT)
+    alone = of_axes(torque[SAMPLES // 2 :], rates[SAMPLES // 2 :], stretch[SAMPLES // 2 :])
     assert alone[10:].any(axis=(1, 2)).all()
 
 
 @pytest.mark.parametrize("samples", [3, 12])
 def test_a_flight_that_is_too_short_has_none(rng, samples):
     torque, rates = in_loop(rng, pilot=1.0)
-    assert not input_innovations(torque[:samples], rates[:samples], np.zeros(samples, int), DT).any()
+    assert not of_axes(torque[:samples], rates[:samples], np.zeros(samples, int)).any()
 
 
 def standard(rng, *, passed, segments=2):

@@ -53,14 +53,17 @@ def search_sample_times(
 ) -> list[Optimum]:
     """The optimum at each sample time.
 
-    The search for all parameters starts at the answer of the sample time before, if that is a minimum.
+    The search for all parameters starts at the answer of the sample time before, if that is a minimum. It starts anew
+    where feedthroughs end: with commands, they hide nearly all that is compared, and the answer is far off.
 
     **Arguments:** `several`: one flight at several sample times, each twice the one before.
     """
     optimum, optima = None, []
     for data in reversed(several):
         progress(f"fitting samples of {1e3 * float(data.problem.flight.dt):.3g} ms")
-        start = None if optimum is None else start_of(data.likelihood, optimum.first)
+        start, own = None, data.likelihood
+        if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
+            start = start_of(own, optimum.first)
         optimum = search(estimator, data.likelihood, start=start)
         optima.insert(0, optimum)
     return optima

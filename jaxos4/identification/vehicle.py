@@ -15,7 +15,7 @@ from ..bracket import Bracket
 from ..errors import InputError, TrainingError, shortened
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
-from ..flight import Flight
+from ..flight import CHANNEL_NAMES, Flight
 from ..logs import Recording
 from ..models.flight_model import FlightModel
 from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
@@ -23,7 +23,7 @@ from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.voltage import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from ..shooting.feedthrough import input_innovations
+from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, input_innovations
 from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
@@ -252,16 +252,23 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     )
 
 
-def _input_innovations(shooting: ShootingProblem, capacity: int) -> Float[np.ndarray, "samples feedthroughs 3"] | None:
-    """Those of a flight that is padded to `capacity` samples."""
-    flight = shooting.flight
+def _input_innovations(
+    shooting: ShootingProblem, capacity: int
+) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
+    """Those of the body rates and of the vertical force, of a flight that is padded to `capacity` samples."""
+    flight, columns = shooting.flight, shooting.columns
     if flight.within is None:
         return None
     samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
-    torque = np.square(np.asarray(flight.within)) @ mixer[:3].T
+    inputs = np.square(np.asarray(flight.within)) @ mixer.T
     stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
-    found = input_innovations(torque, shooting.recorded()[:, :3], stretch, float(flight.dt))
-    return np.pad(found, ((0, capacity - samples), (0, 0), (0, 0)))
+    measured, found = shooting.recorded(), np.zeros((capacity, FEEDTHROUGHS, columns.size))
+    for channel, column in enumerate(columns):
+        axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
+        if axis is not None:
+            own = input_innovations(inputs[:, :, axis], measured[:, channel], stretch, float(flight.dt), COUNTS[axis])
+            found[:samples, : COUNTS[axis], channel] = own
+    return found
 
 
 def _held_out(

@@ -194,7 +194,7 @@ def _add_force_bias(force: Vector, values: Values) -> Vector:
 
 
 # Small vehicles have 0.02 to 0.1 s. A time constant of less than -0.002 s is neither chance nor rounding.
-_LAG = Parameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-0.002, _INF, _LATE, _CLOCKS)))
+_LAG = Parameter("rotor_lag", "s", 0.025, center=0.035, contradiction=_limits((-0.002, _INF, _LATE, _CLOCKS)))
 
 _OWN: dict[str, Term] = {
     "offset": Term(
@@ -266,7 +266,7 @@ _OWN: dict[str, Term] = {
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
         # A delay of the motors, and an offset between the clocks of motors and gyro, of either sign.
-        (Parameter("rotor_delay", "s", 0.03),),
+        (Parameter("rotor_delay", "s", 0.02, center=0.005),),
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
         quantity="motors",
     ),

@@ -18,7 +18,8 @@ from jaxtyping import Float, Int
 
 FEEDTHROUGHS = 2
 """The largest number of input innovations of a body rate."""
-_COUNTS = (2, 2, 1)  # about roll, pitch and yaw; a second one of yaw would hide the reaction of the rotors
+COUNTS = (2, 2, 1, 1)
+"""Those of roll, pitch, yaw and thrust. A second one of yaw would hide the reaction of the rotors."""
 # The share of a signal that rounding may have made.
 _ROUNDING = 1e-6
 # The rows of one matrix product: more would not fit the cache, and BLAS would divide so small a product among threads.
@@ -26,38 +27,37 @@ _BLOCK = 2048
 
 
 def input_innovations(
-    torque: Float[np.ndarray, "samples parts 3"],
-    rates: Float[np.ndarray, "samples 3"],
+    inputs: Float[np.ndarray, "samples parts"],
+    measured: Float[np.ndarray, " samples"],
     stretch: Int[np.ndarray, " samples"],
     dt: float,
+    count: int,
     *,
     memory: float = 0.1,
-) -> Float[np.ndarray, "samples feedthroughs 3"]:
-    """The part of the torque within each sample that the past does not tell, about each axis, of mean square 1.
+) -> Float[np.ndarray, "samples count"]:
+    """The part of the torque or thrust within each sample that the past does not tell, of mean square 1.
 
-    A linear regression on earlier samples of torque and rate about the same axis leaves combinations of the parts of a
-    sample, in which most of the rest lies: two about roll and pitch, one about yaw (the second is 0). 0 at the
-    beginning of a stretch. The sign of a combination is arbitrary.
+    A linear regression on earlier samples of the input and of what is measured of its motion leaves `count`
+    combinations of the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch. The sign of a
+    combination is arbitrary.
 
-    - `torque`: in equal parts of each sample, in any unit. `rates`: measured [rad/s]; NaN counts as 0.
+    - `inputs`: in equal parts of each sample, in any unit. `measured`: the rate or specific force; NaN counts as 0.
     - `stretch`: the number of the uninterrupted stretch of each sample.
     - `dt`: sample time [s]. `memory`: how far back the past reaches [s], at least three samples.
     """
-    lags, (samples, parts) = max(round(memory / dt), 3), torque.shape[:2]
-    found, rows = np.zeros((samples, FEEDTHROUGHS, 3)), np.arange(lags, samples)
+    lags, (samples, parts) = max(round(memory / dt), 3), inputs.shape
+    found, rows = np.zeros((samples, count)), np.arange(lags, samples)
     rows = rows[stretch[rows] == stretch[rows - lags]]
     if len(rows) <= 1 + lags * (parts + 1):
         return found
-    for axis in range(3):
-        series = np.ones((samples, parts + 2))
-        series[:, :parts] = _standard(torque[:, :, axis])
-        series[:, parts] = _standard(np.nan_to_num(rates[:, axis]))
-        rest = _unexplained(series, parts, rows, lags)
-        _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
-        is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
-        scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
-        count = _COUNTS[axis]
-        found[rows, :count, axis] = np.sqrt(len(rows)) * rest @ scaled[:, :count]
+    series = np.ones((samples, parts + 2))
+    series[:, :parts] = _standard(inputs)
+    series[:, parts] = _standard(np.nan_to_num(measured))
+    rest = _unexplained(series, parts, rows, lags)
+    _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
+    is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
+    scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
+    found[rows] = np.sqrt(len(rows)) * rest @ scaled[:, :count]
     return found
 
 

@@ -53,9 +53,9 @@ class InnovationsProblem(AbstractProblem):
       and equal room share a program.
     - `settling`: after this many samples a filter has settled. The first innovations of a segment do not count.
     - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
-    - `input_innovations`: of each body rate, what the past does not tell of its torque within a sample, see
+    - `input_innovations`: of each channel, what the past does not tell of its torque or thrust within a sample, see
       `jaxos4.shooting.feedthrough`; by default nothing: the controller knows no more than the log.
-    - `answers_within`: whether the controller answers a measurement within its sample; otherwise feedthroughs are 0.
+    - `answers_within`: whether the controller answers a rate within its sample; otherwise feedthroughs are 0.
     - `noise_feedthrough`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default:
       not known, so that a search has two stages. The first finds them, the second counts them.
     - `noise_unknowns`: how the noise is looked for.
@@ -65,7 +65,7 @@ class InnovationsProblem(AbstractProblem):
     problem: ShootingProblem
     start: Values = eqx.field(converter=as_float)
     least_noise: Float[Array, " channels"] = eqx.field(converter=as_float)
-    input_innovations: Float[Array, "samples feedthroughs 3"] = eqx.field(converter=as_float)
+    input_innovations: Float[Array, "samples feedthroughs channels"] = eqx.field(converter=as_float)
     noise_feedthrough: Float[Array, "channels feedthroughs"] = eqx.field(converter=as_float)
     answers_within: Bool[Array, ""]
     segments: int = eqx.field(static=True)
@@ -80,7 +80,7 @@ class InnovationsProblem(AbstractProblem):
         settling: int = SETTLING,
         start: Float[ArrayLike, " unknowns"] | None = None,
         least_noise: Float[ArrayLike, " channels"] | None = None,
-        input_innovations: Float[ArrayLike, "samples feedthroughs 3"] | None = None,
+        input_innovations: Float[ArrayLike, "samples feedthroughs channels"] | None = None,
         noise_feedthrough: Float[ArrayLike, "channels feedthroughs"] | None = None,
         answers_within: Bool[ArrayLike, ""] = True,
         noise_unknowns: NoiseUnknowns | None = None,
@@ -96,10 +96,12 @@ class InnovationsProblem(AbstractProblem):
             raise ValueError(f"`segments` must be more than the {len(each.places)} recordings, got {segments}.")
         # An array in any case, so that all starts share one program.
         channels, samples = self.problem.columns.size, problem.flight.time.shape[-1]
-        self.input_innovations = as_float(np.zeros((samples, 0, 3)) if input_innovations is None else input_innovations)
-        if self.input_innovations.shape[::2] != (samples, 3):
+        nothing = np.zeros((samples, 0, channels))
+        self.input_innovations = as_float(nothing if input_innovations is None else input_innovations)
+        if self.input_innovations.shape[::2] != (samples, channels):
             raise ValueError(
-                f"`input_innovations` must have shape ({samples}, feedthroughs, 3), got {self.input_innovations.shape}."
+                f"`input_innovations` must have shape ({samples}, feedthroughs, {channels}), "
+                f"got {self.input_innovations.shape}."
             )
         unknown = np.full((channels, self.input_innovations.shape[1]), np.nan)
         self.noise_feedthrough = as_float(unknown if noise_feedthrough is None else noise_feedthrough)
@@ -295,7 +297,6 @@ class InnovationsProblem(AbstractProblem):
             places = jnp.asarray(each.places)[self.segmentation.recording].T
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
-        inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, problem.columns.size - inputs.shape[2]), (0, 0)))
         fixed = self.segmentation.rows, self.flight.dt, self.window
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 

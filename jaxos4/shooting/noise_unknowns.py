@@ -94,7 +94,7 @@ class NoiseUnknowns(NamedTuple):
             jnp.pad(x, ((0, 0), (0, 3 * feedthroughs)), constant_values=value)
             for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf), (free, True))
         )
-        free = free.at[:, free.shape[1] - feedthroughs :].set(answers_within)
+        free = free.at[:, free.shape[1] - feedthroughs :].set(answers_within & rate)
         names = tuple(each.format(name) for name in channels for each in own_names(count, feedthroughs))
         precision = jnp.full(first.size, self.precision)
         return Unknowns(
