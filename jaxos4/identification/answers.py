@@ -16,8 +16,10 @@ from ..bracket import is_identifiable
 from ..estimate import Estimate
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.abstract import PARAMETER_NAMES
+from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
 from ..models.state import CASCADE_ORDER
+from ..models.terms import COMMANDS, TERMS
 from ..shooting import ShootingProblem
 from .data import Data
 from .results import (
@@ -217,6 +219,9 @@ def drag_error(answer: Answer) -> float:
     """The standard deviation of the ratio of drag to thrust, as a share, by what is known of the airframe."""
     if answer.problem.model.airframe.guesses_drag:
         return TABLES.guessed_drag
+    model = answer.problem.model
+    if isinstance(model, FlightModel) and any(COMMANDS in TERMS[term].needs for term in model.terms):
+        return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
     excess = abs(thrust_excess(answer))
     return excess if excess > TABLES.other_thrust else 0.0
 

@@ -38,8 +38,8 @@ def input_innovations(
     """The part of the torque or thrust within each sample that the past does not tell, of mean square 1.
 
     A linear regression on earlier samples of the input and of what is measured of its motion leaves `count`
-    combinations of the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch. The sign of a
-    combination is arbitrary.
+    combinations of the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch. The sign
+    of a combination is arbitrary.
 
     - `inputs`: in equal parts of each sample, in any unit. `measured`: the rate or specific force; NaN counts as 0.
     - `stretch`: the number of the uninterrupted stretch of each sample.
