@@ -200,7 +200,9 @@ def masked(draw, shape, limits):
 def flights(draw):
     n = draw(st.integers(2, 12))
     time = draw(st.floats(-1e4, 1e4)) + draw(st.floats(1e-3, 0.02)) * np.arange(n)
-    omega = draw(hnp.arrays(float, (n, 4), elements=st.floats(0, 1e5)))
+    # A rotor turns, or stands still: a single 0 counts as not measured.
+    omega = draw(hnp.arrays(float, (n, 4), elements=st.floats(0, 1e5, exclude_min=True)))
+    omega *= draw(hnp.arrays(bool, 4))
     states = masked(draw, (n, 12), [LIMITS.get(name, 1e6) for name in STATE_NAMES])
     states[draw(st.integers(0, n - 1)), draw(st.integers(0, 11))] = 0.1
     force = masked(draw, (n, 3), 1e3) if draw(st.booleans()) else None

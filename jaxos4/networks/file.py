@@ -16,7 +16,7 @@ import numpy as np
 from .._custom_types import as_float
 from .._files import BROKEN, check_plain, write_file
 from .._version import __version__
-from ..airframe import Airframe, airframe_from_table
+from ..airframe import airframe_from_table, airframe_table
 from ..bracket import Bracket
 from ..errors import InputError, in_words, named
 from ..flight import Flight
@@ -51,8 +51,9 @@ def encode_network(network: TrainedNetwork) -> bytes:
         "windows": problem.windows,
         "checks": network.history.shape[0],
     }
-    airframe = problem.model.airframe
-    arrays = {f"airframe.{f.name}": getattr(airframe, f.name) for f in dataclasses.fields(airframe)}
+    constants = airframe_table(problem.model.airframe)
+    header["guessed"] = constants.pop("guessed", [])
+    arrays = {f"airframe.{name}": value for name, value in constants.items()}
     arrays |= {name: getattr(problem.flight, name) for name in ("time", "omega", "states")}
     arrays["sigma"] = problem.sigma
     if problem.initial_state is not None:
@@ -96,9 +97,9 @@ def _restore(place: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     if settings.depth > len(arrays) or largest > max(map(np.size, arrays.values())):
         raise ValueError("its layers are not those of its settings")
     with named(place):
-        constants = {f.name: arrays.get(f"airframe.{f.name}") for f in dataclasses.fields(Airframe)}
-        # Files of earlier versions lack constants that have a default.
-        airframe = airframe_from_table({name: value for name, value in constants.items() if value is not None})
+        # Files of earlier versions lack what has a default.
+        constants = {name.removeprefix("airframe."): value for name, value in arrays.items() if "airframe." in name}
+        airframe = airframe_from_table(constants | {"guessed": header.get("guessed", [])})
     problem = ShootingProblem(
         MODELS[header["model"]](airframe),
         Flight(arrays["time"], arrays["omega"], arrays["states"]),

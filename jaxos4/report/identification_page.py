@@ -14,7 +14,7 @@ from ..errors import printable
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification
-from ..identification.verdict import RIGID_BODY, headline, statuses_of
+from ..identification.verdict import headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from .html import draw, render
 from .identification_figures import (
@@ -29,7 +29,7 @@ from .identification_figures import (
 )
 from .identification_signals import BAND, identified_signals
 from .style import drawing, styles
-from .terminal import quantity_rows, warning_lines
+from .terminal import quantity_rows, warning_lines, why_no_value
 from .text import DASH, plain
 
 # The page shows these entries of the provenance in a place of their own.
@@ -92,11 +92,14 @@ def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
     every, rows = physical_quantities(found), []
     for row, cells, note in zip(every, *quantity_rows(every), strict=True):
         own = found.parameters.get(row.name.replace(" ", "_"))
-        small = row.judged == RIGID_BODY and abs(row.value) <= NINETY_FIVE * row.std
-        said = dict.fromkeys([note, "" if own is None else own.note, "below noise" if small else ""])
-        shown = (row.name, DASH, *cells[2:]) if small else cells  # a J_R of -3 kg m^2 would be read as a value
-        rows.append((shown, "; ".join(filter(None, said))))
+        said = dict.fromkeys([note, "" if own is None else own.note])
+        rows.append((cells, "; ".join(filter(None, said))))
     listed = {cells[0] for cells, _ in rows}
+    for name, row in {} if found.is_vehicle else found.rigid_body.constants.items():
+        if name not in listed:  # a J_R of -3 kg m^2 would be read as a value
+            half = NINETY_FIVE * row.std
+            interval = f"{row.estimate - half:.4g} to {row.estimate + half:.4g}"
+            rows.append(((name, DASH, interval, row.unit), why_no_value(row)))
     for name in INERTIAS:
         if name in found.verdicts and name not in listed:
             rows.append(((name, DASH, "", "kg m^2"), found.verdicts[name].status))

@@ -11,7 +11,7 @@ from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities, possible
-from ..identification.results import COLOURED, Identification
+from ..identification.results import COLOURED, Constant, Identification
 from ..identification.verdict import (
     CONTRADICTED,
     IDENTIFIED,
@@ -175,12 +175,17 @@ def _fit(found: Identification) -> Section:
         yield f"residuals {property_}, tests at {100 * _SIGNIFICANCE:.0f} %: {answer}."
 
 
+def why_no_value(row: Constant) -> str:
+    """Why a constant of a rigid body is not among the physical quantities."""
+    return "below noise" if abs(row.estimate) <= NINETY_FIVE * row.std else "impossible"
+
+
 def _inertias(found: Identification) -> Section:
     body = found.rigid_body
     inertias = [
         f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
         if name in possible(body)
-        else f"{name} {'below noise' if abs(row.estimate) <= NINETY_FIVE * row.std else 'impossible'}"
+        else f"{name} {why_no_value(row)}"
         for name, row in body.constants.items()
     ]
     verdict = ""
