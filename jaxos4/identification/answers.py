@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import Parameters
-from ..airframe import AXES, INERTIAS, INVERSES, MOTIONS, YAW
+from ..airframe import AXES, INERTIAS, INVERSES, MOTIONS, YAW, Airframe
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.evaluation import Evaluation
 from ..analysis.inertia import fit_inertia
@@ -215,10 +215,14 @@ def thrust_excess(answer: Answer) -> float:
 
 def drag_error(answer: Answer) -> float:
     """The standard deviation of the ratio of drag to thrust, as a share, by what is known of the airframe."""
-    if answer.problem.model.airframe.guesses_drag:
+    return ratio_error(answer.problem.model.airframe, thrust_excess(answer))
+
+
+def ratio_error(airframe: Airframe, excess: float) -> float:
+    """The same of an airframe. `excess`: by which share the thrust exceeds the airframe's."""
+    if airframe.guesses_drag:
         return TABLES.guessed_drag
-    excess = abs(thrust_excess(answer))
-    return excess if excess > TABLES.other_thrust else 0.0
+    return abs(excess) if abs(excess) > TABLES.other_thrust else 0.0
 
 
 def vehicle_constants(answer: Answer) -> RigidBody:
