@@ -109,7 +109,8 @@ def spread_of(
 
 def _guessed_constants(airframe: Airframe, values: Mapping[str, float]) -> tuple[dict[str, float], float]:
     """Standard deviations of constants of the airframe that are guesses, as shares, and how far its thrust is off."""
-    excess = abs(values.get(GAIN, 1.0) - 1)
+    # With commands, a full speed that is wrong makes thrust and drag wrong by the same factor.
+    excess = 0.0 if "rotor_lag" in values else abs(values.get(GAIN, 1.0) - 1)
     shares = {DRAG: ratio_error(airframe, excess)}
     if REACTION not in values:
         shares[ROTOR_INERTIA] = _GUESS * (ROTOR_INERTIA in airframe.guessed)

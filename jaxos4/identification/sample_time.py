@@ -82,7 +82,7 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `rows`: the shortest sample time first."""
     answered = [i for i, row in enumerate(rows) if row.constants] or [0]
     longer = dict(itertools.pairwise(answered))
-    clean = [i for i in answered if abs(rows[i].correlation) <= white_limit(rows[i])]
+    clean = [i for i in answered if is_white(rows[i])]
     clean = clean or [min(answered, key=lambda i: abs(rows[i].correlation))]
     return next((i for i in clean[:-1] if _agree(rows[i], rows[longer[i]])), clean[0])
 
@@ -90,6 +90,11 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
 def white_limit(row: SampleTime) -> float:
     """The largest correlation of innovations that are nearly white."""
     return RULE.white + RULE.chance / math.sqrt(max(row.samples, 1))
+
+
+def is_white(row: SampleTime) -> bool:
+    """Whether innovations are nearly white."""
+    return abs(row.correlation) <= white_limit(row)
 
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:

@@ -72,7 +72,7 @@ class NoiseUnknowns(NamedTuple):
         told: Bool[Array, "channels feedthroughs"],
         answers_within: Bool[Array, ""],
     ) -> Unknowns:
-        """The parameters, then noise, gains and feedthroughs of each channel, in brackets from differences of measurements.
+        """The parameters, then noise, gains and feedthroughs of each channel, in brackets from the measurements.
 
         `told`: which input innovations a channel has. `answers_within`: see `InnovationsProblem`.
         """
