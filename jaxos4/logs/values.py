@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..flight import CHANNEL_NAMES, FORCE_NAMES
+from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
 from .sampling import filled
 from .table import COMMAND_NAMES, SPEED_NAMES, Recording, Table
 
@@ -137,10 +137,11 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
 
     A rotor's measured speed is taken out if it is `dropped`, too.
     """
-    channels, omega = recording.channels.copy(), recording.omega.copy()
-    impossible, clipped = {}, {}
-    names = (*CHANNEL_NAMES, *(f"rotor {i + 1}" for i in range(4)))
-    for name, column in zip(names, (*channels.T, *omega.T), strict=True):
+    sensed = () if recording.specific_force is None else recording.specific_force.T
+    impossible, clipped, cleaned = {}, {}, {}
+    names = (*CHANNEL_NAMES[: len(STATE_NAMES) + len(sensed)], *(f"rotor {i + 1}" for i in range(4)))
+    for name, logged in zip(names, (*recording.states.T, *sensed, *recording.omega.T), strict=True):
+        column = logged.copy()  # one at a time: a long log has 400 MB
         wrong = _isolated(column, rules)
         if name.startswith("rotor") and not recording.commanded:
             wrong |= dropped(recording.time, column)
@@ -148,20 +149,24 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
             worst = column[wrong][np.argmax(np.abs(column[wrong]))]
             impossible[name] = int(wrong.sum()), float(worst)
             column[wrong] = np.nan
-        if name not in ("p", "q", "r", *FORCE_NAMES):
-            continue
         known = np.count_nonzero(np.isfinite(column))
-        for sign in (1.0, -1.0):
+        for sign in (1.0, -1.0) if name in ("p", "q", "r", *FORCE_NAMES) else ():
             stuck = _stuck(sign * column, rules)
             if stuck.any():
                 end, number = float(column[stuck][0]), int(stuck.sum())
                 count, share, before = clipped.get(name, (0, 0.0, end))
                 clipped[name] = count + number, share + number / known, max(before, end, key=abs)
                 column[stuck] = np.nan
+        if name in impossible or name in clipped:
+            cleaned[name] = column
     if not impossible and not clipped:
         return Plausible(recording, {}, {})
-    force = None if recording.specific_force is None else channels[:, 12:]
-    clean = recording._replace(omega=filled(omega), states=channels[:, :12], specific_force=force)
+    omega, states, force = recording.omega.copy(), recording.states.copy(), recording.specific_force
+    force = None if force is None else force.copy()
+    channels = zip(names, (*states.T, *(() if force is None else force.T), *omega.T), strict=True)
+    for name, channel in channels:
+        channel[:] = cleaned.get(name, channel)
+    clean = recording._replace(omega=filled(omega), states=states, specific_force=force)
     return Plausible(clean, impossible, clipped)
 
 
