@@ -84,6 +84,7 @@ class VehicleCase:
         solver, is_default = FilterError(tolerance=LIKELIHOODS.tolerance), self.estimator == DEFAULT
         compared = self.data if is_default or len(self.data) > 1 else ()
         optima = search_sample_times(compared, solver, progress=progress)
+        progress("computing intervals")
         answers = [corrected(x, data) for x, data in zip(optima, compared, strict=True)]
         rows = [sample_time_of(answer) for answer in answers]
         place = chosen_place(rows) if self.choose and rows else 0
@@ -100,6 +101,7 @@ class VehicleCase:
 
     def check(self, solution: Solution, progress: Progress) -> Checked:
         """The estimate of each quantity, and the doubts about it."""
+        progress("checking the answer")
         return check_vehicle(*solution, progress)
 
 
