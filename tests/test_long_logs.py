@@ -1,16 +1,20 @@
 """Logs with more samples than a fit takes in a minute: the parts that tell the most are fitted, and a note says so."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
 
 from jaxos4.flight import RATES
+from jaxos4.logs.values import plausible
 from jaxos4.recording import Recording, richest
 from jaxos4.recording.checks import Evidence
 from jaxos4.recording.inspection import inspect_log
 from jaxos4.recording.prepared import finest, prepare
 from jaxos4.recording.richest import fair_share
 from jaxos4.recording.stretches import Stretch
+from jaxos4.report.log_page import logged, spectra
 
 DT, HOVER = 0.01, float(CRAZYFLIE.hover_speed)
 ROLL, PITCH, YAW = np.sign(np.asarray(CRAZYFLIE.mixer)[:3])
@@ -104,3 +108,19 @@ def test_each_of_many_logs_is_fitted(two_minutes):
     ready = prepare(logs, CRAZYFLIE, sample_time=DT, holdout=0.0)[0]
     assert {*ready.recordings} == {*range(30)}
     assert ready.fitted.time.shape[0] <= richest.MOST
+
+
+@pytest.mark.parametrize("what", ["values", "signals", "spectra"])
+def test_a_page_of_a_long_log_takes_less_memory_than_the_log(what):
+    long = log(2000, manoeuvres=MANOEUVRES)
+    found = inspect_log(log(20))
+    make = {
+        "values": lambda: plausible(long),
+        "signals": lambda: logged(long, found),
+        "spectra": lambda: spectra([long], None),
+    }[what]
+    tracemalloc.start()
+    make()
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < sum(x.nbytes for x in (long.time, long.omega, long.states, long.specific_force))

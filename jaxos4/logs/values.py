@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
+from ..flight import FORCE_NAMES, STATE_NAMES
 from .sampling import filled
 from .table import COMMAND_NAMES, SPEED_NAMES, Recording, Table
 
@@ -137,11 +137,12 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
 
     A rotor's measured speed is taken out if it is `dropped`, too.
     """
-    sensed = () if recording.specific_force is None else recording.specific_force.T
     impossible, clipped, cleaned = {}, {}, {}
-    names = (*CHANNEL_NAMES[: len(STATE_NAMES) + len(sensed)], *(f"rotor {i + 1}" for i in range(4)))
-    for name, logged in zip(names, (*recording.states.T, *sensed, *recording.omega.T), strict=True):
-        column = logged.copy()  # one at a time: a long log has 400 MB
+    states = [(name, "states", i) for i, name in enumerate(STATE_NAMES)]
+    force = [(name, "specific_force", i) for i, name in enumerate(FORCE_NAMES) if recording.specific_force is not None]
+    for name, field, place in [*states, *force, *((f"rotor {i + 1}", "omega", i) for i in range(4))]:
+        logged = getattr(recording, field)
+        column = logged[:, place].copy()  # one at a time: a long log has 400 MB
         wrong = _isolated(column, rules)
         if name.startswith("rotor") and not recording.commanded:
             wrong |= dropped(recording.time, column)
@@ -158,16 +159,10 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
                 clipped[name] = count + number, share + number / known, max(before, end, key=abs)
                 column[stuck] = np.nan
         if name in impossible or name in clipped:
-            cleaned[name] = column
-    if not impossible and not clipped:
-        return Plausible(recording, {}, {})
-    omega, states, force = recording.omega.copy(), recording.states.copy(), recording.specific_force
-    force = None if force is None else force.copy()
-    channels = zip(names, (*states.T, *(() if force is None else force.T), *omega.T), strict=True)
-    for name, channel in channels:
-        channel[:] = cleaned.get(name, channel)
-    clean = recording._replace(omega=filled(omega), states=states, specific_force=force)
-    return Plausible(clean, impossible, clipped)
+            if field not in cleaned:
+                cleaned[field] = logged.copy()
+            cleaned[field][:, place] = filled(column) if field == "omega" else column
+    return Plausible(recording._replace(**cleaned), impossible, clipped)
 
 
 def _isolated(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:

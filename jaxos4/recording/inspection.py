@@ -73,14 +73,12 @@ class Inspection(msgspec.Struct, frozen=True):
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
     """Describe a log that was read with this airframe and `full_scale=1.0`. Without one, torques are unknown."""
     seconds = fair_share([recording], finest(recording.dt))
-    evidence, flown, parts = Evidence(recording, airframe, seconds=seconds), [], []
+    evidence, parts = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
-        if not stretch.reason:
-            flown.append(cut(evidence.plausible.recording, stretch))
-        excited = {} if stretch.reason else excitation(flown[-1], airframe)
+        excited = {} if stretch.reason else excitation(cut(evidence.plausible.recording, stretch), airframe)
         parts.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
-    nothing = "" if flown else f"{nothing_usable(evidence.every)}; give the log of a flight"
-    opposite = {} if airframe is None else opposite_axes(flown, airframe)
+    nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
+    opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))
     refusals = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
