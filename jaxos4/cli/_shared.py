@@ -10,6 +10,8 @@ import secrets
 import shlex
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -56,9 +58,42 @@ def option_names(**files: Path | None) -> Iterator[None]:
         raise InputError(in_options(str(error), **files)) from None
 
 
+PERIOD = 10.0  # s; between lines of progress
+
+
+def stages(first: str, total: int | None = None) -> contextlib.AbstractContextManager[Callable[..., None]]:
+    """Shows a stage, the time, and how much of a `total` is done. Yields a function that changes them.
+
+    A terminal has one status, which moves; another stderr gets a line from time to time.
+    """
+    is_terminal = sys.stderr is not None and sys.stderr.isatty()
+    return (_status if is_terminal else _lines)(first, total)
+
+
 @contextlib.contextmanager
-def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """Shows a stage, the time, and a bar if there is a `total`, on a terminal. Yields a function that changes them."""
+def _lines(first: str, total: int | None) -> Iterator[Callable[..., None]]:
+    now, begin, ended = [first, None], time.monotonic(), threading.Event()
+
+    def tell() -> None:
+        while not ended.wait(PERIOD):
+            stage, done = now
+            share = f" ({done} of {total})" if total and done is not None else ""
+            with contextlib.suppress(OSError, ValueError, AttributeError):  # a stderr that is closed, or `None`
+                sys.stderr.write(f"jaxos4: {stage}{share}, {time.monotonic() - begin:.0f} s\n")
+                sys.stderr.flush()
+
+    def change(stage: str, done: int | None = None) -> None:
+        now[:] = stage, done
+
+    threading.Thread(target=tell, daemon=True).start()
+    try:
+        yield change
+    finally:
+        ended.set()
+
+
+@contextlib.contextmanager
+def _status(first: str, total: int | None) -> Iterator[Callable[..., None]]:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -72,7 +107,7 @@ def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]
     console = Console(stderr=True)
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total else ()
     columns = (SpinnerColumn(), "{task.description}", TimeElapsedColumn(), *columns)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(first, total=total)
         yield lambda stage, done=None: bar.update(task, description=stage, completed=done)
 

@@ -59,8 +59,9 @@ def search_sample_times(
     **Arguments:** `several`: one flight at several sample times, each twice the one before.
     """
     optimum, optima = None, []
-    for data in reversed(several):
-        progress(f"fitting samples of {1e3 * float(data.problem.flight.dt):.3g} ms")
+    for number, data in enumerate(reversed(several), start=1):
+        step = 1e3 * float(data.problem.flight.dt)
+        progress(f"fitting samples of {step:.3g} ms ({number} of {len(several)} sample times)")
         start, own = None, data.likelihood
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
             start = start_of(own, optimum.first)

@@ -100,6 +100,7 @@ class VehicleCase:
 
     def check(self, solution: Solution, progress: Progress) -> Checked:
         """The estimate of each quantity, and the doubts about it."""
+        progress("checking the answer")
         return check_vehicle(*solution, progress)
 
 
@@ -119,6 +120,7 @@ def fit_sample_times(
             break
         found = search_sample_times(some, solver, progress=progress)
         optima += found
+        progress("computing intervals")
         rows += [sample_time_of(corrected(x, data)) for x, data in zip(found, some, strict=True)]
     return optima, rows
 
