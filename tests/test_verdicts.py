@@ -255,7 +255,7 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
         assert abs(row.estimate - truth) < 3 * row.std
     assert vehicle.verdicts["Iz"].status == MISSING
     known = vehicle_constants(solution.answer._replace(fixed={})).constants["Iz"]
-    assert known.note == "if mass and the drag coefficient 7.5e-07 are right"
+    assert known.note == "if mass and the ratio of drag to thrust, 0.024 m, are right"
     assert "fly more yaw" in vehicle.verdicts["Iz"].reasons[0]
     assert "s ahead" in vehicle.verdicts["predictions"].value
     written = vehicle.to_dict()

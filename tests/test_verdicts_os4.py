@@ -48,8 +48,9 @@ def test_alphas_of_no_rigid_body_contradict_the_rigid_body_alone(number):
     z = [(row.estimate - truth) / row.std for row, truth in zip(found.parameters.values(), alpha, strict=True)]
     assert np.abs(z).max() < 3.5
     assert np.mean(np.abs(z) < 1.96) >= 7 / 8
-    lines = found.summary(width=200).splitlines()
-    assert lines[0].startswith("identified: alpha1; ")
+    lines = found.summary(width=1000).splitlines()
+    assert lines[0].startswith("alpha1, ")
+    assert lines[0].endswith(": identified.")
     assert ": successful," in lines[-1]
 
 
@@ -73,7 +74,9 @@ def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels)
     assert found.result == "implausible"
     assert {verdict.status for verdict in found.verdicts.values()} == {CONTRADICTED}
     # The first line says what the last one says.
-    assert found.summary(width=200).splitlines()[0].startswith("contradicted: alpha1")
+    first, *_ = found.summary(width=200).splitlines()
+    assert first.startswith("alpha1, ")
+    assert first.endswith(", rigid body: refused (contradicted).")
 
 
 def alpha_table(**alphas):
@@ -134,6 +137,8 @@ def test_an_alpha_that_is_not_excited_does_not_refuse_the_others():
     refused = {name for name, verdict in found.verdicts.items() if not verdict.trusted}
     assert refused == {"alpha1", "alpha4", "alpha7"}
     assert found.verdicts["alpha3"].status == IDENTIFIED
-    first, second, *_ = found.summary(width=200).splitlines()
-    assert first == "not identified: alpha1; alpha4; alpha7."
-    assert second.startswith("identified with a reservation: ")
+    assert found.summary(width=200).splitlines()[:3] == [
+        "alpha3, alpha6, alpha8, rigid body: identified.",
+        "alpha2, alpha5: use with care.",
+        "alpha1, alpha4, alpha7: refused (not identified).",
+    ]
