@@ -20,25 +20,36 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # Also in a container that sets PYTHONDONTWRITEBYTECODE: to compile the checked modules and the tests takes 3 s.
 sys.dont_write_bytecode = False
-# Before the first import of jaxos4: all its annotated functions and modules are checked. The two files that decode a
-# log number by number have no arrays, and the checks would take four times as long as the decoding.
-PACKAGE = pathlib.Path(__file__).resolve().parents[1] / "jaxos4"
-UNCHECKED = ("__init__", "blackbox_frames")
-modules = [path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("*.py") if path.stem not in UNCHECKED]
-jaxtyping.install_import_hook([".".join(module.with_suffix("").parts) for module in modules], "typechecker.check")
-
 # Tests compile for longer than they compute: XLA hardly optimises their programs, which then compile in a third of the
 # time, and compute three to five times as long. The other cores have workers, so a program is compiled in one part.
 QUICK = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*os.environ.get("XLA_FLAGS", "").split(), *QUICK]))
-import jaxos4  # noqa: E402, F401 - which adds its own
-
 jax.config.update("jax_disable_most_optimizations", True)
+# Files of the package whose annotations are not checked. The one that decodes a log number by number has no arrays, and
+# the checks would take four times as long as the decoding.
+UNCHECKED = ("__init__", "blackbox_frames")
+PROCESSES = 8  # at most: a worker holds up to 2 GB
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Checks shapes and types of all annotated functions and modules, except in the daily loop: they cost 60 %."""
+    if config.option.markexpr != "not slow":
+        package = pathlib.Path(__file__).resolve().parents[1] / "jaxos4"
+        modules = [path.relative_to(package.parent) for path in package.rglob("*.py") if path.stem not in UNCHECKED]
+        jaxtyping.install_import_hook([".".join(each.with_suffix("").parts) for each in modules], "typechecker.check")
+    import jaxos4  # noqa: F401 - after the hook; adds its own XLA flags
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A worker for each core; none for files that are named, which begin sooner without."""
+    return 0 if config.option.file_or_dir else min(os.cpu_count() or 1, PROCESSES)
+
+
+@pytest.hookimpl(tryfirst=True)  # before slow tests are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests start first, so that the workers end together."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}

@@ -19,8 +19,6 @@ from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.noise import NOISES
 from jaxos4.simulation import METHODS
 
-pytestmark = pytest.mark.slow
-
 PLATFORMS = "cuda", "tpu"
 LANES = 37  # more than a block of a CPU, and no other test's: JAX keeps what it has traced
 STATES, KEYS = np.zeros((LANES, len(OMEGA), 12)), jax.random.split(jax.random.key(0), LANES)
@@ -91,6 +89,7 @@ PROGRAMS += [(noisy, kind) for kind in NOISES]
 PROGRAMS += [(simulated, method) for method in sorted(METHODS.keys() - {"diffrax"})]  # diffrax calls the host
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("program", "of"), PROGRAMS)
 def test_a_batch_needs_no_library_and_no_host(foreign, program, of):
     one, *lanes = program(of)

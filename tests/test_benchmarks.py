@@ -11,10 +11,11 @@ from experiments.benchmarks.opponents import c_fit, c_shots
 from experiments.benchmarks.opponents.c_library import FAST, compiled, compiler
 from experiments.benchmarks.opponents.residuals import Residuals
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
+pytestmark = pytest.mark.usefixtures("optimised")
 in_c = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
 
+@pytest.mark.slow
 def test_benchmarks(monkeypatch, tmp_path):
     for name, value in how_we_compile().items():
         monkeypatch.setenv(name, value)
@@ -53,6 +54,7 @@ def test_a_benchmark_skips_who_is_missing_or_fails_and_times_only_who_reaches_th
     assert list(run.reached(case, answers).values()) == [1.0, 0.5, 1.0, 0.0]
 
 
+@pytest.mark.slow
 @in_c
 def test_opponents_in_c_leave_the_arithmetic_of_the_process_alone():
     """A library that is linked with `-ffast-math` would round this quotient to 0 from now on."""

@@ -15,8 +15,6 @@ from scipy.spatial.transform import Rotation
 import jaxos4
 from jaxos4.closed_loop import fly_standard
 
-pytestmark = pytest.mark.slow
-
 NO_GAINS = {"attitude_gain": 0.0, "rate_gain": 0.0, "integral_gain": 0.0}
 VEHICLES = {"crazyflie": CRAZYFLIE, "os4": jaxos4.OS4}
 every_vehicle = pytest.mark.parametrize("airframe", VEHICLES.values(), ids=VEHICLES)
@@ -219,6 +217,7 @@ EVERY_EFFECT = jaxos4.ClosedLoop(
 )
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_loop_and_a_failure_stays_in_its_lane():
     """Two vehicles, one with all effects, one that pitches over, one whose rates grow without bound."""
     whole = {"air": jaxos4.Air(), "sensors": jaxos4.Sensors()}

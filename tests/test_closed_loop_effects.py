@@ -14,8 +14,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 
-pytestmark = pytest.mark.slow
-
 TIME, RANDOM = DT * np.arange(SAMPLES), np.asarray(references())
 GRAVITY, HOVER = float(CRAZYFLIE.gravity), float(CRAZYFLIE.hover_speed)
 
@@ -133,6 +131,7 @@ def test_the_controller_can_have_a_gyro_of_its_own():
     np.testing.assert_allclose(filtered / white, np.sqrt(np.square(impulse).sum()), rtol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("logged", ["commands", "speeds"])
 def test_a_fast_controller_is_a_fast_log_of_which_some_rows_are_kept(logged):
     sensors = {"gyro_vibration": 0.05, "gyro_filter": 0.002, "clock_offset": 0.0023, "controller_gyro_noise": None}

@@ -18,7 +18,7 @@ from jaxos4.design.task import CRITERIA, criterion_of
 from jaxos4.study import load_study
 from jaxos4.study.cell import setup_of
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("all_optimised")]
+pytestmark = pytest.mark.usefixtures("all_optimised")
 
 MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
@@ -86,6 +86,7 @@ def geometric_mean(bounds):
     return np.exp(np.log(bounds).mean())
 
 
+@pytest.mark.slow
 def test_the_bounds_are_those_of_an_independent_fisher_information(speeds):
     for one in (speeds.designed, speeds.standard["multisine"]):
         np.testing.assert_allclose(one.bounds, numpy_bounds(one.inputs), rtol=1e-3)
@@ -103,6 +104,7 @@ def test_a_designed_input_tells_more_than_the_standard_inputs(speeds):
     assert own < 0.5 * min(geometric_mean(one.bounds) for one in speeds.standard.values())
 
 
+@pytest.mark.slow
 def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(speeds):
     others, designed, limits = drawn(BRACKET, jax.random.key(77), speeds.task.vehicles), speeds.designed, speeds.task
     states = fly_finely(MODEL, others, jnp.asarray(designed.inputs), jnp.asarray(DT, float))
@@ -111,6 +113,7 @@ def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(speed
     assert 0.9 < max(designed.uses.values()) <= 1
 
 
+@pytest.mark.slow
 def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, command, run, tmp_path):
     out, _ = command("design_input", speeds, BRACKET, OPEN_SETTINGS, "--initial-state", "known", "--duration", "2")
     for words in ("x multisine", "x chirp", "of 200 vehicles", "fly it"):
@@ -132,6 +135,7 @@ def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, comma
 # References.
 
 
+@pytest.mark.slow
 def test_designed_references_tell_twice_as_much_as_3211(references):
     """With the same length and no larger values; the bounds are standard deviations."""
     found = references
@@ -144,12 +148,14 @@ def test_designed_references_tell_twice_as_much_as_3211(references):
     np.testing.assert_allclose(found.designed.inputs[period:], found.designed.inputs[:-period], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_how_the_sensors_are_mounted_changes_no_references(references):
     mounted = eqx.tree_at(lambda loop: loop.airframe.sensor_rotation, LOOP, np.array([10.0, -5.0, 45.0]))
     found = design.design_references(mounted, bracket=LOOP_BRACKET, **LOOP_SETTINGS, key=0)
     np.testing.assert_array_equal(found.designed.inputs, references.designed.inputs)
 
 
+@pytest.mark.slow
 def test_other_vehicles_in_other_gusts_keep_the_limits(references):
     """The limits of rates and angles are mostly used by gusts, whose largest value is random."""
     assert max(references.designed.uses.values()) <= 1
@@ -159,6 +165,7 @@ def test_other_vehicles_in_other_gusts_keep_the_limits(references):
     assert max(uses[name] for name in ("angle", "rate")) < 1.15
 
 
+@pytest.mark.slow
 def test_the_bounds_are_those_of_filter_error(references):
     """The bounds of an identified flight, whose filters know neither the noise nor the parameters."""
     designed = references.designed
@@ -174,6 +181,7 @@ def test_the_bounds_are_those_of_filter_error(references):
     assert np.abs(errors / designed.bounds[:3]).max() < 4
 
 
+@pytest.mark.slow
 def test_repeated_references_add_the_same_information(references):
     """Half of the flight without references leaves half of what they add: bounds fall with the root of the duration."""
     fleet, designed = references.task.fleet, references.designed
@@ -191,6 +199,7 @@ def test_repeated_references_add_the_same_information(references):
     np.testing.assert_allclose(designed.shortest(designed.bounds[:3] / 2), 4 * LOOP_SECONDS, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_command_writes_references_that_simulate_flies(references, command, run, tmp_path):
     out, loop = command("design_references", references, LOOP_BRACKET, LOOP_SETTINGS, *CLOSED, "--duration", "4")
     for words in ("x 3211", "of 64 vehicles", "known to 5 %: Ix after"):

@@ -13,8 +13,6 @@ import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
 from jaxos4.estimators import ESTIMATORS, make_estimator
 
-pytestmark = pytest.mark.slow
-
 MODEL, P = jaxos4.PublishedOS4(), jaxos4.STATE_NAMES.index("p")
 NAMES = [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
 
@@ -38,6 +36,7 @@ def test_tiny_noise_gives_the_truth(name):
     assert (np.abs(estimates.parameters - MODEL.alpha) < most).all()
 
 
+@pytest.mark.slow
 def test_loop_jit_and_vmap_agree(name):
     batched, (problem, states, _, lower, upper) = found_by(name), lanes(noisy_states(count_of(name), seed=50))
     assert set(names(batched)) == {"successful"}
@@ -51,6 +50,7 @@ def test_loop_jit_and_vmap_agree(name):
         assert (names(alone), int(alone.rollouts)) == (names(batched)[lane], int(batched.rollouts[lane]))
 
 
+@pytest.mark.slow
 def test_failing_lanes_leave_their_neighbours_alone(name):
     problem, *arrays = lanes(noisy_states(count_of(name), seed=50))
     states, omega, lower, upper = (np.array(x) for x in arrays)
@@ -88,6 +88,7 @@ def test_failing_lanes_leave_their_neighbours_alone(name):
         np.testing.assert_allclose(broken.std[6], HALF)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "svsf"])
 def test_missing_samples_only_cost_precision(name):
     """Three of ten measurements are lost, and the covariance still describes the errors."""
@@ -97,6 +98,7 @@ def test_missing_samples_only_cost_precision(name):
     assert_chi_square(np.asarray(estimates.parameters - MODEL.alpha), np.linalg.inv(estimates.covariance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "free"),
     [*((name, False) for name in NAMES), *((name, True) for name in ("svsf", "equation-error", "rls"))],
@@ -107,6 +109,7 @@ def test_no_estimator_invents_numbers_for_doublets(name, free):
         assert_nothing_invented(make_estimator(name), *doublet_problem(only_roll=only_roll, free=free))
 
 
+@pytest.mark.slow
 def test_output_error_is_the_minimum_that_another_minimiser_finds():
     problem = standard_problem(channels="rates", states=noisy_states(1, seed=4)[0])
     found = jaxos4.OutputError()(problem, jaxos4.Bracket.default(problem.model))
@@ -125,6 +128,7 @@ def test_output_error_is_the_minimum_that_another_minimiser_finds():
     assert off(early.parameters) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["output-error", "equation-error", "rls"])
 def test_a_truth_far_from_the_bracket_is_reported(name):
     problem = standard_problem(channels="rates", free=True)

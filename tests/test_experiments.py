@@ -13,7 +13,7 @@ from experiments import shared
 from experiments.published import RECORDER, read
 from jaxos4.study import load_study, metrics, read_results
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]  # they compute for longer than they compile
+pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 
 
@@ -45,6 +45,7 @@ def run(tmp_path):
     return results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*STUDIES, *OTHERS])
 def test_configurations(name):
     """The full configuration is valid, and no smaller than the small one."""
@@ -53,6 +54,7 @@ def test_configurations(name):
     assert (EXPERIMENTS / name / "run.py").exists() == (name not in STUDIES)
 
 
+@pytest.mark.slow
 def test_comparison_noise_study_and_scale(tmp_path):
     """One study of IBSS and equation error against the noise, and the figures of three experiments."""
     shared.run_studies({"out": load_study(small("comparison"))}, tmp_path)
@@ -73,6 +75,7 @@ def test_comparison_noise_study_and_scale(tmp_path):
     assert (accuracy.sel(scale=10.0, estimator="ibss") < accuracy.sel(scale=10.0, estimator="equation-error")).all()
 
 
+@pytest.mark.slow
 def test_noise_kinds(tmp_path):
     shared.run_studies({"out": load_study(small("noise_kinds"))}, tmp_path)
     plot(tmp_path, "noise_kinds", results="out")
@@ -95,6 +98,7 @@ def test_frontier(run):
     assert (frontier.sel(parameter="alpha7") == 0).all()
 
 
+@pytest.mark.slow
 def test_rollout_budget(run):
     data = shared.load_results(run("rollout_budget", limits=[1, 10])).squeeze()
     reached, (few, enough) = load("rollout_budget", "plot").accuracy(data), data["rollouts"].mean("flight").T
@@ -104,6 +108,7 @@ def test_rollout_budget(run):
     assert near(reached.isel(limit=1), 1, 0.2)  # both minimise the same cost
 
 
+@pytest.mark.slow
 def test_published_corrected(run):
     data = shared.load_results(run("published_corrected")).squeeze()
     rms, rejected = (data["error"] ** 2).mean("flight") ** 0.5, (data["white_p"] < 0.01).mean("flight")
@@ -121,6 +126,7 @@ def test_published_corrected(run):
     assert rms.sel(alien).sel(parameter=wrong).min() > 10 > 2 > rms.sel(alien).drop_sel(parameter=wrong).max()
 
 
+@pytest.mark.slow
 def test_inverse_crime(run):
     out, bias = run("inverse_crime", fit_methods=["euler", "rk4"], dts=[0.01]), load("inverse_crime", "plot").bias
     euler, rk4 = (bias(read_results(out / f"{fit} 0.01 s")).squeeze() for fit in ("euler", "rk4"))
@@ -128,6 +134,7 @@ def test_inverse_crime(run):
     assert float(rk4.sel({"method": "rk4"})) < float(euler.sel({"method": "rk4"})) / 8
 
 
+@pytest.mark.slow
 def test_bracket_and_seeds(run):
     data = read_results(run("bracket_and_seeds", seeds=[0]) / "seed 0").squeeze()
     rollouts, accuracy = metrics.mean_rollouts(data), metrics.accuracy(data)
@@ -142,6 +149,7 @@ def test_bracket_and_seeds(run):
 # Experiments that are scripts.
 
 
+@pytest.mark.slow
 def test_efficiency(tmp_path):
     case = "published, rates"
     (row,) = result_of(tmp_path, "efficiency", flights=48, seed=0, scale=1.0, cases=[case])["cases"]
@@ -152,12 +160,14 @@ def test_efficiency(tmp_path):
     assert near(row["covered"], 0.95, 4 * np.sqrt(0.95 * 0.05 / 48))
 
 
+@pytest.mark.slow
 def test_speed(tmp_path):
     report = result_of(tmp_path, "speed", batch=64, repeats=2)
     assert report["provenance"]["precision"] == "float64"
     assert all(row["steps_per_second"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
 
 
+@pytest.mark.slow
 def test_networks(tmp_path):
     trained = {"networks": ["score, mlp", "score, cmac"], "channels": "rates", "separate": False}
     report = result_of(tmp_path, "networks", flights=128, seed=7, steps=100, many=128, noises=[1.0], **trained)
@@ -170,6 +180,7 @@ def test_networks(tmp_path):
     assert all(rows[n]["rollouts"] < rows["ibss"]["rollouts"] and rows[n]["hit_rate"] > 0.9 for n in hybrids)
 
 
+@pytest.mark.slow
 def test_precision(tmp_path):
     """In a process of its own: JAX keeps the constants of a program in the precision of their first use."""
     # How far the answers of a flight may be apart, in bounds.
@@ -189,6 +200,7 @@ def test_precision(tmp_path):
     assert all(near(rows[name, "float32"]["efficiency"], 1, 5 * np.sqrt(1 / 128)) for name in ("kalman", "ibss"))
 
 
+@pytest.mark.slow
 def test_baselines(tmp_path):
     cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
     rows = result_of(tmp_path, "baselines", flights=48, seed=5, channels="rates", **cases)["rows"]
@@ -200,6 +212,7 @@ def test_baselines(tmp_path):
     assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]
 
 
+@pytest.mark.slow
 def test_coverage(tmp_path):
     cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
     rows = result_of(tmp_path, "coverage", flights=128, seed=11, scales=[1.0], steps=100, **cases)["rows"]
@@ -210,6 +223,7 @@ def test_coverage(tmp_path):
         assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
 
 
+@pytest.mark.slow
 def test_defaults(tmp_path):
     settings = ["equation error, memory 0", "equation error, memory 1 (default)", "ant colony, q 0.1"]
     rows = result_of(tmp_path, "defaults", flights=8, seed=7, settings=settings)["rows"]
@@ -223,6 +237,7 @@ def test_defaults(tmp_path):
     assert 0 <= rows[4]["gap"] < 0.02  # its cost above that of output error
 
 
+@pytest.mark.slow
 def test_robust_intervals():
     """Those by the residuals hold the truth under coloured noise; those by the bound of white noise do not."""
     load("coverage", "robust").main(flights=16, seed=13)
@@ -230,6 +245,7 @@ def test_robust_intervals():
     assert white < 70 < 80 < robust
 
 
+@pytest.mark.slow
 def test_times_of_commands(monkeypatch):
     monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
     load("speed", "commands").main(repeats=1, commands=["simulate --help"])
@@ -241,6 +257,7 @@ def test_times_of_commands(monkeypatch):
         load("speed", "commands").main(repeats=1, commands=["estimate missing.csv"])
 
 
+@pytest.mark.slow
 def test_long_flight(tmp_path):
     """Windows follow a drift that one shot cannot. One shot ends at the bounds, and its result says so."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
@@ -250,6 +267,7 @@ def test_long_flight(tmp_path):
     assert max(many["percent"][place] for place in (1, 3, 4)) < 2  # the gains of the torques
 
 
+@pytest.mark.slow
 def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interval():
     def row(value):
         return {"constants": {name: {"estimate": value, "std": 1.0} for name in ("Ix", "Iy")}}
@@ -261,6 +279,7 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
     assert agreement({})["share"] is None
 
 
+@pytest.mark.slow
 def test_public_flights(shared_flights, tmp_path):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}

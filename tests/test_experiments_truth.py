@@ -5,8 +5,6 @@ import json
 import pytest
 from small_experiments import load, result_of
 
-pytestmark = pytest.mark.slow
-
 # A simulator in this package's stead: the experiment must find, call and believe it.
 FLY = """
 import json, pathlib, shutil
@@ -35,6 +33,7 @@ def simulator(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_cases_are_flown_identified_and_counted(capsys, simulator, tmp_path):
     """The second case has a false truth: the estimate is wrong, and is counted as wrong."""
     report = result_of(tmp_path, "truth", truth=simulator)

@@ -20,8 +20,6 @@ from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise, Observed
 from jaxos4.shooting.innovations import SETTLING
 
-pytestmark = pytest.mark.slow
-
 MODEL = jaxos4.PublishedOS4()
 # Without gyroscopic torques a disturbed rate changes no other channel.
 UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
@@ -89,6 +87,7 @@ def test_the_likelihood_is_that_of_a_joint_gaussian():
 # The likelihood.
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences():
     """Also in the noise, all channels together: a channel's noise is taken to change no other channel's innovations."""
     problem, alpha = disturbed(), np.asarray(MODEL.alpha) * 1.1
@@ -135,6 +134,7 @@ def test_the_information_is_the_covariance_of_the_gradient():
         np.testing.assert_allclose(np.square(scaled).mean(axis=0), 1, atol=4 * np.sqrt(2 / LANES))
 
 
+@pytest.mark.slow
 def test_the_likelihood_does_not_depend_on_the_segments_and_no_trajectory_runs_away_in_a_long_gap():
     problem = disturbed()
     alone, cut = likelihood(problem, MODEL.alpha, NOISE), likelihood(problem, MODEL.alpha, NOISE, segments=4)
@@ -151,6 +151,7 @@ def test_the_likelihood_does_not_depend_on_the_segments_and_no_trajectory_runs_a
 # Simulated flights without a disturbance.
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
 def test_it_finds_the_truth_at_nearly_the_bound():
     """White noise and nothing else. The noise is estimated too, and a weak disturbance can never be ruled out.
@@ -169,6 +170,7 @@ def test_it_finds_the_truth_at_nearly_the_bound():
 # Gaps, recordings, failures.
 
 
+@pytest.mark.slow
 def test_a_long_gap_and_another_recording_restart_the_filter_and_a_while_after_does_not_count():
     """Recordings begin in mid-flight, where the controller has answered the disturbance for some time."""
     observed = observed_in(disturbed())
@@ -188,6 +190,7 @@ def test_a_long_gap_and_another_recording_restart_the_filter_and_a_while_after_d
     assert (np.abs(found.parameters - MODEL.alpha) < 4 * found.std).all()
 
 
+@pytest.mark.slow
 def test_a_flight_too_short_to_say_anything_leaves_the_bracket():
     states = noisy_states(1, duration=11 * DT)[0]
     problem = standard_problem(channels="rates", free=True, states=states, duration=11 * DT)
@@ -198,6 +201,7 @@ def test_a_flight_too_short_to_say_anything_leaves_the_bracket():
     assert (found.std <= bracket.half_width * 1.001).all()
 
 
+@pytest.mark.slow
 def test_lanes_may_differ_in_everything_and_padding_changes_nothing():
     """Lanes become segments of one filter: each with its own model, sample time, number of samples and noise."""
     problem = disturbed()

@@ -14,8 +14,6 @@ from jaxos4.flight import Inputs, Stretches
 from jaxos4.models.rotors import Batch, Grid, Motor, driven
 from jaxos4.models.state import CASCADE_ORDER
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.mark.parametrize("counts", [(1,), (37,), (5, 1, 20, 11), (64, 64)])
 def test_the_filter_is_the_recursion(counts):
@@ -83,6 +81,7 @@ def test_parabolas_are_delayed_exactly(delay):
     np.testing.assert_allclose(delayed(speeds(t), delay)[8:-8], expected[8:-8], rtol=1e-10, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_delay_has_a_continuous_derivative():
     omega = np.random.default_rng(0).uniform(100, 400, (40, 4))
     slope = jax.jit(jax.jacfwd(lambda delay: delayed(omega, delay)))
@@ -154,6 +153,7 @@ def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="
 MOTORS = ("offset", "motor", "delay", "accelerometer", "gyro_bias")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("terms", "recordings", "channels"),
     [(MOTORS, (0, 0), "rates"), (MOTORS, (0, 1), "rates"), (("velocity",), (0,), "all"), (("drag",), (0,), "all")],
@@ -197,6 +197,7 @@ def assert_held(found, values):
     assert not np.asarray(found.covariance)[places].any()
 
 
+@pytest.mark.slow
 def test_the_truth_is_found_without_noise():
     """The offsets of two recordings differ, and each is found. The attitude tells them from biases of the gyro."""
     model = jaxos4.FlightModel(FULL, terms=("offset", "gyro_bias"), recordings=(0, 1))
@@ -208,6 +209,7 @@ def test_the_truth_is_found_without_noise():
     assert_held(found, whole)
 
 
+@pytest.mark.slow
 def test_the_centre_of_mass_and_the_effect_of_the_voltage_are_found():
     model = jaxos4.FlightModel(FULL, terms=("offset", "center_of_mass", "voltage", "delay"), battery_voltage=VOLTS)
     whole = truth(model)
@@ -230,6 +232,7 @@ def test_the_centre_of_mass_and_the_effect_of_the_voltage_are_found():
     assert jaxos4.center_of_mass(model.parameter_names[:2], whole[:2], np.eye(2), FULL) == ()
 
 
+@pytest.mark.slow
 def test_the_error_of_the_centre_of_mass_is_that_of_the_quotient():
     names, values = ("pitch_thrust", "roll_thrust", "alpha6", "alpha3"), np.array([0.9, -0.5, 133.0, 120.0])
     rng = np.random.default_rng(0)

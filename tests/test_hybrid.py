@@ -13,9 +13,8 @@ from small_network import BRACKET, CMAC, OMEGA, PUBLISHED, SMALL, flights, ident
 
 import jaxos4
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", ["good", "misses", "outside", "mismatch"])
 def test_the_hybrid_finds_what_ibss_finds(seed):
     """Misses: the network was trained in another bracket. Outside: one truth lies outside of the network's bracket.
@@ -47,6 +46,7 @@ def test_the_hybrid_finds_what_ibss_finds(seed):
         assert (hybrid.rollouts >= alone.rollouts).all()
 
 
+@pytest.mark.slow
 def test_the_hybrid_begins_at_the_initial_state_that_the_network_saw():
     """From the first measurement it takes 1.75 sweeps."""
     _, states = flights(LANES, seed=18)
@@ -77,6 +77,7 @@ def network_file(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(st.data())
 def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(network_file, data):
@@ -111,6 +112,7 @@ class Trap:
         return (pytest.fail, ("the file was executed",))
 
 
+@pytest.mark.slow
 def test_a_file_of_another_version_or_with_objects_or_a_model_of_ones_own_is_refused(tmp_path, network_file):
     path = tmp_path / "made.npz"
     with np.load(network_file) as file:

@@ -18,8 +18,6 @@ from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
 
-pytestmark = pytest.mark.slow
-
 AIRFRAME = """
 mass = 0.65
 arm = 0.23
@@ -94,6 +92,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "said"), REFUSED.items(), ids=REFUSED)
 def test_wrong_requests_are_one_line(run, vehicle, monkeypatch, line, said):
     monkeypatch.chdir(vehicle)
@@ -102,6 +101,7 @@ def test_wrong_requests_are_one_line(run, vehicle, monkeypatch, line, said):
     assert not list(vehicle.glob("*.html"))
 
 
+@pytest.mark.slow
 def test_a_log_shows_whether_its_vehicle_is_real(vehicle, tmp_path):
     commands = read_recording(vehicle / "flight1.csv", full_scale=1.0)
     assert commands.vehicle_evidence == "has commands, not rotor speeds"
@@ -171,6 +171,7 @@ def test_a_flight_has_the_numbers_of_the_command(run, tmp_path, flight):
     assert row.ci95[0] < row.estimate < row.ci95[1]
 
 
+@pytest.mark.slow
 def test_identify_takes_paths(tmp_path):
     model = jaxos4.PublishedOS4()
     flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=1.0, dt=0.01), dt=0.01)
@@ -187,6 +188,7 @@ def test_identify_takes_paths(tmp_path):
         jaxos4.identify(tmp_path / "none.csv", model)
 
 
+@pytest.mark.slow
 def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_path, vehicle, monkeypatch):
     monkeypatch.chdir(vehicle)
     files = ("--out", str(tmp_path / "found.json"), "--report", str(tmp_path / "found.html"))
@@ -231,6 +233,7 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     assert all(np.allclose(drawn[name], again[name], rtol=1e-9, atol=0) for name in drawn)
 
 
+@pytest.mark.slow
 def test_a_search_that_fails_keeps_what_the_log_shows():
     diverging, settings = {"roll_damping": [-1e6, -9e5]}, jaxos4.VehicleSettings(sample_time=0.016, holdout=0.0)
     recording, airframe = flown(CRAZYFLIE, 0, seconds=6.0), turned(CRAZYFLIE, "rotor_spins")

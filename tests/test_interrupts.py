@@ -41,7 +41,9 @@ def environment():
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]), "JAX_PLATFORMS": "cpu"}
 
 
-@pytest.mark.parametrize("where", DROPPED)
+@pytest.mark.parametrize(
+    "where", [pytest.param(each, marks=[pytest.mark.slow] * (each != "raised")) for each in DROPPED]
+)
 def test_an_interrupt_ends_a_command_by_the_signal_wherever_it_arrives(where, tmp_path):
     body = "\n".join(f"    {line}" for line in DROPPED[where].splitlines())
     line = [sys.executable, "-c", WAITING.format(body) + COMMAND, "simulate", "--out", "flight.csv"]
@@ -79,8 +81,8 @@ def inspect(tmp_path):
 @pytest.mark.parametrize(
     ("behind", "code", "said"),
     [
-        (">&-", 0, ""),
-        (">&- 2>&-", 0, ""),
+        pytest.param(">&-", 0, "", marks=pytest.mark.slow),
+        pytest.param(">&- 2>&-", 0, "", marks=pytest.mark.slow),
         (">/dev/full", 2, "jaxos4: standard output: No space left on device; print elsewhere. Files"),
     ],
 )
@@ -100,6 +102,7 @@ def test_a_device_that_is_not_there_is_named(inspect):
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_programs_are_kept_only_where_nobody_else_can_write(inspect, tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     folder = tmp_path / "cache/jaxos4"
@@ -114,6 +117,7 @@ def test_programs_are_kept_only_where_nobody_else_can_write(inspect, tmp_path, m
     assert inspect(**home)[::2] == (0, "")
 
 
+@pytest.mark.slow
 def test_nothing_is_kept_without_a_home_folder(inspect, tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)

@@ -18,9 +18,6 @@ from jaxos4.logs.sampling import PARTS
 from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise, Window, step_of
 
-pytestmark = pytest.mark.slow
-
-
 # The filters.
 
 
@@ -109,6 +106,7 @@ def lively(samples, seed):
     return jaxos4.Flight(*(0.01 * np.arange(samples), speeds.mean(axis=1), states), within=speeds, averaging_time=0.01)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_likelihood_of_means_are_those_of_finite_differences():
     """In the parameters that act on the two moments of the torque in different ways, and in the noise."""
     model = jaxos4.FlightModel(CINERAT, terms=("damping", "delay", "reaction"))
@@ -137,6 +135,7 @@ def gradient_of(problem, parameters, noise):
 # The forcing.
 
 
+@pytest.mark.slow
 def test_stretches_and_padding_do_not_change_the_forcing_of_means():
     """Each stretch is as if it were alone, and so is what comes before the padding."""
     model = jaxos4.FlightModel(CINERAT, terms=("motor", "delay", "reaction", "accelerometer"))
@@ -190,6 +189,7 @@ def truth():
     return dict(zip(SHARED, (1 / ix, 1 / iy, 1 / iz, float(CINERAT.rotor_inertia) / iz), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("logged", ["speeds", "commands"])
 def test_a_flight_in_still_air_has_the_same_answer_at_8_and_32_ms(logged):
     """Hardly any noise, so errors are those of the model. The mean torque over the sample that follows, in the place of
@@ -205,6 +205,7 @@ def test_a_flight_in_still_air_has_the_same_answer_at_8_and_32_ms(logged):
         assert all(abs(found[f"{axis}_damping"][0]) < 0.01 for axis in ("roll", "pitch", "yaw"))
 
 
+@pytest.mark.slow
 def test_a_flight_in_gusts_has_the_same_answer_at_8_and_32_ms():
     fine, coarse = answers(gust=2.0)
     for name, value in truth().items():

@@ -13,8 +13,6 @@ from lanes import LANES, identify
 import jaxos4
 from jaxos4.models.state import CASCADE_ORDER
 
-pytestmark = pytest.mark.slow
-
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 SHOOTING = {"ibss": jaxos4.IBSS, "output error": jaxos4.OutputError}
 WINDOWS = 4
@@ -67,6 +65,7 @@ def test_windows_are_flights_of_their_own(windows, channels):
     np.testing.assert_allclose(whole, (weight * (states[:, order] - predicted)).ravel(), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @every_case
 def test_both_shooting_methods_find_the_same_answer_with_errors_at_the_bound(model_class, channels):
     """With all channels: `experiments/efficiency`."""
@@ -85,6 +84,7 @@ def test_both_shooting_methods_find_the_same_answer_with_errors_at_the_bound(mod
         np.testing.assert_allclose(found.cost[0], cost, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHOOTING)
 def test_a_window_without_measurements_changes_no_estimate(name):
     states = np.array(noisy_states(LANES, CORRECTED))
@@ -95,6 +95,7 @@ def test_a_window_without_measurements_changes_no_estimate(name):
     assert np.isfinite(found.initial_state).all()
 
 
+@pytest.mark.slow
 def test_the_hybrid_runs_on_windows():
     problem, bracket = windowed(WINDOWS, "rates", CORRECTED), jaxos4.Bracket.default(CORRECTED())
     network = jaxos4.NetworkEstimator(width=32, depth=2, batch=64, steps=100, held_out=1000)
@@ -106,6 +107,7 @@ def test_the_hybrid_runs_on_windows():
         network(windowed(1, "rates", CORRECTED), bracket)
 
 
+@pytest.mark.slow
 def test_equation_error_is_the_same_whatever_the_windows():
     one, several = windowed(1, "rates"), windowed(4, "rates")
     bracket = jaxos4.Bracket.default(one.model)

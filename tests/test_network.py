@@ -29,11 +29,10 @@ from small_network import (
 
 import jaxos4
 
-pytestmark = pytest.mark.slow
-
 # Training.
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
 def test_training_learns_and_comes_near_the_bound():
     assert trained().history.shape == (4, 2)
@@ -47,6 +46,7 @@ def test_training_learns_and_comes_near_the_bound():
     assert abs(squares.mean() - 1) < 0.1  # errors have the size of the covariance
 
 
+@pytest.mark.slow
 def test_cmac_corrects_the_linear_map():
     alpha, states = many(1.0)
 
@@ -67,6 +67,7 @@ OTHER_NETWORKS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", OTHER_NETWORKS, ids=str)
 @pytest.mark.usefixtures("optimised")
 def test_intervals_hold_whatever_the_networks_quality(changes):
@@ -84,6 +85,7 @@ def test_intervals_hold_whatever_the_networks_quality(changes):
         assert abs(together - 0.9) < 4.5 * np.sqrt(0.09 * (1 / MANY + 1 / 4000)) + 0.002
 
 
+@pytest.mark.slow
 def test_the_same_key_gives_the_same_network_and_other_numbers_compile_nothing():
     """Other numbers are no reason to compile: bracket, noise, rate, number of steps, key."""
 
@@ -100,6 +102,7 @@ def test_the_same_key_gives_the_same_network_and_other_numbers_compile_nothing()
     assert not same(first.regressor, another.regressor)
 
 
+@pytest.mark.slow
 def test_training_stops_early_without_progress_and_a_flight_without_excitation_is_unidentifiable():
     slow = SMALL | {"steps": 5000, "learning_rate": 1e-12, "patience": 2, "noise": (1.0, 1.0), "batch": 8}
     network = jaxos4.NetworkEstimator(**slow).fit(problem_of(), BRACKET, key=jax.random.key(0))
@@ -112,6 +115,7 @@ def test_training_stops_early_without_progress_and_a_flight_without_excitation_i
     assert names(network(problem_of(noisy.states, omega=hover), BRACKET)) == "unidentifiable"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "off", "message"),
     [
@@ -140,6 +144,7 @@ OTHER = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", OTHER)
 def test_another_problem_is_an_error_that_says_what_differs(what):
     changes, words = OTHER[what]
@@ -156,6 +161,7 @@ def test_a_problem_may_be_a_constant_of_a_traced_function_and_an_invalid_bracket
     np.testing.assert_allclose(traced(BRACKET)[1], network(problem, BRACKET).parameters, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_network_takes_held_parameters_as_known():
     network, (alpha, states) = trained(), flights(400, seed=15)
     names_held, place = ["alpha1", "alpha5"], [0, 4]
@@ -180,6 +186,7 @@ def test_a_network_takes_held_parameters_as_known():
     assert np.all(np.abs(spread - 1) < 4 / np.sqrt(2 * 400) + 0.1)
 
 
+@pytest.mark.slow
 def test_in_a_batch_each_lane_has_its_own_result_and_leaves_the_others_alone():
     network, lanes = trained(), 8
     states = flights(LANES, seed=14)[1][:lanes]
@@ -206,6 +213,7 @@ def test_in_a_batch_each_lane_has_its_own_result_and_leaves_the_others_alone():
         assert np.isinf(np.diagonal(broken.covariance[lane])).all()
 
 
+@pytest.mark.slow
 def test_missing_samples_widen_the_intervals_and_no_more():
     alpha, states = many(1.0)
     fewer = identify(trained(), lost(states, share=0.4, seed=16))
@@ -216,6 +224,7 @@ def test_missing_samples_widen_the_intervals_and_no_more():
     assert np.abs(covered - 0.9).max() < 0.06
 
 
+@pytest.mark.slow
 def test_a_free_initial_state_is_estimated_too_and_a_column_may_begin_late_but_not_lack():
     network = trained(free=True)
     # Its intervals are calibrated over all the starts that it was trained for, and hold more often at their middle.

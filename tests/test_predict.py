@@ -17,7 +17,7 @@ from jaxos4.airframe import airframe_table
 from jaxos4.closed_loop import Air, ClosedLoop, Sensors
 from jaxos4.closed_loop.flight import fly_standard
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("all_optimised")]
+pytestmark = pytest.mark.usefixtures("all_optimised")
 
 TERMS = ("offset", "damping", "lag", "delay", "reaction", "accelerometer", "inflow", "drag")
 DRAG, DAMPING, LAG, DELAY = (0.3, 0.4, 0.5), 0.5, 0.04, 0.01
@@ -116,6 +116,7 @@ def reference(begin, squares, steps):
     return np.array(states)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pitch", "turning"), [(0.2, 0.0), (1.5, 3.0)])
 def test_a_prediction_is_the_solution_of_newton_and_euler(write, pitch, turning):
     """Through any attitude, that at which Euler angles are singular too."""
@@ -141,6 +142,7 @@ def test_a_prediction_is_the_solution_of_newton_and_euler(write, pitch, turning)
         assert off.max() < 1e-6
 
 
+@pytest.mark.slow
 def test_the_band_holds_95_percent_of_what_is_measured(write):
     """Gusty flights; each result has errors of its own. The error of the share is that of its mean over flights."""
     found = [jaxos4.predict(write(uncertain(i)), flown(10 + i), seed=i).quality for i in range(4)]
@@ -150,6 +152,7 @@ def test_the_band_holds_95_percent_of_what_is_measured(write):
         assert 0.92 - 2 * error < shares.mean() < 0.97 + 2 * error, (name, shares)
 
 
+@pytest.mark.slow
 def test_the_filters_and_the_model_predict_better_than_constant_rates(write):
     quality = jaxos4.predict(write(result()), flown(2)).quality
     for name in ("position", "velocity", "attitude", "rates"):
@@ -158,6 +161,7 @@ def test_the_filters_and_the_model_predict_better_than_constant_rates(write):
         assert at.error[24] < at.regression[24]
 
 
+@pytest.mark.slow
 def test_a_recording_has_its_own_offset(write):
     """After some seconds it is known from the past of the recording, whatever the fit says."""
     flight = flown(3, offset=(8.0, -6.0, 2.0))
@@ -170,6 +174,7 @@ def test_a_recording_has_its_own_offset(write):
     assert (wrong.half_width[0, -1, 9:] > 1.5 * wrong.half_width[-1, -1, 9:]).all()
 
 
+@pytest.mark.slow
 def test_errors_are_means_of_lengths(write):
     found = jaxos4.predict(write(result()), flown(2))
     length = np.linalg.norm((found.predicted - found.measured)[..., :3], axis=-1)
@@ -187,6 +192,7 @@ def test_errors_are_means_of_lengths(write):
     np.testing.assert_allclose(found.constant[..., :3], moved)
 
 
+@pytest.mark.slow
 def test_one_poisoned_sample_does_not_spread(write):
     flight, path = flown(2), write(result())
     states, force = np.array(flight.states), np.array(flight.specific_force)
@@ -202,6 +208,7 @@ def test_one_poisoned_sample_does_not_spread(write):
     json.dumps(poisoned.to_dict(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_what_was_not_measured_is_not_compared(write):
     """Without velocity and accelerometer, too."""
     states = np.array(flown(2).states)
@@ -214,6 +221,7 @@ def test_what_was_not_measured_is_not_compared(write):
     assert not any(name.startswith(("position", "velocity")) for name in found.to_dataset())
 
 
+@pytest.mark.slow
 def test_a_result_of_several_recordings_gives_their_mean(write):
     values = truth()
     pairs = {f"roll_offset_{i}": values["roll_offset"] + x for i, x in ((1, 1.0), (2, -1.0))}
@@ -224,6 +232,7 @@ def test_a_result_of_several_recordings_gives_their_mean(write):
     assert two.covariance[place, place] == pytest.approx(2 * (0.01 / 2) ** 2)
 
 
+@pytest.mark.slow
 def test_a_parameter_that_is_not_identified_is_noted(write):
     rows = {name: row(value, 0.01) for name, value in truth().items()}
     rows["x_drag"] = row(None, None)
@@ -253,6 +262,7 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     np.testing.assert_allclose(table["p_half_width"], dataset.rates_half_width.values[..., 0].ravel(), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_path, write):
     write(
         result(
@@ -267,6 +277,7 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
     assert err.startswith("jaxos4: no_skill: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "options", "fragments"),
     [
@@ -295,6 +306,7 @@ def test_unusable_input_is_refused_in_one_line(run, tmp_path, write, content, op
     refused(run("predict", "found.json", "log.csv", *options), *fragments)
 
 
+@pytest.mark.slow
 def test_flights_without_attitude_or_with_measured_speeds_are_refused(write):
     states = np.array(flown(2).states)
     states[:, [6, 8, 10]] = np.nan

@@ -13,8 +13,6 @@ from helpers import compiled_programs, noisy_states, standard_flight, standard_p
 import jaxos4
 from jaxos4.shooting import for_threads, padded
 
-pytestmark = pytest.mark.slow
-
 # The search, the simulation with all derivatives, the default bracket, the intervals, a comparison of result codes.
 BUDGET = 6
 
@@ -27,6 +25,7 @@ def recorded(samples, model, seed=0):
     return jaxos4.Flight(np.asarray(flight.time)[:samples], np.asarray(flight.omega)[:samples], states)
 
 
+@pytest.mark.slow
 def test_an_identification_is_few_programs_and_the_next_one_none():
     """The second flight has another length, and another vehicle flew it."""
     model = jaxos4.PublishedOS4()
@@ -46,6 +45,7 @@ def cost_and_residuals(problem, *at):
     return problem.cost(*at), problem.residuals(*at).reshape(-1, problem.size)
 
 
+@pytest.mark.slow
 def test_a_batch_is_the_same_on_any_number_of_cores_by_one_program(monkeypatch):
     """150 flights: the last of three chunks begins with flights of the second. `shared` has a leaf that is no array."""
     problem, states = standard_problem(channels="rates"), jnp.asarray(noisy_states(150))
@@ -66,6 +66,7 @@ def test_a_batch_is_the_same_on_any_number_of_cores_by_one_program(monkeypatch):
     np.testing.assert_allclose(found[0][np.array([0, 100, 149])], alone, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [False, True])
 def test_another_thread_has_the_precision_of_its_caller(double):
     with jax.enable_x64(double), ThreadPoolExecutor(1) as other:
@@ -73,6 +74,7 @@ def test_another_thread_has_the_precision_of_its_caller(double):
     assert kind == (jnp.float64 if double else jnp.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", ["rates", "all"])
 def test_padding_changes_no_result(channels):
     problem = standard_problem(states=noisy_states(1)[0], channels=channels, free=True)

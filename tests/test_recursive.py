@@ -12,12 +12,11 @@ from lanes import HALF, LANES, bound, errors, identify, lanes, lost, names, nois
 import jaxos4
 from jaxos4.estimators import SVSF, JointEKF
 
-pytestmark = pytest.mark.slow
-
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])  # p, q, r, phi, theta, psi, x, vx, ...
 
 
+@pytest.mark.slow
 def test_one_pass_is_not_enough_beyond_the_rates():
     """Why there are passes: the plain filter keeps the errors of its first linearisations, and does not know it."""
     case = CORRECTED, "all", False
@@ -78,6 +77,7 @@ def textbook(states, omega, center, half, sigma, *, start, free, derivative):
     return np.stack(history), p[size:, size:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model_class", "channels", "free"),
     [(PUBLISHED, "rates", False), (PUBLISHED, "rates", True), (CORRECTED, "all", False)],
@@ -107,6 +107,7 @@ def test_agrees_with_the_textbook_filter(model_class, channels, free):
         assert np.abs(estimate.history / HALF - wrong[0] / HALF).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_agrees_with_shooting():
     """The prior aside, which a wide bracket makes weak, both have the same optimum."""
     problem, states, omega, lower, upper = lanes(noisy_states(LANES, seed=50))
@@ -121,6 +122,7 @@ def test_agrees_with_shooting():
 RATES = [7, 9, 11]
 
 
+@pytest.mark.slow
 def test_history_is_what_was_averaged_and_other_channels_do_not_matter():
     estimates = noisy(SVSF)
     history = np.asarray(estimates.history)
@@ -135,6 +137,7 @@ def test_history_is_what_was_averaged_and_other_channels_do_not_matter():
     assert alone.initial_state.shape == (12,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("free", "covered"), [(True, 0.95 - 4 * np.sqrt(0.95 * 0.05 / LANES)), (False, 0.87)])
 def test_a_free_start_or_missing_samples_only_cost_precision(free, covered):
     states = noisy_states(LANES, seed=50) if free else lost(noisy_states(LANES, seed=7))
@@ -185,6 +188,7 @@ def plain(states, omega, center, *, rates_layer, parameter_layer, damping, equil
     return np.stack(history)
 
 
+@pytest.mark.slow
 def test_agrees_with_plain_numpy():
     states = np.array(noisy_states(1, seed=3, duration=1.0)[0])
     states[30:40, RATES[1]] = np.nan

@@ -12,8 +12,6 @@ import jaxos4
 from jaxos4.estimators.levenberg_marquardt import LevenbergMarquardt
 from jaxos4.estimators.solver import solve
 
-pytestmark = pytest.mark.slow
-
 PUBLISHED = jaxos4.PublishedOS4
 
 
@@ -30,6 +28,7 @@ def test_where_a_start_is_nan_the_search_begins_at_the_center():
 SOLVERS = [jaxos4.IBSS(), LevenbergMarquardt(), jaxos4.AntColony()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
 def test_a_start_beyond_the_reach_is_moved_to_its_limit(solver):
     problem = standard_problem(channels="rates", states=noisy_states(1)[0])
@@ -40,6 +39,7 @@ def test_a_start_beyond_the_reach_is_moved_to_its_limit(solver):
     assert names(found) != "nonfinite_trajectory"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shooting", "innovations"])
 def test_the_search_of_the_documentation_ends_at_the_minimum_or_says_that_it_did_not(kind):
     exec(documented_class("likelihood.md"), defined := {"__name__": "descent"})  # noqa: S102
@@ -54,6 +54,7 @@ def test_the_search_of_the_documentation_ends_at_the_minimum_or_says_that_it_did
         assert names(defined["Descent"](steps=1)(problem)) == "max_sweeps"
 
 
+@pytest.mark.slow
 def test_output_error_takes_no_more_steps_for_a_long_flight():
     """Of 300 s. A search of the whole from the start, with ten times the steps, ends in the same minimum at best."""
     problem = standard_problem(channels="rates", duration=300.0)
@@ -83,6 +84,7 @@ def test_too_few_sweeps_are_reported():
     assert (np.asarray(estimates.sweeps) == 3).all()  # one for each share of the flight
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
 def test_ibss_reaches_the_maximum_of_the_likelihood():
     """That of output error, which is that of another minimiser: `test_estimators.py`."""
@@ -151,6 +153,7 @@ def problem_of(model, start, duration):
     ).within(jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF))
 
 
+@pytest.mark.slow
 def test_rollouts_are_counted_right():
     """On however many samples."""
     free, slow = None, {"halvings": 3}
@@ -164,6 +167,7 @@ def test_rollouts_are_counted_right():
         assert 2 * sweeps <= shots <= 3 + sweeps * (1 + most)
 
 
+@pytest.mark.slow
 def test_the_colony_reaches_the_optimum_of_ibss_with_many_more_rollouts():
     colony = noisy(jaxos4.AntColony, count=FEW)
     ibss = jax.tree.map(lambda leaf: leaf[:FEW], noisy(jaxos4.IBSS))
@@ -175,6 +179,7 @@ def test_the_colony_reaches_the_optimum_of_ibss_with_many_more_rollouts():
     assert (np.asarray(colony.rollouts) > 5 * np.asarray(ibss.rollouts)).all()
 
 
+@pytest.mark.slow
 def test_each_simulated_point_of_a_colony_is_counted():
     """A search that is stopped says so."""
     problem = problem_of(counting(torques := []), np.zeros(12), 5.0)

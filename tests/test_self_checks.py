@@ -33,8 +33,6 @@ from jaxos4.recording.checks.response import rotor_response
 from jaxos4.recording.motion import in_body_axes
 from jaxos4.recording.stretches import cut
 
-pytestmark = pytest.mark.slow
-
 INERTIAS = {"Ix", "Iy", "Iz"}
 WIND = {"wind": 1.0, "drag": 0.3, "inflow": 0.6, "flapping": 2.0}
 P, FORCE, AZ = 7, np.array([12, 13, 14]), 14  # of the channels
@@ -140,6 +138,7 @@ def test_a_fault_is_named_with_its_cause(fault, flights):
         assert len(named) <= 1 or fault in ("tilted", "gyro clipped"), found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [2, 3, 4])
 def test_speeds_at_instants_that_are_far_apart_are_noted(rows, flights):
     """Motion of the rotors in between is not known; 8 ms are good enough."""
@@ -148,6 +147,7 @@ def test_speeds_at_instants_that_are_far_apart_are_noted(rows, flights):
     assert not any(each.contradicted for each in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [4, 8])
 def test_a_gyro_below_50_hz_does_not_judge_the_scale_of_the_attitude(rows, flights):
     flight = scaled(RATES)(flights[1], 0.5)
@@ -157,6 +157,7 @@ def test_a_gyro_below_50_hz_does_not_judge_the_scale_of_the_attitude(rows, fligh
     assert ("gyro_or_time_scale" in names) == (rows * flight.dt <= 0.02)
 
 
+@pytest.mark.slow
 def test_each_fault_of_one_sensor_says_nothing_of_another(flights):
     """A late attitude leaves the inertias alone, and so does one of another scale."""
     for fault in ("attitude late", "attitude scale"):
@@ -164,6 +165,7 @@ def test_each_fault_of_one_sensor_says_nothing_of_another(flights):
         assert found.quantities == ("attitude",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "name"), [(RATES, "gyro_or_accelerometer_clock"), (ANGLES, "attitude_clock")])
 def test_two_causes_are_both_named_if_the_log_does_not_show_which(sensor, name, flights):
     flight = late(sensor)(flights[0], -0.02 if sensor is RATES else 0.1)
@@ -175,6 +177,7 @@ def test_two_causes_are_both_named_if_the_log_does_not_show_which(sensor, name, 
     assert set(found.name.split("_")) == set(name.split("_"))
 
 
+@pytest.mark.slow
 def test_an_attitude_of_other_axes_leaves_the_inertias_alone(flights):
     """Turned by 20 degrees, with the rotors on the side of the gyro."""
     flight, turn = copied(flights[0]), np.radians(20)
@@ -187,6 +190,7 @@ def test_an_attitude_of_other_axes_leaves_the_inertias_alone(flights):
     assert set(found.quantities) == INERTIAS | {"attitude"}
 
 
+@pytest.mark.slow
 def test_a_velocity_tells_the_gyro_from_the_time_and_its_own_axes(flights):
     flight = flights[-1]
     for fault, cause in (("gyro scale", SCALE), ("time scale", TIME)):
@@ -205,6 +209,7 @@ def given_rotation(finding):
     return np.array(re.search(r"`sensor_rotation = \[(.*?)\]`", finding.remedy)[1].split(", "), dtype=float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 30.0), (15.0, -25.0, 40.0), (180.0, 0.0, -90.0)])
 def test_the_advised_rotation_of_the_sensors_cures_their_mounting(flights, angles):
     """Without a rotation about z, the thrust shows two angles, and the rotors then the third."""
@@ -220,6 +225,7 @@ def test_the_advised_rotation_of_the_sensors_cures_their_mounting(flights, angle
     assert not self_checks(turned_flight, airframe)
 
 
+@pytest.mark.slow
 def test_a_channel_that_is_missing_stays_missing_along_its_own_axis_only(flights):
     flight = copied(flights[0])
     flight.states[10, RATES[0]] = np.nan
@@ -228,6 +234,7 @@ def test_a_channel_that_is_missing_stays_missing_along_its_own_axis_only(flights
     np.testing.assert_allclose(seen.states[10, RATES[2]], flight.states[10, RATES[2]])
 
 
+@pytest.mark.slow
 def test_simulated_sensors_are_mounted_as_the_airframe_says(flights):
     """A flight along the axes of turned sensors is that of sensors which are not turned."""
     turned_vehicle = eqx.tree_at(lambda a: a.sensor_rotation, CRAZYFLIE, np.array([10.0, 20.0, 30.0]))
@@ -237,6 +244,7 @@ def test_simulated_sensors_are_mounted_as_the_airframe_says(flights):
     np.testing.assert_allclose(seen.channels, flights[0].channels, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_turned_sensor_seems_to_lie_on_the_ground(flights):
     flight = tilted(100)(flights[0], 0)
     flight.states[:, ANGLES] = np.nan
@@ -244,6 +252,7 @@ def test_a_turned_sensor_seems_to_lie_on_the_ground(flights):
     assert [each.name for each in found if each.contradicted] == ["force_direction"]
 
 
+@pytest.mark.slow
 def test_faulty_values_count_as_not_measured(flights):
     flight = impossible(clipped(P)(flights[1], 0.5), 19.0)
     found = plausible(flight)
@@ -257,6 +266,7 @@ def test_faulty_values_count_as_not_measured(flights):
     assert plausible(flights[0]).recording is flights[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signal", ["coarse", "held", "noisy"])
 def test_a_largest_value_is_no_limit(signal, flights):
     """A coarse or a held signal repeats its largest value."""
@@ -272,6 +282,7 @@ def test_a_largest_value_is_no_limit(signal, flights):
     assert plausible(flight).clipped == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("counts", [2, 6])
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
 def test_the_noise_of_a_gyro_at_rest_is_no_limit(counts, jitter, flights):
@@ -283,6 +294,7 @@ def test_the_noise_of_a_gyro_at_rest_is_no_limit(counts, jitter, flights):
     assert plausible(flight).clipped == {}
 
 
+@pytest.mark.slow
 def test_logs_of_two_vehicles(flights):
     heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, np.asarray(0.035))
     for i, contradicted in ((0, False), (1, True)):
@@ -294,6 +306,7 @@ def test_logs_of_two_vehicles(flights):
         assert found.contradicted == contradicted
 
 
+@pytest.mark.slow
 def test_estimates_hold_within_their_standard_errors(flights):
     """Delay, axes and scale of flights without faults."""
     for flight in flights:
@@ -307,12 +320,14 @@ def test_estimates_hold_within_their_standard_errors(flights):
     np.testing.assert_allclose(jackknife.error, values.std(axis=0, ddof=1) / np.sqrt(12))
 
 
+@pytest.mark.slow
 def test_limits_are_settings(flights):
     strict = msgspec.structs.replace(Limits(), motions=1000.0)
     assert [each.name for each in self_checks(flights[0], CRAZYFLIE, limits=strict)] == ["short_flight"]
     assert len({check.__name__ for check in CHECKS}) == len(CHECKS)
 
 
+@pytest.mark.slow
 def test_little_or_nothing_measured_is_no_fault(flights):
     flight = copied(flights[0])
     nothing = flight._replace(states=np.full_like(flight.states, np.nan), specific_force=None)
@@ -338,6 +353,7 @@ def test_inspect_prints_cause_size_and_remedy(flights, run, tmp_path):
     assert found["quantities"] == ["Ix", "Iy", "Iz"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("log", "airframe", "names"),
     [

@@ -23,8 +23,6 @@ from jaxos4.models.state import CHANNELS
 from jaxos4.networks import ARCHITECTURES, FEATURES, NetworkEstimator
 from jaxos4.simulation import METHODS
 
-pytestmark = pytest.mark.slow
-
 # Libraries that only some commands need, and that are slow to import.
 HEAVY = set("diffrax lineax optax optimistix xarray h5netcdf h5py matplotlib jinja2 pandas dask".split())
 CORE = {"jax", "equinox", "jaxtyping", "numpy", "msgspec"}
@@ -71,6 +69,7 @@ def test_help_and_mistakes_import_no_library():
         assert not set(packages) & (HEAVY | CORE), line
 
 
+@pytest.mark.slow
 def test_shell_completion_offers_estimators_and_imports_no_library():
     line = {"COMP_WORDS": "jaxos4 estimate flight.csv --estimator ", "COMP_CWORD": "4"}
     printed, packages = loaded(COMMAND, _JAXOS4_COMPLETE="complete_bash", **line)
@@ -78,6 +77,7 @@ def test_shell_completion_offers_estimators_and_imports_no_library():
     assert not packages & (HEAVY | CORE)
 
 
+@pytest.mark.slow
 def test_the_package_imports_what_is_used_and_presets_outlive_a_change_of_precision():
     """A preset is made at import, when JAX still rounds to float32. The user chooses double precision later."""
     code = """
@@ -106,6 +106,7 @@ def test_all_public_names_are_there():
         jaxos4.nothing  # noqa: B018
 
 
+@pytest.mark.slow
 def test_a_first_import_inside_a_traced_function_leaks_no_tracer():
     code = """
 import jax, jaxos4
@@ -121,6 +122,7 @@ import diffrax
     assert process.returncode == 0, process.stderr
 
 
+@pytest.mark.slow
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_command_keeps_settings(run):
     tables = {"Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
     tables |= {
@@ -150,6 +152,7 @@ def ended(*arguments: str, cwd: pathlib.Path, **environment: str) -> tuple[int, 
     return int(hits), int(misses), "--xla_cpu_use_fusion_emitters=false" in flags
 
 
+@pytest.mark.slow
 def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwise(tmp_path):
     home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     hits, misses, quickly = ended(*SIMULATE, cwd=tmp_path, **home)
@@ -168,6 +171,7 @@ def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwis
     assert ended(*SIMULATE, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "flight.csv"))[0] == 0
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_gone_is_no_error_of_the_program():
     command = COMMAND.replace(
         "main()", "import os; reader, writer = os.pipe(); os.close(reader); os.dup2(writer, 1); main()"
@@ -176,6 +180,7 @@ def test_a_reader_that_has_gone_is_no_error_of_the_program():
     assert (process.returncode, process.stderr) == (1, "")
 
 
+@pytest.mark.slow
 def test_a_study_of_many_flights_is_fully_optimised(tmp_path):
     (tmp_path / "study.toml").write_text("")
     assert not ended("study", "study.toml", "--out", "study", "--dry-run", cwd=tmp_path)[2]
@@ -186,6 +191,7 @@ WIDE = "--xla_cpu_prefer_vector_width=512"
 OFF = "JAXOS4_NO_XLA_OPTIONS"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variables", "flags"),
     [

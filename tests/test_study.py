@@ -22,8 +22,6 @@ from jaxos4.study.cell import run_cell
 from jaxos4.study.dataset import open_store, read_store
 from jaxos4.study.specification import AXES
 
-pytestmark = pytest.mark.slow
-
 SPECIFICATION = """
 durations = [1.0]
 scales = [1.0, 0.1]
@@ -47,6 +45,7 @@ def dataset(whole):
         return dataset.load()
 
 
+@pytest.mark.slow
 def test_another_specification_is_refused_with_what_changed(run, tmp_path):
     (tmp_path / "other.toml").write_text(SPECIFICATION.replace("seed = 5", "seed = 6\ndt = 0.02"))
     study = load_study(specification(tmp_path, SPECIFICATION))
@@ -111,6 +110,7 @@ def flown(number, scale, *, channels="rates", initial_state=None):
     return truth, problem
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "scale"), [(0, 1.0), (9, 0.1)])
 def test_the_dataset_is_what_the_library_computes(dataset, number, scale):
     truth, problem = flown(number, scale, initial_state=jnp.zeros(12))
@@ -150,6 +150,7 @@ hybrid_channels = "rates"
 """
 
 
+@pytest.mark.slow
 def test_the_hybrid_of_a_study_is_that_of_the_library(tmp_path):
     """The library searches from the network in one program for each flight, the study in batches with that of IBSS."""
     out = run_study(tmp_path, HYBRID)
@@ -178,6 +179,7 @@ def same(ours, theirs, scale=0.0) -> None:
     assert np.all(np.abs(ours - theirs) <= 1e-9 * np.maximum(np.abs(theirs), scale))
 
 
+@pytest.mark.slow
 def test_every_variable_has_a_name_and_a_unit_and_the_attributes_are_those_of_the_study(whole, dataset, tmp_path):
     for name, variable in dataset.variables.items():
         assert variable.attrs["long_name"], name
@@ -203,6 +205,7 @@ def test_every_variable_has_a_name_and_a_unit_and_the_attributes_are_those_of_th
 # Flights and cells that fail.
 
 
+@pytest.mark.slow
 def test_a_diverging_cell_is_counted_and_the_study_ends(run, tmp_path, dataset):
     specification(tmp_path, SPECIFICATION.replace("[1.0, 0.1]", "[1.0, 1e300]"))
     code, out, err = run("study", "spec.toml", "--out", "out")
@@ -218,6 +221,7 @@ def test_a_diverging_cell_is_counted_and_the_study_ends(run, tmp_path, dataset):
     assert all(f"{count} {OUTCOMES[result]}" in out for result, count in zip(codes, counts, strict=True))
 
 
+@pytest.mark.slow
 def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path, monkeypatch, dataset):
     specification(tmp_path, SPECIFICATION)
     study, broken = ("study", "spec.toml", "--out", "out"), (1, 7, 10)

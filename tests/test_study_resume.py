@@ -17,8 +17,6 @@ from small_study import COMMAND, SPECIFICATION, cells, finish, results, run_stud
 from jaxos4.study import load_study
 from jaxos4.study.dataset import open_store, read_store
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
@@ -39,6 +37,7 @@ def written(out: pathlib.Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in out.glob("cells/[0-9]*.npz")}
 
 
+@pytest.mark.slow
 def test_a_study_is_the_same_after_any_number_of_kills_and_on_any_number_of_devices(whole, tmp_path):
     """The processes that are killed have one device; the process that finishes the study has two."""
     out, moments, kills = tmp_path / "out", random.Random(1), 0
@@ -64,6 +63,7 @@ def test_a_study_is_the_same_after_any_number_of_kills_and_on_any_number_of_devi
     assert finished.items() <= written(out).items()  # no finished cell is computed again
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_resumes(whole, tmp_path):
     # A long training runs in a thread that cannot be interrupted.
     text = (
@@ -92,6 +92,7 @@ class InterruptedAtItsEnd:
         raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_an_interrupt_that_python_drops_ends_a_study_too(whole, copy, run, monkeypatch):
     (copy / "results.nc").unlink()
     (copy / "cells/00000019.npz").unlink()
@@ -115,6 +116,7 @@ def test_an_interrupt_that_python_drops_ends_a_study_too(whole, copy, run, monke
     assert run("study", "spec.toml", "--out", "out")[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("after", "name"), [(0, "00000019.npz"), (1, "00000040.npz"), (2, "results.nc"), (0, "study.json")]
 )
@@ -143,6 +145,7 @@ def test_a_full_disk_is_one_line_and_the_study_resumes_later(whole, copy, run, m
         xr.testing.assert_identical(results(copy), results(whole))
 
 
+@pytest.mark.slow
 def test_a_second_run_is_refused_during_the_first_and_where_nothing_can_be_written(copy, run, monkeypatch):
     command = ("study", "spec.toml", "--out", "out")
     with open_store(copy, load_study(copy.parent / "spec.toml"), "the first"):
@@ -156,6 +159,7 @@ def test_a_second_run_is_refused_during_the_first_and_where_nothing_can_be_writt
     refused(run(*command[:-1], "empty"), "study.json", "not writable")
 
 
+@pytest.mark.slow
 def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole, run):
     cell, older = copy / "cells" / "00000030.npz", (copy / "results.nc").read_bytes()
     data, other = cell.read_bytes(), whole / "cells" / "00000023.npz"  # three flights, where four belong
@@ -169,6 +173,7 @@ def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole,
     assert cells(copy) == cells(whole)
 
 
+@pytest.mark.slow
 def test_a_folder_whose_specification_is_damaged_is_refused(copy, run):
     other = '{"version": "0.0.1", "device": "d", "study": {"of": "old"}}'
     contents = dict.fromkeys(("", "\x00\x01", "[1, 2]", "[" * 100_000), "give another folder")
@@ -190,6 +195,7 @@ def test_a_folder_with_other_files_is_refused_and_unchanged(run, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
 
 
+@pytest.mark.slow
 def test_half_written_files_of_a_killed_run_are_no_obstacle(copy, whole, run):
     for place in (".study.0123abcd.part.json", ".results.0123abcd.part.nc", "cells/.00000003.0123abcd.part.npz"):
         (copy / place).write_bytes(b"half")

@@ -12,8 +12,6 @@ from jaxos4 import estimators
 from jaxos4.results import NAMES
 from jaxos4.shooting import InnovationsProblem
 
-pytestmark = pytest.mark.slow
-
 HELD = {"alpha2": 0.0079, "alpha7": 0.01}
 PLACES = [1, 6]
 ESTIMATORS = {name: kind() for name, kind in estimators.ESTIMATORS.items() if not kind.needs_network}
@@ -25,6 +23,7 @@ def noisy_problem():
     return standard_problem(jaxos4.CorrectedOS4, channels="rates", states=noisy_states(1, jaxos4.CorrectedOS4)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_a_held_parameter_keeps_its_value_and_has_no_variance(name):
     found = ESTIMATORS[name](noisy_problem().hold(HELD))
@@ -40,6 +39,7 @@ def test_a_held_parameter_keeps_its_value_and_has_no_variance(name):
         assert (np.asarray(found.std)[others] <= 1.1 * np.asarray(free.std)[others]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ibss", "output-error", "kalman", "equation-error"])
 def test_the_others_are_estimated_without_error_if_the_held_values_are_true(name):
     model = jaxos4.CorrectedOS4()
@@ -50,6 +50,7 @@ def test_the_others_are_estimated_without_error_if_the_held_values_are_true(name
     assert (np.abs(found.parameters - model.alpha) <= tolerance).all()
 
 
+@pytest.mark.slow
 def test_a_held_parameter_needs_neither_a_start_nor_a_bracket():
     """A start elsewhere does not move it, and its bracket may be empty."""
     problem = noisy_problem().hold(HELD)
@@ -62,6 +63,7 @@ def test_a_held_parameter_needs_neither_a_start_nor_a_bracket():
         assert (np.abs(other.parameters - found.parameters) <= 0.01 * found.std).all()
 
 
+@pytest.mark.slow
 def test_held_parameters_are_no_degrees_of_freedom():
     problem = noisy_problem()
     residuals = problem.residuals(problem.model.alpha)
@@ -70,6 +72,7 @@ def test_held_parameters_are_no_degrees_of_freedom():
     assert held / free == pytest.approx(np.sqrt((1 - 8 / count) / (1 - 6 / count)), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shooting", "innovations"])
 def test_information_about_held_unknowns_is_left_out(kind):
     """Gradient and information of the others do not change."""

@@ -27,8 +27,6 @@ from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.gains import LogNoise
 from jaxos4.shooting.innovations import SETTLING
 
-pytestmark = pytest.mark.slow
-
 DT, SAMPLES = 0.004, SETTLING + 8 * 384
 ANGLES_AND_RATES = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "p", "q", "r")]
 TERMS = ("offset", "lag", "delay", "accelerometer")
@@ -117,6 +115,7 @@ def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
     assert chosen_place([vague, *near[1:]]) == 1
 
 
+@pytest.mark.slow
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
     monkeypatch.setattr(uncertainty, "PROFILE", Profile(well_known=0.0))
@@ -134,6 +133,7 @@ def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     assert noted <= {"alpha3", "alpha6", "alpha8"}
 
 
+@pytest.mark.slow
 def test_a_sample_time_that_is_given_has_the_answer_of_the_rule():
     """The same samples, numbers and checks."""
     chosen = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))
@@ -169,6 +169,7 @@ def test_the_noise_of_an_accelerometer_is_at_least_its_count_and_half_of_its_sec
         assert prepared.force_noise[2] == pytest.approx(least, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     data = data_of(flown(), 2 * DT)
@@ -193,6 +194,7 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
 # The likelihood.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.0, 0.0])
 def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share):
     """The dense covariance of a smoothed Ornstein-Uhlenbeck process, with a gap.
@@ -241,6 +243,7 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share)
     assert abs(of_other - of_all) > 1e-3 * abs(dense)
 
 
+@pytest.mark.slow
 def test_the_weight_tells_the_error_of_the_accelerometer():
     """Not of the thrust: the airframe says 20 % less than there is."""
     flight = flown()
@@ -257,6 +260,7 @@ def test_the_weight_tells_the_error_of_the_accelerometer():
     assert other.level[0] - value == pytest.approx(0.11, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measured", [ANGLES_AND_RATES, ANGLES_AND_RATES[3:]], ids=["attitude", "rates alone"])
 @pytest.mark.parametrize(("tilt", "period"), [(0.0, 12.0), (0.1, 6.0), (0.35, 12.0), (0.35, 6.0), (0.5, 8.0)])
 def test_a_vehicle_that_circles_is_carried_by_its_force(measured, tilt, period):
@@ -282,6 +286,7 @@ def test_a_vehicle_that_circles_is_carried_by_its_force(measured, tilt, period):
     assert prepared.level is None  # no calibration: the fit says that the axis points down
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_leans_is_carried_by_its_drag_too():
     """In steady flight all forces carry the weight, whatever the tilt; what is left is the accelerometer's error."""
     samples, tilt = 400, (0.1, -0.2, 0.0)
@@ -297,6 +302,7 @@ def test_a_vehicle_that_leans_is_carried_by_its_drag_too():
     assert abs(prepared.level[0] - 0.1) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_wrong_accelerometer_is_doubted():
     """It is known from the weight, whether the fit estimates it or not."""
     flight = dataclasses.replace(flown(), specific_force=np.asarray(flown().specific_force) + [0.0, 0.0, 1.5])
@@ -306,6 +312,7 @@ def test_a_wrong_accelerometer_is_doubted():
     assert [d.cause for d in found.doubts if "levelled accelerometer" in d.cause] != []
 
 
+@pytest.mark.slow
 def test_shifted_clocks_give_the_same_inertias():
     """The motors are recorded 20 ms early or late: only `rotor_delay` says so."""
     flight, found = flown(), {}

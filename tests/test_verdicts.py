@@ -28,8 +28,6 @@ from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
 from jaxos4.recording.stretches import cut
 
-pytestmark = pytest.mark.slow
-
 IDENTIFIED, RESERVED = "identified", "identified with a reservation"
 MISSING, CONTRADICTED = "not identified", "contradicted"
 
@@ -166,6 +164,7 @@ def fitted():
     return case, Solution(data, corrected(optimum, data))
 
 
+@pytest.mark.slow
 def test_a_parameter_at_another_value_moves_the_others(fitted):
     """The cost rises by as much as the parameter says. The thrust is the scale of the inertias."""
     answer = fitted[1].answer
@@ -213,6 +212,7 @@ def halved(states):
     return states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", ["rates", "all"])
 def test_an_os4_flight_whose_rates_are_halved_is_contradicted(channels):
     flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(standard_flight(), key=jax.random.key(0))
@@ -255,7 +255,7 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
         assert abs(row.estimate - truth) < 3 * row.std
     assert vehicle.verdicts["Iz"].status == MISSING
     known = vehicle_constants(solution.answer._replace(fixed={})).constants["Iz"]
-    assert known.note == "if mass and the drag coefficient 7.5e-07 are right"
+    assert known.note == "if mass and the ratio of drag to thrust, 0.024 m, are right"
     assert "fly more yaw" in vehicle.verdicts["Iz"].reasons[0]
     assert "s ahead" in vehicle.verdicts["predictions"].value
     written = vehicle.to_dict()
@@ -302,6 +302,7 @@ def heavier():
     return flown(airframe, duration=12.0, seed=3, name="heavy.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", SPOILED)
 def test_what_the_log_shows_counts_against_the_inertias_before_a_fit(fault):
     spoil, status, cause = SPOILED[fault]

@@ -17,8 +17,6 @@ from jaxos4.identification.physical import physical_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, RigidBody
 from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, RESERVED
 
-pytestmark = pytest.mark.slow
-
 
 def drawn(number):
     """A flight whose alphas lie inside 60 % of the default brackets, and these alphas."""
@@ -35,6 +33,7 @@ def changed(flight, *, scale=1.0, order=(0, 1, 2)):
     return {"states": states}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
 def test_alphas_of_no_rigid_body_contradict_the_rigid_body_alone(number):
     alpha, flight = drawn(number)
@@ -48,9 +47,10 @@ def test_alphas_of_no_rigid_body_contradict_the_rigid_body_alone(number):
     z = [(row.estimate - truth) / row.std for row, truth in zip(found.parameters.values(), alpha, strict=True)]
     assert np.abs(z).max() < 3.5
     assert np.mean(np.abs(z) < 1.96) >= 7 / 8
-    lines = found.summary(width=200).splitlines()
-    assert lines[0].startswith("identified: alpha1; ")
-    assert ": successful," in lines[-1]
+    lines = found.summary(width=1000).splitlines()
+    assert lines[0].startswith("alpha1, ")
+    assert lines[0].endswith(": identified.")
+    assert ": successful," in lines[-2]
 
 
 FAULTY = {
@@ -61,6 +61,7 @@ FAULTY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", ["all", "rates"])
 @pytest.mark.parametrize("fault", FAULTY)
 def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels):
@@ -72,8 +73,9 @@ def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels)
     )
     assert found.result == "implausible"
     assert {verdict.status for verdict in found.verdicts.values()} == {CONTRADICTED}
-    # The first line says what the last one says.
-    assert found.summary(width=200).splitlines()[0].startswith("contradicted: alpha1")
+    first, *_ = found.summary(width=200).splitlines()
+    assert first.startswith("alpha1, ")
+    assert first.endswith(", rigid body: refused (contradicted).")
 
 
 def alpha_table(**alphas):
@@ -115,6 +117,7 @@ def test_a_rotor_inertia_below_noise_is_no_physical_value():
     assert "J_R below noise" in found.summary(width=300)
 
 
+@pytest.mark.slow
 def test_coloured_residuals_are_a_reservation():
     flight, slow = standard_flight(), jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.1)
     found = jaxos4.identify(slow(flight, key=jax.random.key(1)), jaxos4.PublishedOS4())
@@ -134,6 +137,8 @@ def test_an_alpha_that_is_not_excited_does_not_refuse_the_others():
     refused = {name for name, verdict in found.verdicts.items() if not verdict.trusted}
     assert refused == {"alpha1", "alpha4", "alpha7"}
     assert found.verdicts["alpha3"].status == IDENTIFIED
-    first, second, *_ = found.summary(width=200).splitlines()
-    assert first == "not identified: alpha1; alpha4; alpha7."
-    assert second.startswith("identified with a reservation: ")
+    assert found.summary(width=200).splitlines()[:3] == [
+        "alpha3, alpha6, alpha8, rigid body: identified.",
+        "alpha2, alpha5: use with care.",
+        "alpha1, alpha4, alpha7: refused (not identified).",
+    ]
