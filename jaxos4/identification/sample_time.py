@@ -24,6 +24,7 @@ from .answers import Answer, overwhelmed, vehicle_constants
 from .data import Data, Progress, silent
 from .results import Constant, SampleTime
 from .search import Optimum, search
+from .uncertainty import corrected
 
 
 class SampleTimeRule(NamedTuple):
@@ -46,6 +47,27 @@ class SampleTimeRule(NamedTuple):
 
 
 RULE = SampleTimeRule()
+
+
+def fit_sample_times(
+    several: Sequence[Data[InnovationsProblem]], solver: AbstractEstimator, *, choose: bool, progress: Progress
+) -> tuple[list[Optimum], list[SampleTime]]:
+    """The optimum and the answer at each sample time, the shortest first.
+
+    Where commands are answered within a sample, feedthroughs hide nearly all that is compared. If the sample time is to
+    be chosen, such samples are fitted only if no shorter ones have white innovations.
+    """
+    clear = [each for each in several if not each.hides_answers] if choose else []
+    optima: list[Optimum] = []
+    rows: list[SampleTime] = []
+    for some in filter(None, (clear, several[len(clear) :])):
+        if any(row.constants and is_white(row) for row in rows):
+            break
+        found = search_sample_times(some, solver, progress=progress)
+        optima += found
+        progress("computing intervals")
+        rows += [sample_time_of(corrected(x, data)) for x, data in zip(found, some, strict=True)]
+    return optima, rows
 
 
 def search_sample_times(

@@ -28,11 +28,10 @@ from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
 from .problem import Intervals, bracket_of
-from .results import SampleTime
-from .sample_time import chosen_place, is_white, sample_time_of, search_sample_times
-from .search import Optimum, search
+from .sample_time import chosen_place, fit_sample_times, sample_time_of
+from .search import search
 from .settings import VehicleSettings, name_and_class
-from .uncertainty import at_lowest, corrected
+from .uncertainty import at_lowest
 
 DEFAULT = "filter-error"
 """The estimator of a vehicle, which flies in closed loop."""
@@ -102,27 +101,6 @@ class VehicleCase:
         """The estimate of each quantity, and the doubts about it."""
         progress("checking the answer")
         return check_vehicle(*solution, progress)
-
-
-def fit_sample_times(
-    several: Sequence[Data[InnovationsProblem]], solver: AbstractEstimator, *, choose: bool, progress: Progress
-) -> tuple[list[Optimum], list[SampleTime]]:
-    """The optimum and the answer at each sample time, the shortest first.
-
-    Where commands are answered within a sample, feedthroughs hide nearly all that is compared. If the sample time is to
-    be chosen, such samples are fitted only if no shorter ones have white innovations.
-    """
-    clear = [each for each in several if not each.hides_answers] if choose else []
-    optima: list[Optimum] = []
-    rows: list[SampleTime] = []
-    for some in filter(None, (clear, several[len(clear) :])):
-        if any(row.constants and is_white(row) for row in rows):
-            break
-        found = search_sample_times(some, solver, progress=progress)
-        optima += found
-        progress("computing intervals")
-        rows += [sample_time_of(corrected(x, data)) for x, data in zip(found, some, strict=True)]
-    return optima, rows
 
 
 def prepare_vehicle(
