@@ -108,6 +108,7 @@ def run(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")  # the devices of this process are fixed by now
+    monkeypatch.setattr("jaxos4.cli._shared.PERIOD", 1e6)  # a slow machine prints the same
 
     def call(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["jaxos4", *arguments])

@@ -239,8 +239,10 @@ REFUSED = {
     f"{EXPORT} --seed -1": ["--seed", "-1"],
     f"{EXPORT} --out found.json": ["would overwrite an input"],
     f"{EXPORT} --out nowhere/vehicle.xml": ["nowhere/vehicle.xml", "no such folder"],
-    f"{EXPORT} --out . --samples 2": [".: is a folder"],
-    f"{EXPORT} --out taken.xml --samples 2": ["taken-samples: exists", "remove it"],
+    f"{EXPORT} --out . --samples 2": [".: holds ", "give another folder"],
+    f"{EXPORT} --out flight.csv --samples 2": ["flight.csv: is no folder"],
+    f"{EXPORT} --out new.xml --samples 2": ["--out new.xml: with --samples, this is a folder"],
+    f"{EXPORT} --out nowhere/vehicles --samples 2": ["nowhere/vehicles", "no such folder"],
     f"{EXPORT} --to gazebo": ["'gazebo' is not one of 'mujoco', 'rotorpy', 'sdf'"],
     "export none.json --to sdf": ["none.json", "give a path"],
 }
@@ -257,7 +259,6 @@ def inputs(tmp_path_factory):
     for name, text in (INPUTS | others).items():
         (folder / name).write_text(text)
     (folder / "log").write_text("nobody reads it")
-    (folder / "taken-samples").mkdir()
     return folder
 
 

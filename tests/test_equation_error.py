@@ -1,5 +1,6 @@
 """Equation error, in batch and recursive: against plain NumPy, with noise, with gaps, and when things go wrong."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from helpers import DT, OS4, noisy_states, standard_flight, standard_problem
 from lanes import HALF, bound, errors, lost, names
 
 import jaxos4
-from jaxos4.estimators.equation_error import EquationError, RecursiveLeastSquares
+from jaxos4.estimators.equation_error import EquationError, RecursiveLeastSquares, normal_equations
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 KINDS = EquationError, RecursiveLeastSquares
@@ -156,3 +157,13 @@ def test_a_gap_in_one_rate_leaves_the_equations_without_it_alone_and_one_that_is
     assert growth[2] < growth[5]
     bridged, split = (estimated(lost(noisy_states(1, seed=7)[0]), bridge=bridge) for bridge in (4, 0))
     assert (split.std > 5 * bridged.std).all()
+
+
+@pytest.mark.parametrize("columns", [20, 200])
+def test_normal_equations_of_pooled_logs_fit_into_memory(columns):
+    """The products of 200 columns and 60,000 rows would take 19 GB."""
+    rows = np.random.default_rng(0).normal(size=(20_000, 3, columns + 1))
+    information, moment = jax.jit(normal_equations)(rows)
+    flat = rows.reshape(-1, columns + 1)
+    np.testing.assert_allclose(information, flat[:, :-1].T @ flat[:, :-1], rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(moment, flat[:, :-1].T @ flat[:, -1], rtol=1e-9, atol=1e-6)

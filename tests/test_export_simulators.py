@@ -246,13 +246,17 @@ def test_the_programs_of_the_page_run(run, mujoco, monkeypatch, tmp_path, target
     """The vehicle hovers in each simulator, and every sample of it too, by the programs that the page prints."""
     pytest.importorskip(target)
     read(tmp_path, vehicle_result())
-    code, _, err = run("export", "found.json", "--to", target, "--out", f"vehicle.{suffix}", "--samples", "3")
-    assert code == 0, err
+    for options in (("--out", f"vehicle.{suffix}"), ("--out", "vehicles", "--samples", "3")):
+        code, _, err = run("export", "found.json", "--to", target, *options)
+        assert code == 0, err
     mine = [program for name, program in zip(PROGRAMS, blocks(PAGE, "python"), strict=True) if name == target]
     monkeypatch.syspath_prepend(tmp_path)
     defined = {}
     for program in mine:
         exec(program, defined)  # noqa: S102
-    flown = [(defined["height"], defined["tilt"]), *defined.get("drawn", [])]
+    flown = [(defined["height"], defined["tilt"]), *(each[:2] for each in defined.get("drawn", []))]
     assert len(flown) == {"mujoco": 4, "rotorpy": 1}[target]
     assert all(abs(height - 1) < 0.05 and tilt < 0.05 for height, tilt in flown)
+    if target == "mujoco":  # one controller turns three vehicles at three rates
+        assert defined["hovering"] == len(set(defined["peaks"])) == 3
+        assert defined["peaks"] == pytest.approx([defined["expected"].max()] * 3, rel=0.1)

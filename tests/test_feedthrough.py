@@ -213,6 +213,15 @@ def test_without_answers_within_a_sample_feedthroughs_are_fixed_and_gains_are_fr
         assert free["r_disturbance_gain_1"]
 
 
+def test_gains_of_no_input_innovation_are_fixed(rng):
+    """Nothing would hold them, and a search would follow them without end."""
+    problem = standard(rng, passed=2)
+    one = eqx.tree_at(lambda p: p.input_innovations, problem, problem.input_innovations.at[:, 1, 2].set(0.0))
+    free = dict(zip(one.unknowns.names, np.asarray(one.unknowns.free), strict=True))
+    fixed = [name for name, is_free in free.items() if not is_free]
+    assert fixed == ["r_rate_gain_2", "r_disturbance_gain_2", "r_feedthrough_2"]
+
+
 def test_input_innovations_must_fit_the_flight(rng):
     problem = standard(rng, passed=1).problem
     with pytest.raises(ValueError, match=r"`input_innovations` must have shape \(301, feedthroughs, 3\)"):

@@ -224,6 +224,13 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     np.testing.assert_array_equal(own.predicted[:, near], found.predictions.predicted[same, 0])
     np.testing.assert_allclose(np.diff(own.horizons), own.horizons[0])
     assert own.horizons[-1] == pytest.approx(0.5, abs=own.horizons[0])
+    # Vehicles are drawn from it as from the file, as wide as the moments of inertia are uncertain.
+    spread, key = jaxos4.export.read_result(found).spread, jax.random.key(1)
+    plain = {name: row.std for name, row in found.rigid_body.constants.items() if name not in spread.widened}
+    assert plain.keys() >= {"Ix", "Iy"}
+    assert {name: spread.std[spread.names.index(name)] for name in plain} == pytest.approx(plain)
+    drawn, again = found.sample(3, key=key), jaxos4.export.sample_vehicles(tmp_path / "found.json", 3, key=key)
+    assert all(np.allclose(drawn[name], again[name], rtol=1e-9, atol=0) for name in drawn)
 
 
 @pytest.mark.slow

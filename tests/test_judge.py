@@ -215,6 +215,27 @@ def test_the_jackknife_is_that_of_repeated_fits():
     assert factor[1] == 1 or ratio[1] ** 2 > chdtri(19, 0.05) / 19
 
 
+def test_the_jackknife_of_many_unknowns_is_quick_and_the_same(monkeypatch):
+    """Fifty logs have hundreds of unknowns, and least squares by singular values take half a second for each part."""
+    rng, unknowns, part = np.random.default_rng(6), 40, np.arange(60)
+    rows = rng.standard_normal((60, 50, unknowns))
+    information, gradient = np.einsum("lsi,lsj->lij", rows, rows), rng.standard_normal((60, unknowns)) * 20
+    asked = []
+    lstsq = np.linalg.lstsq
+    monkeypatch.setattr(np.linalg, "lstsq", lambda *given, **how: asked.append(given) or lstsq(*given, **how))
+    factors = disagreement(gradient, information, np.zeros((unknowns, unknowns)), part)
+    assert asked == []
+    assert (factors > 1).any()
+    doubled = [np.concatenate([each, each[..., :1]], axis=-1) for each in (gradient, information)]
+    doubled[1] = np.concatenate([doubled[1], doubled[1][:, :1]], axis=1)  # the first unknown twice: not determined
+    tiny = 1e-9 * np.eye(unknowns + 1)
+    assert np.isfinite(disagreement(*doubled, tiny, part)).all()
+    assert len(asked) == 60
+    monkeypatch.setattr("jaxos4.identification.uncertainty._CLEAR", np.inf)
+    slowly = disagreement(gradient, information, np.zeros((unknowns, unknowns)), part)
+    np.testing.assert_allclose(slowly, factors, rtol=1e-9)
+
+
 def test_parts_that_agree_widen_one_interval_in_twenty():
     rng, part = np.random.default_rng(4), parts_of(40, np.zeros(40, dtype=int))[0]
     trials = 400

@@ -1,13 +1,17 @@
 """Shared by the commands: values of options, checks of them, progress, messages in the words of options, and files."""
 
 import contextlib
+import errno
 import json
 import math
+import os
 import re
 import secrets
 import shlex
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +19,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from .._files import check_writable, read_toml, write_file
+from .._files import check_writable, read_json, read_toml, write_file
 from ..errors import InputError, printable
 from ..estimators import ESTIMATORS
 
@@ -54,9 +58,42 @@ def option_names(**files: Path | None) -> Iterator[None]:
         raise InputError(in_options(str(error), **files)) from None
 
 
+PERIOD = 10.0  # s; between lines of progress
+
+
+def stages(first: str, total: int | None = None) -> contextlib.AbstractContextManager[Callable[..., None]]:
+    """Shows a stage, the time, and how much of a `total` is done. Yields a function that changes them.
+
+    A terminal has one status, which moves; another stderr gets a line from time to time.
+    """
+    is_terminal = sys.stderr is not None and sys.stderr.isatty()
+    return (_status if is_terminal else _lines)(first, total)
+
+
 @contextlib.contextmanager
-def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """Shows a stage, the time, and a bar if there is a `total`, on a terminal. Yields a function that changes them."""
+def _lines(first: str, total: int | None) -> Iterator[Callable[..., None]]:
+    now, begin, ended = [first, None], time.monotonic(), threading.Event()
+
+    def tell() -> None:
+        while not ended.wait(PERIOD):
+            stage, done = now
+            share = f" ({done} of {total})" if total and done is not None else ""
+            with contextlib.suppress(OSError, ValueError, AttributeError):  # a stderr that is closed, or `None`
+                sys.stderr.write(f"jaxos4: {stage}{share}, {time.monotonic() - begin:.0f} s\n")
+                sys.stderr.flush()
+
+    def change(stage: str, done: int | None = None) -> None:
+        now[:] = stage, done
+
+    threading.Thread(target=tell, daemon=True).start()
+    try:
+        yield change
+    finally:
+        ended.set()
+
+
+@contextlib.contextmanager
+def _status(first: str, total: int | None) -> Iterator[Callable[..., None]]:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -70,7 +107,7 @@ def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]
     console = Console(stderr=True)
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total else ()
     columns = (SpinnerColumn(), "{task.description}", TimeElapsedColumn(), *columns)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(first, total=total)
         yield lambda stage, done=None: bar.update(task, description=stage, completed=done)
 
@@ -100,14 +137,52 @@ def end(result: str) -> None:
         raise typer.Exit(1)
 
 
+MANIFEST = "manifest.json"
+
+
+def check_folder(folder: Path) -> list[str]:
+    """Refuses a folder to write that cannot be made, or that holds files besides those that its manifest lists.
+
+    Returns the names of the files that it holds.
+    """
+    if not os.path.lexists(folder):
+        check_writable(folder)
+        return []
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; give the output another name.")
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(errno.EACCES, "is not writable", str(folder))
+    ours = {MANIFEST}
+    with contextlib.suppress(OSError, InputError, LookupError, TypeError):
+        ours |= {each["file"] for each in read_json(folder / MANIFEST, "")["vehicles"]}
+    names = sorted(each.name for each in folder.iterdir())
+    complete = MANIFEST in names and len(ours) > 1
+    others = [name for name in names if not complete or name not in ours or not (folder / name).is_file()]
+    if others:
+        raise InputError(
+            f"{folder}: holds {others[0]}, which no manifest there lists; give another folder, or empty it."
+        )
+    return names
+
+
 def write_folder(texts: dict[str, str], folder: Path) -> None:
-    """Writes text files, by name, into a new folder. It appears when all files are in it."""
-    beside = folder.with_name(f".{folder.name[:40]}.{secrets.token_hex(4)}.part")
+    """Writes text files, by name; the last is the manifest. A new folder appears when all files are in it.
+
+    In a folder that `check_folder` allows, new files replace those of the manifest, which is gone until all are there.
+    """
+    old, exists = check_folder(folder), folder.exists()
+    beside = (folder if exists else folder.parent) / f".{folder.name[:40]}.{secrets.token_hex(4)}.part"
     try:
         beside.mkdir()
         for name, text in texts.items():
             (beside / name).write_text(text, encoding="utf-8")
-        beside.rename(folder)
+        if exists:
+            for name in sorted(old, key=lambda name: name != MANIFEST):
+                (folder / name).unlink()
+            for name in texts:
+                (beside / name).rename(folder / name)
+        else:
+            beside.rename(folder)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(folder)) from None
     finally:
@@ -115,11 +190,15 @@ def write_folder(texts: dict[str, str], folder: Path) -> None:
 
 
 def write_json(report: dict[str, Any], out: Path) -> None:
-    """Writes a JSON file, each list of numbers on one line. A number that is not finite is an error of the program."""
+    """Writes a JSON file."""
+    write_file(out, json_text(report))
+
+
+def json_text(report: dict[str, Any]) -> str:
+    """JSON with each list of numbers on one line. A number that is not finite is an error of the program."""
     text = json.dumps(report, indent=2, allow_nan=False)
     # No string has a line break, because JSON escapes it.
-    text = re.sub(r"\[(\n\s+[^][{}\"]*)\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
-    write_file(out, text + "\n")
+    return re.sub(r"\[(\n\s+[^][{}\"]*)\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text) + "\n"
 
 
 # The names in the library's tables, written out because an import of these tables takes seconds; a test compares them.

@@ -62,11 +62,13 @@ def estimate(
         from ..identification import settings_for
         from ..recording import read_recording
 
-        progress("reading")
         vehicle = jaxos4.load_airframe(airframe or _OS4)
         # Without an airframe, commands are read only to find out that one is needed.
         full_scale = 1.0 if airframe is None and model in (None, "flight") else None
-        recordings = [read_recording(path, vehicle, full_scale=full_scale, columns=columns) for path in flights]
+        recordings = []
+        for number, path in enumerate(flights, start=1):
+            progress(f"reading {printable(path.name)} ({number} of {len(flights)})")
+            recordings.append(read_recording(path, vehicle, full_scale=full_scale, columns=columns))
         subject, evidence = _subject(recordings, model, vehicle, given=airframe is not None)
         found = jaxos4.identify(
             recordings,

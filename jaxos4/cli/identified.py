@@ -8,10 +8,21 @@ from typer import Argument, Option
 
 import jaxos4
 
-from .._files import check_writable, write_file
+from .._files import write_file
 from ..errors import InputError
 from . import _shared as options
-from ._shared import check_outputs, end, in_options, option_names, stages, write_folder, write_json
+from ._shared import (
+    MANIFEST,
+    check_folder,
+    check_outputs,
+    end,
+    in_options,
+    json_text,
+    option_names,
+    stages,
+    write_folder,
+    write_json,
+)
 
 
 def export(
@@ -19,9 +30,11 @@ def export(
     to: Annotated[
         options.Simulator, Option(help="MuJoCo (MJCF), RotorPy, SDF (Gazebo), drone_models (crazyflow) or URDF.")
     ],
-    out: Annotated[Path | None, Option(help="The file to write. Default: standard output.")] = None,
+    out: Annotated[
+        Path | None, Option(help="The file to write, or with --samples the folder. Default: standard output.")
+    ] = None,
     samples: Annotated[
-        int, Option(help="Also draw N vehicles from the covariance, into the folder OUT-samples.", metavar="N")
+        int, Option(help="Draw N vehicles from the uncertainty, one file each, with a manifest.", metavar="N")
     ] = 0,
     inertia_z: Annotated[
         float | None, Option(help="Iz to use [kg m^2], as far as a rigid body can have it: for one that is a guess.")
@@ -30,33 +43,36 @@ def export(
 ) -> None:
     """Write an identified vehicle for a simulator.
 
-    With --samples, also vehicles that are drawn from its uncertainty.
+    With --samples, vehicles that are drawn from its uncertainty instead, to vary them in training or in tests.
     """
     if samples > (most := 100_000):
         raise InputError(f"--samples: must be at most {most}, got {samples}.")
     if samples and out is None:
-        raise InputError("--samples: are written into a folder beside --out; give that too.")
-    check_outputs(result, out=out)
-    folder = out.with_name(f"{out.stem}-samples") if samples and out is not None else None
+        raise InputError("--samples: vehicles are written into a folder; give --out too.")
+    folder = out if samples > 0 else None
+    check_outputs(result, out=out if folder is None else None)
     if folder is not None:
-        if folder.exists():
-            raise InputError(f"{folder}: exists; remove it, or give the output another name.")
-        check_writable(folder)
+        check_folder(folder)
     with stages("loading the library") as progress, option_names():
         from ..export import TARGETS, export_vehicle, read_result
 
+        target = TARGETS[to]
+        if folder is not None and folder.suffix == target.suffix:
+            raise InputError(f"--out {out}: with --samples, this is a folder; give a name without {folder.suffix}.")
         progress("reading")
-        found, target = read_result(result, inertia_z=inertia_z), TARGETS[to]
+        found = read_result(result, inertia_z=inertia_z)
         progress("drawing and writing")
         written = export_vehicle(found, to, samples=samples, seed=seed)
-    if out is not None:
+    if out is None:
+        typer.echo(written.text, nl=False)
+    elif folder is not None:
+        files = (each["file"] for each in written.manifest["vehicles"])
+        write_folder(dict(zip(files, written.samples, strict=True)) | {MANIFEST: json_text(written.manifest)}, folder)
+        again = f"; {written.impossible} draws that no vehicle can have were repeated" if written.impossible else ""
+        typer.echo(f"{out}: {samples} vehicles, {target.label}, drawn with seed {seed}{again}")
+    else:
         write_file(out, written.text)
-    if folder is not None:
-        files = {f"{number:06}{target.suffix}": text for number, text in enumerate(written.samples, start=1)}
-        write_folder(files, folder)
-        again = f"; {written.impossible} impossible draws were repeated" if written.impossible else ""
-        typer.echo(f"{folder}: {samples} vehicles, drawn with seed {seed}{again}")
-    typer.echo(written.text if out is None else f"{out}: {target.label}", nl=out is not None)
+        typer.echo(f"{out}: {target.label}")
     for doubt in found.doubts:
         typer.echo(doubt, err=True)
     for note in written.notes:

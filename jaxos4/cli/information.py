@@ -48,6 +48,7 @@ def inspect(
         progress("reading")
         vehicle = None if airframe is None else jaxos4.load_airframe(airframe)
         recording = read_recording(log, vehicle, full_scale=1.0, columns=columns)
+        progress("checking")
         found = inspect_log(recording, vehicle)
         text, missing = ("", ()) if airframe_out is None else airframe_draft(recording)
     console = Console(highlight=False, markup=False)

@@ -30,6 +30,7 @@ Matrix = Float[Array, "parameters parameters"]
 # Standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It matters only
 # for parameters that are not excited.
 DIFFUSE = 1e6
+_MANY = 100  # columns; one flight has at most 30
 
 
 class Regression(NamedTuple):
@@ -208,10 +209,16 @@ class Regression(NamedTuple):
 
 
 def normal_equations(rows: Float[Array, "*rows columns"]) -> tuple[Matrix, Float[Array, " parameters"]]:
-    """X^T X and X^T y of rows [X, y]. Plain sums give the same digits alone and in a batch."""
+    """X^T X and X^T y of rows [X, y]. Plain sums give the same digits alone and in a batch.
+
+    Their products of the many columns of pooled logs, which are no batch, would not fit into any memory.
+    """
     rows = rows.reshape(-1, rows.shape[-1])
     regressors, output = rows[:, :-1], rows[:, -1]
-    information = (regressors[:, :, None] * regressors[:, None, :]).sum(axis=0)
+    if regressors.shape[1] > _MANY:
+        information = regressors.T @ regressors
+    else:
+        information = (regressors[:, :, None] * regressors[:, None, :]).sum(axis=0)
     return information, (regressors * output[:, None]).sum(axis=0)
 
 

@@ -1,6 +1,12 @@
 """An identified vehicle as a model for simulators: MuJoCo, RotorPy, SDF (Gazebo), drone_models (crazyflow) and URDF."""
 
-from .formats import TARGETS as TARGETS, Exported as Exported, Target as Target, export_vehicle as export_vehicle
+from .formats import (
+    TARGETS as TARGETS,
+    Exported as Exported,
+    Target as Target,
+    export_vehicle as export_vehicle,
+    sample_vehicles as sample_vehicles,
+)
 from .loop import found_loop as found_loop
 from .result import Identified as Identified, read_result as read_result
 from .vehicle import RigidVehicle as RigidVehicle

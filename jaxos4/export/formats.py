@@ -2,17 +2,22 @@
 
 import functools
 import math
+import os
 import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._templates import in_xml, templates
 from .._version import __version__
 from ..errors import InputError, printable
+from ..identification.results import Identification
 from ..results import meaning
-from .result import Identified
+from .result import Identified, read_result
 from .vehicle import RigidVehicle
 
 _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. Rotor 1 is the airframe's first."
@@ -52,13 +57,17 @@ class Exported(NamedTuple):
 
     - `text`: the estimated vehicle. `samples`: vehicles drawn from its uncertainty.
     - `impossible`: the number of impossible draws, which were repeated.
-    - `notes`: the effects that the simulator does not have, or has differently, as in each file; one line each.
+    - `notes`: the effects that the simulator does not have, or has differently, as in each file; then, of samples, why
+      they differ by more than the estimate's uncertainty; one line each.
+    - `manifest`: of the samples, ready for JSON: the Gaussian from which they are drawn, and the name of the file and
+      the constants of each vehicle (the fields of `RigidVehicle`).
     """
 
     text: str
     samples: tuple[str, ...]
     impossible: int
     notes: tuple[str, ...]
+    manifest: dict[str, Any]
 
 
 def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 0) -> Exported:
@@ -69,17 +78,16 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 
     - `found`: a result, from `read_result`.
     - `to`: the simulator, a name in `TARGETS`.
-    - `samples`: the number of vehicles to draw from the covariance of the estimate. Constants that were not estimated,
-      such as the mass, do not change. `seed`: for the draws. Sample i does not depend on the number of samples.
+    - `samples`: the number of vehicles to draw from the uncertainty of the estimate, the reservations of its verdicts,
+      and the width of guesses. Constants that were weighed or measured, such as the mass, do not change.
+    - `seed`: for the draws. Sample i does not depend on the number of samples.
 
     **Raises:** `InputError` for an unknown simulator, if `samples` or `seed` is not an integer of at least 0, or if
     hardly any draw is a possible vehicle.
     """
     if to not in TARGETS:
         raise InputError(f"`to`: must be one of {', '.join(TARGETS)}, got {to!r}.")
-    for name, value in (("samples", samples), ("seed", seed)):
-        if not isinstance(value, int) or value < 0:
-            raise InputError(f"`{name}`: must be an integer of at least 0, got {value!r}.")
+    _check_draws(samples, seed)
     target = TARGETS[to]
     warning = (
         () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {meaning(found.result)}.", *found.doubts)
@@ -96,12 +104,50 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 
     draws, estimated = [found.draw(number, seed=seed) for number in range(samples)], text(found.vehicle)
     limits = re.findall(r"^\W*Note: (.*)$", estimated, re.MULTILINE)[len(found.notes) :]
+    vehicles, notes = [vehicle for vehicle, _ in draws], (*found.notes, *limits)
+    impossible = sum(impossible for _, impossible in draws)
+    manifest = {"version": __version__, "source": found.source, "simulator": to, "seed": seed, "impossible": impossible}
+    manifest |= {"warnings": list(warning), "notes": [*notes, *found.notes_on_draws], "gaussian": found.gaussian}
+    manifest["vehicles"] = [
+        {"file": f"{number:06}{target.suffix}"} | {name: np.asarray(x).tolist() for name, x in each._asdict().items()}
+        for number, each in enumerate(vehicles, start=1)
+    ]
     return Exported(
         text=estimated,
-        samples=tuple(text(vehicle, f"Sample {i}, seed {seed}.") for i, (vehicle, _) in enumerate(draws, start=1)),
-        impossible=sum(impossible for _, impossible in draws),
-        notes=(*found.notes, *limits),
+        samples=tuple(text(vehicle, f"Sample {i}, seed {seed}.") for i, vehicle in enumerate(vehicles, start=1)),
+        impossible=impossible,
+        notes=(*notes, *found.notes_on_draws * bool(samples)),
+        manifest=manifest,
     )
+
+
+def sample_vehicles(
+    found: Identification | str | os.PathLike[str], samples: int, *, key: PRNGKeyArray
+) -> dict[str, Float[Array, "samples ..."]]:
+    """Vehicles drawn from the uncertainty of an estimate, the reservations of its verdicts, and the width of guesses.
+
+        vehicles = found.sample(64, key=jax.random.key(0))
+        jax.vmap(step, in_axes=(0, None))(vehicles, state)
+
+    **Returns:** the fields of `RigidVehicle` by name, with the vehicles along the leading axis of each.
+
+    Vehicle i depends on the key and on i alone. `jaxos4 export --samples` writes the same vehicles with `--seed` n as
+    `jax.random.key(n)` gives.
+
+    **Raises:** `InputError` as `read_result` and `export_vehicle` do.
+    """
+    words = np.asarray(jax.random.key_data(key), dtype=np.uint32).ravel().tolist()
+    seed = functools.reduce(lambda high, low: (high << 32) | low, words)
+    _check_draws(samples, seed, least=1)
+    vehicle = read_result(found)
+    drawn = [vehicle.draw(number, seed=seed)[0] for number in range(samples)]
+    return {name: jnp.array([getattr(each, name) for each in drawn]) for name in RigidVehicle._fields}
+
+
+def _check_draws(samples: int, seed: int, *, least: int = 0) -> None:
+    for name, value, limit in (("samples", samples, least), ("seed", seed, 0)):
+        if not isinstance(value, int) or value < limit:
+            raise InputError(f"`{name}`: must be an integer of at least {limit}, got {value!r}.")
 
 
 def _mujoco(vehicle: RigidVehicle) -> dict[str, Any]:

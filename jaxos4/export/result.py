@@ -1,20 +1,19 @@
-"""Result files of `jaxos4 estimate`, and vehicles drawn from the uncertainty of a result."""
+"""Results of `jaxos4 estimate`, and vehicles drawn from the uncertainty of a result."""
 
 import itertools
 import math
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from ..airframe import AXES, INERTIAS, YAW, Airframe
 from ..errors import InputError, named, printable
 from ..identification.results import Identification
-from ..linalg import covariance_root
 from ..models.flight_model import without_recording
 from ..result_file import vehicle_result
+from .spread import DRAG, Spread, spread_of
 from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # Why some parameters are not carried; notes on the rotors' inertia name alpha2 and alpha5. All others have one note.
@@ -26,6 +25,8 @@ _NOT_CARRIED = {
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
 
+_MAY_BE_POSITIVE = 2.0  # standard deviations below 0: one draw in 44 is positive
+
 
 class Identified(NamedTuple):
     """A vehicle from a result file.
@@ -34,7 +35,8 @@ class Identified(NamedTuple):
     - `result`: the name of the result code. If it is not `"successful"`, the estimate cannot be trusted.
     - `airframe`: the constants that were not estimated.
     - `values`: all parameters by name, estimated or fixed.
-    - `drawn`, `covariance`: the names of the parameters that are uncertain, and their covariance.
+    - `identifies_iz`: whether the flights show Iz, if the airframe's drag coefficient is right.
+    - `spread`: how far drawn vehicles differ.
     - `doubts`: why the estimate cannot be trusted, or only with care, and what to do; one line each. Empty if the
       result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.
@@ -45,8 +47,8 @@ class Identified(NamedTuple):
     result: str
     airframe: Airframe
     values: dict[str, float]
-    drawn: tuple[str, ...]
-    covariance: Float[np.ndarray, "drawn drawn"]
+    identifies_iz: bool
+    spread: Spread
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
     inertia_z: float | None = None
@@ -61,11 +63,6 @@ class Identified(NamedTuple):
         """The vehicle with the estimated parameters."""
         return self._made(self.values)
 
-    @property
-    def identifies_iz(self) -> bool:
-        """Whether the flights show Iz, if the airframe's drag coefficient is right."""
-        return YAW.inverse in self.drawn
-
     def _made(self, values: dict[str, float]) -> RigidVehicle:
         estimated = rigid_vehicle(self.airframe, values)
         ix, iy, iz = estimated.inertia
@@ -73,8 +70,7 @@ class Identified(NamedTuple):
             return estimated
         rounding = 1e-9
         allowed = min(max(self.inertia_z, (1 + rounding) * abs(ix - iy)), (1 - rounding) * (ix + iy))
-        gain = values.get("thrust_gain", 1.0)
-        vehicle = rigid_vehicle(self.airframe, values | {YAW.inverse: gain / allowed})
+        vehicle = rigid_vehicle(self.airframe, {**values, YAW.inertia: allowed})
         if not self.identifies_iz:
             return vehicle
         # Flights show the yaw torque over Iz: another Iz means another drag coefficient.
@@ -83,25 +79,44 @@ class Identified(NamedTuple):
     def draw(self, number: int, *, seed: int, most: int = 1000) -> tuple[RigidVehicle, int]:
         """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
 
-        It depends on its `number` and the seed alone. A damping, drag, lag or delay that is drawn negative is 0.
-        Raises `InputError` if `most` draws are impossible.
+        It depends on its `number` and the seed alone. Raises `InputError` if `most` draws without a negative parameter
+        are impossible.
         """
-        generator = np.random.default_rng([seed, number])
-        root = covariance_root(self.covariance)
-        for impossible in range(most):
-            errors = root @ generator.standard_normal(len(root))
-            changed = {name: self.values[name] + float(error) for name, error in zip(self.drawn, errors, strict=True)}
-            vehicle = self._made(_clipped(self.values | changed))
+        for impossible, drawn in itertools.islice(self.spread.draws(number, seed=seed), most):
+            vehicle = self._made(self.values | drawn)
             if not vehicle.impossible:
                 return vehicle, impossible
         raise InputError(
-            f"`samples`: the estimate is too uncertain: {most} draws gave no possible vehicle; export without "
-            "samples, or fly with more excitation."
+            "`samples`: the estimate is too uncertain: hardly any draw is a possible vehicle; export without samples, "
+            "or fly with more excitation."
         )
 
+    @property
+    def gaussian(self) -> dict[str, dict[str, Any]]:
+        """Mean, standard deviation, unit and origin of each constant that varies, ready for JSON.
 
-def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None) -> Identified:
-    """Read a file that `jaxos4 estimate --out` wrote.
+        Without Iz and what follows from it, if Iz was given.
+        """
+        given = () if self.inertia_z is None else (YAW.inertia, DRAG)
+        rows = zip(
+            self.spread.names, self.spread.mean.tolist(), self.spread.std.tolist(), self.spread.units, strict=True
+        )
+        return {
+            name: {"mean": mean, "std": std, "unit": unit, "origin": self.spread.widened.get(name, "the estimate")}
+            for name, mean, std, unit in rows
+            if name not in given
+        }
+
+    @property
+    def notes_on_draws(self) -> tuple[str, ...]:
+        """Why drawn vehicles differ by more than the estimate's uncertainty; one line each."""
+        rows = {name: row for name, row in self.gaussian.items() if name in self.spread.widened}
+        sizes = {name: f"{row['std']:.3g} {row['unit']}".strip().removesuffix(" 1") for name, row in rows.items()}
+        return tuple(f"{name}: varies by {sizes[name]} (std): {row['origin']}" for name, row in rows.items())
+
+
+def read_result(found: Identification | str | os.PathLike[str], *, inertia_z: float | None = None) -> Identified:
+    """The vehicle of an identification, or of a file that `jaxos4 estimate --out` wrote.
 
     `inertia_z`: Iz [kg m^2] instead of the estimate, as far as a rigid body with these Ix and Iy can have it.
 
@@ -110,36 +125,39 @@ def read_result(path: str | os.PathLike[str], *, inertia_z: float | None = None)
     """
     if inertia_z is not None and not 0 < inertia_z < math.inf:
         raise InputError(f"`inertia_z`: must be positive, got {inertia_z:g}.")
-    file = vehicle_result(path)
-    with named(path):
+    file = vehicle_result(found)
+    with named("" if isinstance(found, Identification) else found):
         values, estimated, notes = _parts(file)
         negative = [name for name in NOT_NEGATIVE if values.get(name, 0.0) < 0]
-        notes += [f"{name}: came out negative, which is impossible; it is 0 here" for name in negative]
+        # One that may be positive is drawn, from the part of its Gaussian that is.
+        never = [name for name in negative if values[name] < -_MAY_BE_POSITIVE * (file.parameters[name].std or 0.0)]
+        varies = {name: "" if name in never else ", and above 0 in samples" for name in negative}
+        notes += [f"{name}: came out negative, which is impossible; it is 0 here{varies[name]}" for name in negative]
         if not np.isfinite(file.airframe.max_rotor_speed):
             notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
-        drawn = tuple(name for name in estimated if name not in negative)
-        places = [list(file.parameters).index(name) for name in drawn]
-        found = Identified(
-            source=f"{printable(Path(path).name)} ({file.estimator}, {file.model} model, {file.result})",
+        source = printable(", ".join(file.logs) if isinstance(found, Identification) else Path(found).name)
+        exported = Identified(
+            source=f"{source} ({file.estimator}, {file.model} model, {file.result})",
             result=file.result,
             airframe=file.airframe,
-            values=_clipped(values),
-            drawn=drawn,
-            covariance=np.array(file.covariance)[np.ix_(places, places)],
+            values=values | dict.fromkeys(negative, 0.0),
+            identifies_iz=YAW.inverse in estimated,
+            spread=Spread(),
             doubts=file.warnings,
             notes=tuple(notes),
             inertia_z=inertia_z,
         )
         if inertia_z is not None:
-            own = tuple(note for note in found.notes if not note.startswith("Iz: "))
-            found = found._replace(notes=(*own, _given_note(found, inertia_z)))
-        if why := found.vehicle.impossible:
-            guessed = inertia_z is None and not found.identifies_iz and why.startswith(INERTIAS)
+            own = tuple(note for note in exported.notes if not note.startswith("Iz: "))
+            exported = exported._replace(notes=(*own, _given_note(exported, inertia_z)))
+        if why := exported.vehicle.impossible:
+            guessed = inertia_z is None and not exported.identifies_iz and why.startswith(INERTIAS)
             guess = "; Iz was not identified and is a guess: give `inertia_z`" if guessed else ""
             raise InputError(
                 f"no vehicle is like this: {why}{guess}; correct the airframe, or fly with more excitation."
             )
-        return found
+        drawn = [name for name in estimated if name not in never]
+        return exported._replace(spread=spread_of(file, values, drawn, rigid_vehicle(file.airframe, values)))
 
 
 def _given_note(found: Identified, inertia_z: float) -> str:
@@ -152,11 +170,6 @@ def _given_note(found: Identified, inertia_z: float) -> str:
         factor = vehicle.drag_coefficient / estimated.drag_coefficient
         note += f"; the drag coefficient is {factor:.4g} times the airframe's, so that it yaws as the flight showed"
     return note
-
-
-def _clipped(values: dict[str, float]) -> dict[str, float]:
-    """Replaces negative values by 0 if no vehicle has them."""
-    return {name: max(value, 0.0) if name in NOT_NEGATIVE else value for name, value in values.items()}
 
 
 def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str, float], list[str], list[str]]:
@@ -195,9 +208,6 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
         notes.append(f"{', '.join(lost)}: not carried: an exported vehicle of this version has no such parameters")
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
-    fixed = [name for name in values.keys() - found.keys() if without_recording(name) in CARRIED]
-    if fixed:
-        notes.append(f"do not vary in samples, because the flights do not identify them: {', '.join(sorted(fixed))}")
     zero = [name for name in (*(axis.inverse for axis in AXES), "thrust_gain") if values.get(name) == 0]
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")

@@ -103,6 +103,11 @@ class RigidVehicle(NamedTuple):
             return "one of its constants is beyond those of every vehicle"
         if not self.thrust_coefficient > 0:
             return "the thrust is not positive"
+        if not self.drag_coefficient > 0:
+            return "the drag of the rotors is not positive"
+        angles = np.sort(np.arctan2(*self.rotor_positions.T))
+        if not np.diff(angles, append=angles[0] + 2 * np.pi).max() < np.pi:
+            return "the centre of mass lies outside the arms"
         if not 0 <= 4 * self.rotor_inertia < self.inertia[2]:
             return "the rotors have no inertia that a part of the vehicle can have"
         if not 0 < self.thrust_curve < 2:
@@ -115,11 +120,16 @@ class RigidVehicle(NamedTuple):
 
 @np.errstate(all="ignore")  # `impossible` says what is not finite
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
-    """The vehicle with parameters of a `FlightModel`, by name, and else the airframe's. Offsets are averaged."""
+    """The vehicle with parameters of a `FlightModel` by name, and else the airframe's. Offsets are averaged.
+
+    `values` can have Ix, Iy, Iz instead of their alphas, and the airframe's `drag_coefficient` and `rotor_inertia`.
+    """
     mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)
     for place, axis in enumerate(AXES):
-        if axis.inverse in values:
+        if axis.inertia in values:
+            inertia[place] = values[axis.inertia]
+        elif axis.inverse in values:
             # Torques exceed the airframe's by the same factor as thrust.
             inertia[place] = gain / values[axis.inverse]
     offsets = ([x for name, x in values.items() if name.startswith(f"{axis}_offset")] for axis in MOTIONS)
@@ -131,7 +141,8 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)
     center = np.array([coordinate.value for coordinate in found])
     reaction = values.get("rotor_reaction")
-    rotor_inertia = float(airframe.rotor_inertia) if reaction is None else reaction * inertia[2]
+    rotor_inertia = values.get("rotor_inertia", float(airframe.rotor_inertia))
+    rotor_inertia = rotor_inertia if reaction is None else reaction * inertia[2]
     speed = float(airframe.max_rotor_speed)
     drag = np.array([values.get(f"{axis}_drag", 0.0) for axis in "xyz"])
     moment = [values.get(f"{axis}_velocity", 0.0) for axis in MOTIONS[:2]]
@@ -142,7 +153,7 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
         rotor_positions=np.asarray(airframe.rotor_positions, dtype=float) - center,
         rotor_spins=np.asarray(airframe.rotor_spins, dtype=float),
         thrust_coefficient=gain * float(airframe.thrust_coefficient),
-        drag_coefficient=gain * float(airframe.drag_coefficient),
+        drag_coefficient=gain * values.get("drag_coefficient", float(airframe.drag_coefficient)),
         rotor_inertia=rotor_inertia,
         max_rotor_speed=speed,
         lag=values.get("rotor_lag", 0.0),

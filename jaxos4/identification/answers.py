@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import Parameters
-from ..airframe import AXES, INERTIAS, INVERSES, MOTIONS, YAW
+from ..airframe import AXES, INERTIAS, INVERSES, MOTIONS, YAW, Airframe
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.evaluation import Evaluation
 from ..analysis.inertia import fit_inertia
@@ -19,7 +19,7 @@ from ..models.abstract import PARAMETER_NAMES
 from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
 from ..models.state import CASCADE_ORDER
-from ..models.terms import COMMANDS, TERMS
+from ..models.terms import follows_commands
 from ..shooting import ShootingProblem
 from .data import Data
 from .results import (
@@ -209,21 +209,24 @@ def rigid_body(answer: Answer) -> RigidBody:
 
 
 def thrust_excess(answer: Answer) -> float:
-    """By which share the thrust exceeds that of the airframe; 0 if the logs do not show it."""
+    """By which share the thrust exceeds that of the airframe at the same speeds; 0 if the logs do not show it."""
     model, values = answer.problem.model, np.asarray(answer.estimate.parameters)
+    if isinstance(model, FlightModel) and follows_commands(model.terms):
+        return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
     gains = [values[i] for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
     return float(np.prod(gains)) - 1
 
 
 def drag_error(answer: Answer) -> float:
     """The standard deviation of the ratio of drag to thrust, as a share, by what is known of the airframe."""
-    if answer.problem.model.airframe.guesses_drag:
+    return ratio_error(answer.problem.model.airframe, thrust_excess(answer))
+
+
+def ratio_error(airframe: Airframe, excess: float) -> float:
+    """The same of an airframe. `excess`: by which share the thrust exceeds the airframe's."""
+    if airframe.guesses_drag:
         return TABLES.guessed_drag
-    model = answer.problem.model
-    if isinstance(model, FlightModel) and any(COMMANDS in TERMS[term].needs for term in model.terms):
-        return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
-    excess = abs(thrust_excess(answer))
-    return excess if excess > TABLES.other_thrust else 0.0
+    return abs(excess) if abs(excess) > TABLES.other_thrust else 0.0
 
 
 def vehicle_constants(answer: Answer) -> RigidBody:

@@ -86,6 +86,7 @@ class Data(Generic[L]):
     - `held_out`: what is not fitted, if there is anything.
     - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
     - `vibrates`: the body rates that vibrate, each with its frequency [Hz].
+    - `follows_commands`: whether rotor speeds are computed from commands.
     """
 
     likelihood: L
@@ -97,6 +98,12 @@ class Data(Generic[L]):
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
     vibrates: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    follows_commands: bool = False
+
+    @property
+    def hides_answers(self) -> bool:
+        """Whether samples hold answers that are commands, so that feedthroughs explain nearly all innovations."""
+        return self.follows_commands and bool(getattr(self.likelihood, "answers_within", False))
 
     @property
     def room(self) -> int:

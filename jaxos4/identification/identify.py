@@ -78,6 +78,7 @@ def identify(
     other = None if validate is None else as_recording(validate, "validation flight", given)
     begin = time.perf_counter()
     options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
+    progress("checking and averaging")
     if isinstance(subject, Airframe):
         case = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **options)
     else:

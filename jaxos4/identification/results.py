@@ -4,6 +4,7 @@ import math
 from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import msgspec
+from jaxtyping import Array, PRNGKeyArray
 
 from ..airframe import Airframe, airframe_table
 from ..analysis.diagnostics import Correlations
@@ -200,7 +201,6 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `airframe`: the constants that were not estimated.
     - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the noise levels
       that were found. Files do not hold them: `None` if the result was read from one.
-
     - `traces`: signals of the fitted flights, at most 1,200 samples. `correlations`: of the residuals. `None` without
       an answer.
 
@@ -279,6 +279,12 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         if delay is None or delay.estimate is None or delay.estimate > -TOLERANCE.late:
             return ""
         return f"motors are recorded {-1e3 * delay.estimate:.0f} ms late"
+
+    def sample(self, samples: int, *, key: PRNGKeyArray) -> dict[str, Array]:
+        """Vehicles drawn from the uncertainty, ready for `jax.vmap`; see `jaxos4.export.sample_vehicles`."""
+        from ..export import sample_vehicles
+
+        return sample_vehicles(self, samples, key=key)
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON.

@@ -59,8 +59,9 @@ def search_sample_times(
     **Arguments:** `several`: one flight at several sample times, each twice the one before.
     """
     optimum, optima = None, []
-    for data in reversed(several):
-        progress(f"fitting samples of {1e3 * float(data.problem.flight.dt):.3g} ms")
+    for number, data in enumerate(reversed(several), start=1):
+        step = 1e3 * float(data.problem.flight.dt)
+        progress(f"fitting samples of {step:.3g} ms ({number} of {len(several)} sample times)")
         start, own = None, data.likelihood
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
             start = start_of(own, optimum.first)
@@ -82,7 +83,7 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `rows`: the shortest sample time first."""
     answered = [i for i, row in enumerate(rows) if row.constants] or [0]
     longer = dict(itertools.pairwise(answered))
-    clean = [i for i in answered if abs(rows[i].correlation) <= white_limit(rows[i])]
+    clean = [i for i in answered if is_white(rows[i])]
     clean = clean or [min(answered, key=lambda i: abs(rows[i].correlation))]
     return next((i for i in clean[:-1] if _agree(rows[i], rows[longer[i]])), clean[0])
 
@@ -90,6 +91,11 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
 def white_limit(row: SampleTime) -> float:
     """The largest correlation of innovations that are nearly white."""
     return RULE.white + RULE.chance / math.sqrt(max(row.samples, 1))
+
+
+def is_white(row: SampleTime) -> bool:
+    """Whether innovations are nearly white."""
+    return abs(row.correlation) <= white_limit(row)
 
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:

@@ -28,8 +28,9 @@ from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
 from .problem import Intervals, bracket_of
-from .sample_time import chosen_place, sample_time_of, search_sample_times
-from .search import search
+from .results import SampleTime
+from .sample_time import chosen_place, is_white, sample_time_of, search_sample_times
+from .search import Optimum, search
 from .settings import VehicleSettings, name_and_class
 from .uncertainty import at_lowest, corrected
 
@@ -84,9 +85,7 @@ class VehicleCase:
         """
         solver, is_default = FilterError(tolerance=LIKELIHOODS.tolerance), self.estimator == DEFAULT
         compared = self.data if is_default or len(self.data) > 1 else ()
-        optima = search_sample_times(compared, solver, progress=progress)
-        answers = [corrected(x, data) for x, data in zip(optima, compared, strict=True)]
-        rows = [sample_time_of(answer) for answer in answers]
+        optima, rows = fit_sample_times(compared, solver, choose=self.choose, progress=progress)
         place = chosen_place(rows) if self.choose and rows else 0
         data = self.data[place]
         if is_default:
@@ -101,7 +100,29 @@ class VehicleCase:
 
     def check(self, solution: Solution, progress: Progress) -> Checked:
         """The estimate of each quantity, and the doubts about it."""
+        progress("checking the answer")
         return check_vehicle(*solution, progress)
+
+
+def fit_sample_times(
+    several: Sequence[Data[InnovationsProblem]], solver: AbstractEstimator, *, choose: bool, progress: Progress
+) -> tuple[list[Optimum], list[SampleTime]]:
+    """The optimum and the answer at each sample time, the shortest first.
+
+    Where commands are answered within a sample, feedthroughs hide nearly all that is compared. If the sample time is to
+    be chosen, such samples are fitted only if no shorter ones have white innovations.
+    """
+    clear = [each for each in several if not each.hides_answers] if choose else []
+    optima: list[Optimum] = []
+    rows: list[SampleTime] = []
+    for some in filter(None, (clear, several[len(clear) :])):
+        if any(row.constants and is_white(row) for row in rows):
+            break
+        found = search_sample_times(some, solver, progress=progress)
+        optima += found
+        progress("computing intervals")
+        rows += [sample_time_of(corrected(x, data)) for x, data in zip(found, some, strict=True)]
+    return optima, rows
 
 
 def prepare_vehicle(
@@ -199,6 +220,7 @@ def _data(
         findings=prepared.findings,
         log_step=prepared.log_step,
         vibrates=prepared.vibrates,
+        follows_commands=COMMANDS in prepared.available,
         clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),
     )
 

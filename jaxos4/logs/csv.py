@@ -82,7 +82,7 @@ def read_table(
                 refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
     if count < 2:
         refuse(path, f"has a header and {['no data', 'one row of data'][count]}; a flight needs two rows")
-    columns = dict(zip(wanted, np.concatenate(found).T.copy(), strict=True))
+    columns = {name: np.concatenate([batch[:, i] for batch in found]) for i, name in enumerate(wanted)}
     return Table(path, columns, tuple(name for name in header if name not in known), skip + 2)
 
 

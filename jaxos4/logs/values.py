@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..flight import CHANNEL_NAMES, FORCE_NAMES
+from ..flight import FORCE_NAMES, STATE_NAMES
 from .sampling import filled
 from .table import COMMAND_NAMES, SPEED_NAMES, Recording, Table
 
@@ -137,10 +137,12 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
 
     A rotor's measured speed is taken out if it is `dropped`, too.
     """
-    channels, omega = recording.channels.copy(), recording.omega.copy()
-    impossible, clipped = {}, {}
-    names = (*CHANNEL_NAMES, *(f"rotor {i + 1}" for i in range(4)))
-    for name, column in zip(names, (*channels.T, *omega.T), strict=True):
+    impossible, clipped, cleaned = {}, {}, {}
+    states = [(name, "states", i) for i, name in enumerate(STATE_NAMES)]
+    force = [(name, "specific_force", i) for i, name in enumerate(FORCE_NAMES) if recording.specific_force is not None]
+    for name, field, place in [*states, *force, *((f"rotor {i + 1}", "omega", i) for i in range(4))]:
+        logged = getattr(recording, field)
+        column = logged[:, place].copy()  # one at a time: a long log has 400 MB
         wrong = _isolated(column, rules)
         if name.startswith("rotor") and not recording.commanded:
             wrong |= dropped(recording.time, column)
@@ -148,21 +150,19 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
             worst = column[wrong][np.argmax(np.abs(column[wrong]))]
             impossible[name] = int(wrong.sum()), float(worst)
             column[wrong] = np.nan
-        if name not in ("p", "q", "r", *FORCE_NAMES):
-            continue
         known = np.count_nonzero(np.isfinite(column))
-        for sign in (1.0, -1.0):
+        for sign in (1.0, -1.0) if name in ("p", "q", "r", *FORCE_NAMES) else ():
             stuck = _stuck(sign * column, rules)
             if stuck.any():
                 end, number = float(column[stuck][0]), int(stuck.sum())
                 count, share, before = clipped.get(name, (0, 0.0, end))
                 clipped[name] = count + number, share + number / known, max(before, end, key=abs)
                 column[stuck] = np.nan
-    if not impossible and not clipped:
-        return Plausible(recording, {}, {})
-    force = None if recording.specific_force is None else channels[:, 12:]
-    clean = recording._replace(omega=filled(omega), states=channels[:, :12], specific_force=force)
-    return Plausible(clean, impossible, clipped)
+        if name in impossible or name in clipped:
+            if field not in cleaned:
+                cleaned[field] = logged.copy()
+            cleaned[field][:, place] = filled(column) if field == "omega" else column
+    return Plausible(recording._replace(**cleaned), impossible, clipped)
 
 
 def _isolated(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:

@@ -4,7 +4,7 @@ A new term is one more `Term` in `TERMS`, or an entry point of another package i
 else is found in that object.
 """
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -323,6 +323,11 @@ TERMS: Registry[Term] = Registry("jaxos4.terms", _OWN)
 def default_terms(available: frozenset[str]) -> tuple[str, ...]:
     """The terms that an estimate uses if the user names none, given what the logs and the airframe provide."""
     return tuple(name for name, term in TERMS.data.items() if term.needs <= available and term.by_default(available))
+
+
+def follows_commands(terms: Iterable[str]) -> bool:
+    """Whether a model with these terms computes rotor speeds from commands."""
+    return any(COMMANDS in TERMS[term].needs for term in terms)
 
 
 def clash(terms: Container[str]) -> str:

@@ -14,6 +14,8 @@ from ..flight import CHANNEL_NAMES
 from ..logs import Recording
 from .checks import Evidence, Finding, findings, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
+from .prepared import finest
+from .richest import fair_share
 from .stretches import cut, nothing_usable, usable
 
 ASSUMED_FULL_SCALE = 1000.0
@@ -70,14 +72,13 @@ class Inspection(msgspec.Struct, frozen=True):
 
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
     """Describe a log that was read with this airframe and `full_scale=1.0`. Without one, torques are unknown."""
-    evidence, flown, parts = Evidence(recording, airframe), [], []
+    seconds = fair_share([recording], finest(recording.dt))
+    evidence, parts = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
-        if not stretch.reason:
-            flown.append(cut(evidence.plausible.recording, stretch))
-        excited = {} if stretch.reason else excitation(flown[-1], airframe)
+        excited = {} if stretch.reason else excitation(cut(evidence.plausible.recording, stretch), airframe)
         parts.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
-    nothing = "" if flown else f"{nothing_usable(evidence.every)}; give the log of a flight"
-    opposite = {} if airframe is None else opposite_axes(flown, airframe)
+    nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
+    opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))
     refusals = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(

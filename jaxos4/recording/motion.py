@@ -107,6 +107,11 @@ def excitation(
     return found
 
 
+def torques_of(airframe: Airframe | None) -> Float[np.ndarray, "axes 4"]:
+    """Roll, pitch and yaw torque for the squares of the rotor speeds; in any order and unit without an airframe."""
+    return _PAIRS if airframe is None else np.asarray(airframe.mixer, dtype=float)[:3]
+
+
 def opposite_axes(flown: Sequence[Recording], airframe: Airframe, *, signs: SignRules = SIGNS) -> dict[str, float]:
     """The axes about which vehicles turn against the torque that the airframe gives to the rotors, in usable stretches.
 

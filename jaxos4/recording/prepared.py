@@ -19,6 +19,7 @@ from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .level import force_level
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, without_noise
+from .richest import fair_share, note_of
 from .stretches import Stretch, cut, nothing_usable
 from .vibration import vibrating_rates
 from .windows import averaged, hold_out, joined, whole_windows
@@ -139,7 +140,10 @@ def prepare(
     for number, recording in enumerate(recordings):
         if any(recording.same_data(earlier) for earlier in recordings[:number]):
             raise InputError(f"{recording.name}: given twice; give each log once.")
-    every = [_cleaned(each, airframe, begin, end, predicted=predicted, rules=rules) for each in recordings]
+    step = finest(max(each.dt for each in recordings), sample_time, rules=rules)
+    seconds = math.inf if predicted else fair_share(recordings, step)
+    evidences = [Evidence(each, airframe, seconds=seconds) for each in recordings]
+    every = [_cleaned(each, airframe, begin, end, predicted=predicted, rules=rules) for each in evidences]
     if len({stretch.commanded for each in every for stretch in each.stretches}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
@@ -158,9 +162,10 @@ def prepare(
     coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
     numbers = [number for number, _ in stretched]
     vibrates = {name: at for each in every for name, at in vibrating_rates(each.stretches).items()}
+    noise = np.min([force_noise(in_body_axes(each, airframe)) for each in recordings], axis=0)
     rests = [rest for each in every if (rest := each.evidence.rest) is not None]
     return tuple(
-        _sampled(recordings, numbers, flown, airframe, step, holdout, rests, rules)._replace(
+        _sampled(recordings, numbers, flown, airframe, step, holdout, rests, noise, rules)._replace(
             notes=tuple(notes),
             findings=tuple(found),
             log_step=slowest,
@@ -172,7 +177,7 @@ def prepare(
 
 
 def _cleaned(
-    recording: Recording,
+    evidence: Evidence,
     airframe: Airframe,
     begin: float | None,
     end: float | None,
@@ -180,11 +185,11 @@ def _cleaned(
     predicted: bool,
     rules: Preparation,
 ) -> _Cleaned:
-    """The usable stretches of one recording, and what its checks find. Raises `InputError` if it cannot be used."""
+    """The stretches of one recording to fit, and what its checks find. Raises `InputError` if it cannot be used."""
+    recording = evidence.logged
     name, facts = recording.name, recording.facts
     if np.isnan(recording.states[:, RATES]).all(axis=0).any():
         raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
-    evidence = Evidence(recording, airframe)
     found = [msgspec.structs.replace(each, cause=f"{name}: {each.cause}") for each in findings(evidence)]
     judged = [each for each in found if _is_judged(each)]
     notes = [str(each) for each in found if each not in judged]
@@ -225,23 +230,32 @@ def _usable(
     recording = evidence.plausible.recording
     name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
     if begin is not None or end is not None:
+        given = Stretch(first if begin is None else begin, last if end is None else end)
         with named(name):
-            return [cut(recording, Stretch(first if begin is None else begin, last if end is None else end))], []
-    usable = [stretch for stretch in evidence.every if not stretch.reason]
+            cut(recording, given)
+        return _richest(evidence, [Stretch(max(given.begin, first), min(given.end, last))])
+    usable = evidence.usable
     refused = sorted((stretch for stretch in evidence.every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
         remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
         besides = f" Besides, {slow}." if slow else ""
         raise InputError(f"{name}: {nothing_usable(evidence.every)}; {remedy}.{besides}")
     if not refused:
-        return [recording], []
+        return _richest(evidence, usable)
     reasons = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in refused[:3])
     seconds = sum(stretch.length for stretch in usable)
     note = (
         f"{name}: {seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {reasons}"
         f"{'; ...' if len(refused) > 3 else ''}{'' if predicted else ' (`begin` and `end` override)'}"
     )
-    return [cut(recording, stretch) for stretch in usable], [note]
+    pieces, notes = _richest(evidence, usable)
+    return pieces, [note, *notes]
+
+
+def _richest(evidence: Evidence, parts: Sequence[Stretch]) -> tuple[list[Recording], list[str]]:
+    """The parts, or if they are too long those that tell the most; and a note on that."""
+    recording, chosen = evidence.plausible.recording, evidence.richest(parts)
+    return [cut(recording, each) for each in chosen], note_of(recording.name, chosen, parts)
 
 
 def _sample_times(
@@ -258,12 +272,19 @@ def _sample_times(
                 f"{sample_time:.4g} s; give `sample_time` {slowest:.4g}, or another `validate`."
             )
         raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
-    shortest = max(rules.shortest if sample_time is None else sample_time, slowest)
-    whole = max(round(shortest / slowest), 1) * slowest
-    if not predicted and (sample_time is None or abs(whole - shortest) < rules.whole * shortest):
-        shortest = whole  # samples of whole rows
+    shortest = finest(slowest, sample_time, predicted=predicted, rules=rules)
     doublings = 0 if predicted else math.floor(math.log2(rules.longest * _NEARLY / shortest))
     return [shortest * 2**k for k in range(max(doublings, 0) + 1)]
+
+
+def finest(
+    slowest: float, sample_time: float | None = None, *, predicted: bool = False, rules: Preparation = RULES
+) -> float:
+    """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: that of the logs."""
+    shortest = max(rules.shortest if sample_time is None else sample_time, slowest)
+    whole = max(round(shortest / slowest), 1) * slowest  # samples of whole rows
+    is_near = sample_time is None or abs(whole - shortest) < rules.whole * shortest
+    return whole if is_near and not predicted else shortest
 
 
 def _sampled(
@@ -274,11 +295,13 @@ def _sampled(
     step: float,
     holdout: float,
     rests: Sequence[Float[np.ndarray, "3"]],
+    noise: Float[np.ndarray, "3"],
     rules: Preparation,
 ) -> Prepared:
     """One flight of stretches that are averaged to samples of `step` [s].
 
-    `numbers`: of their recordings. `rests`: the specific force before take-off, where it is known.
+    `numbers`: of their recordings. `rests`: the specific force before take-off, where it is known. `noise`: the least
+    of the accelerometer, see `force_noise`.
     """
     length = round(rules.window / step)
     if length < rules.fewest:
@@ -303,7 +326,7 @@ def _sampled(
         length=length,
         available=_available_inputs(everything, flown, airframe),
         level=force_level(fitted, ups, rests, float(airframe.gravity)),
-        force_noise=np.min([force_noise(in_body_axes(each, airframe), step) for each in recordings], axis=0),
+        force_noise=noise / math.sqrt(step),
         seconds=(_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
     )
 

@@ -1,19 +1,19 @@
 """The page of a log, before anything is fitted: `jaxos4 inspect --report`. It needs no other file."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
 from .._files import check_writable, write_file
 from ..airframe import MOTIONS, Airframe
 from ..errors import InputError, printable
-from ..flight import ANGLES, POSITION, RATES, VELOCITY, Flight
+from ..flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY, Flight
 from ..logs import Recording, Source, as_recording, read_recording
 from ..logs.sampling import filled
 from ..logs.table import counted
@@ -129,15 +129,20 @@ def is_share(recording: Recording) -> bool:
 
 def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) -> tuple[str, int]:
     """All signals of a log for the time axis, grey where it is not usable, and the `thinned` samples of a block."""
-    columns, panels, width = recording.channels, [], 0
+    panels, width = [], 0
     motor = ("command" if is_share(recording) else "motor [rad/s]", recording.omega, tuple("1234"))
-    groups = [(title, columns[:, which], names) for title, which, names in _SIGNALS]
+    groups = [(title, _sensed(recording, which), names) for title, which, names in _SIGNALS]
     groups = [groups[0], motor, *groups[1:]]
     if recording.voltage is not None:
         groups.append(("battery [V]", recording.voltage[:, None], ("battery",)))
     groups = [group for group in groups if np.isfinite(group[1]).any()]
-    every = [bridged(recording.time, column) for _, values, _ in groups for column in values.T]
-    time, values, block = thinned(recording.time, np.column_stack(every), rules.samples)
+    every = [
+        thinned(recording.time, bridged(recording.time, column)[:, None], rules.samples)
+        for _, measured, _ in groups
+        for column in measured.T
+    ]
+    time, _, block = every[0]
+    values = np.hstack([fewer for _, fewer, _ in every])
     for title, _, names in groups:
         lines = (Line(name, values[:, width + i], style(i)) for i, name in enumerate(names))
         panels.append(Panel(title, [line for line in lines if np.isfinite(line.values).any()]))
@@ -146,6 +151,14 @@ def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) ->
     begin = recording.time[0]
     shaded = [(part.begin - begin, part.end - begin) for part in found.parts if not part.usable]
     return signals(axis, [View("", time - begin, panels)], shaded=shaded), block
+
+
+def _sensed(recording: Recording, which: Int[np.ndarray, " columns"]) -> Float[np.ndarray, "samples columns"]:
+    """Some of the channels, without a copy of all."""
+    states, force = recording.states, recording.specific_force
+    if which[0] < len(STATE_NAMES):
+        return states[:, which]
+    return np.full((len(states), len(which)), np.nan) if force is None else force
 
 
 def bridged(
@@ -211,8 +224,8 @@ def motors(flown: Sequence[Recording], full: float, rules: PageRules = RULES) ->
 def spectra(flown: Sequence[Recording], band: tuple[float, float] | None, rules: PageRules = RULES) -> Figure | None:
     """Amplitude spectral densities of gyro and accelerometer; band: how often the rotors turn."""
     kinds = {"gyro [rad/s/√Hz]": RATES, "accelerometer [m/s²/√Hz]": np.arange(12, 15)}
-    every = np.concatenate([*kinds.values()])
-    frequency, whole = amplitude_density([each.channels[:, every] for each in flown], flown[0].dt, rules)
+    sensed = (np.hstack([_sensed(each, which) for which in kinds.values()]) for each in flown)
+    frequency, whole = amplitude_density(sensed, flown[0].dt, rules)
     found = {title: whole[:, 3 * i : 3 * i + 3] for i, title in enumerate(kinds)}
     found = {title: density for title, density in found.items() if np.isfinite(density).any()}
     if not found:
@@ -232,7 +245,7 @@ def spectra(flown: Sequence[Recording], band: tuple[float, float] | None, rules:
 
 
 def amplitude_density(
-    parts: Sequence[Float[np.ndarray, "_ channels"]], dt: float, rules: PageRules = RULES
+    parts: Iterable[Float[np.ndarray, "_ channels"]], dt: float, rules: PageRules = RULES
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies channels"]]:
     """Frequencies [Hz] and the amplitude spectral density of signals, by Welch's means of overlapping segments.
 
@@ -240,18 +253,15 @@ def amplitude_density(
     Trans. Audio Electroacoustics 15.
     """
     size = max(round(rules.segment / dt), 8)
-    window = np.hanning(size)[:, None]
-    powers = [
-        np.abs(np.fft.rfft(window * (piece - piece.mean(axis=0)), axis=0)) ** 2
-        for part in parts
-        for begin in range(0, len(part) - size + 1, size // 2)
-        for piece in [filled(part[begin : begin + size])]
-    ]
-    frequency = np.fft.rfftfreq(size, dt)
-    kept = frequency >= rules.slowest
-    if not powers:
-        return frequency[kept], np.full((np.count_nonzero(kept), parts[0].shape[1]), np.nan)
-    measured = np.isfinite(powers).sum(axis=0)
-    power = np.where(measured, np.nansum(powers, axis=0) / np.maximum(measured, 1), np.nan)
-    density = 2 * dt * power / np.square(window).sum()
+    window, frequency = np.hanning(size)[:, None], np.fft.rfftfreq(size, dt)
+    total = measured = np.zeros((frequency.size, 1))
+    for part in parts:
+        total, measured = (np.broadcast_to(each, (frequency.size, part.shape[1])).copy() for each in (total, measured))
+        for begin in range(0, len(part) - size + 1, size // 2):
+            piece = filled(part[begin : begin + size])
+            power = np.abs(np.fft.rfft(window * (piece - piece.mean(axis=0)), axis=0)) ** 2
+            measured += np.isfinite(power)
+            total += np.nan_to_num(power)
+    mean = np.where(measured, total / np.maximum(measured, 1), np.nan)
+    density, kept = 2 * dt * mean / np.square(window).sum(), frequency >= rules.slowest
     return frequency[kept], np.sqrt(density[kept])

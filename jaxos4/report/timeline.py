@@ -106,13 +106,13 @@ def thinned(
     if block <= 2:
         return time, values, 1
     begin = np.arange(0, time.size, block)
-    padded = np.pad(values, ((0, -len(values) % block), (0, 0)), constant_values=np.nan)
-    cut = padded.reshape(begin.size, block, values.shape[1])
-    known = np.isfinite(cut)
-    ends = np.where(known, cut, np.inf).min(axis=1), np.where(known, cut, -np.inf).max(axis=1)
-    both = np.where(np.asarray(known.any(axis=1))[:, None], np.stack(ends, axis=1), np.nan)
+    ends = np.empty((begin.size, 2, values.shape[1]))
+    for i, column in enumerate(values.T):  # one at a time, for the memory
+        cut = np.pad(column, (0, -column.size % block), constant_values=np.nan).reshape(begin.size, block)
+        cut[~np.isfinite(cut)] = np.nan
+        ends[:, 0, i], ends[:, 1, i] = np.fmin.reduce(cut, axis=1), np.fmax.reduce(cut, axis=1)
     places = np.minimum(begin[:, None] + [0, block // 2], time.size - 1)
-    return time[places].ravel(), both.reshape(2 * begin.size, -1), block
+    return time[places].ravel(), ends.reshape(2 * begin.size, -1), block
 
 
 def signals(

@@ -162,10 +162,10 @@ class InnovationsProblem(AbstractProblem):
     @eqx.filter_jit  # one compiled program instead of one for each operation, and traced once
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
-        feedthroughs, data = self.input_innovations.shape[-2], (self.problem.measured(), self.flight.dt)
-        own = self.problem.unknowns
+        data = self.problem.measured(), self.flight.dt, self.least_noise
+        told = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
         return self.noise_unknowns.after(
-            own, self.channels, feedthroughs, *data, self.least_noise, answers_within=self.answers_within
+            self.problem.unknowns, self.channels, *data, told=told, answers_within=self.answers_within
         )
 
     @property

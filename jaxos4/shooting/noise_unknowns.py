@@ -65,14 +65,17 @@ class NoiseUnknowns(NamedTuple):
         self,
         own: Unknowns,
         channels: tuple[str, ...],
-        feedthroughs: int,
         measured: Float[Array, "samples channels"],
         dt: Scalar,
         least_noise: Float[Array, " channels"],
         *,
+        told: Bool[Array, "channels feedthroughs"],
         answers_within: Bool[Array, ""],
     ) -> Unknowns:
-        """The parameters, then noise and feedthroughs of each channel, in brackets from differences of measurements."""
+        """The parameters, then noise, gains and feedthroughs of each channel, in brackets from the measurements.
+
+        `told`: which input innovations a channel has. `answers_within`: see `InnovationsProblem`.
+        """
         if self.longest_smoothing >= self.shortest_of_force:
             raise ValueError(
                 f"`longest_smoothing` must be shorter than `shortest_of_force`, {self.shortest_of_force} s, "
@@ -90,12 +93,14 @@ class NoiseUnknowns(NamedTuple):
         highest = highest.at[:, 3:].set(jnp.where(rate, first[:, 3:], np.log(self.longest_smoothing)))
         lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))
         free = jnp.ones(first.shape, dtype=bool).at[:, 3:].set(~rate)
-        first, lowest, highest, free = (
-            jnp.pad(x, ((0, 0), (0, 3 * feedthroughs)), constant_values=value)
-            for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf), (free, True))
+        more = 3 * told.shape[1]
+        first, lowest, highest = (
+            jnp.pad(x, ((0, 0), (0, more)), constant_values=value)
+            for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf))
         )
-        free = free.at[:, free.shape[1] - feedthroughs :].set(answers_within & rate)
-        names = tuple(each.format(name) for name in channels for each in own_names(count, feedthroughs))
+        # A gain of nothing is no unknown.
+        free = jnp.concatenate([free, told, told, told & rate & answers_within], axis=1)
+        names = tuple(each.format(name) for name in channels for each in own_names(count, told.shape[1]))
         precision = jnp.full(first.size, self.precision)
         return Unknowns(
             names=own.names + names,

@@ -4,6 +4,8 @@ Each number of the evidence is computed once, when it is first used.
 """
 
 import functools
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -15,7 +17,8 @@ from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
 from ...logs.values import Plausible, plausible
-from ..motion import in_body_axes
+from ..motion import in_body_axes, torques_of
+from ..richest import richest
 from ..stretches import RULES, Stretch, cut, stretches
 from .estimates import Measured, Turns, attitude_turns, tilt_slopes, velocity_slopes
 from .response import Response, rotor_response
@@ -137,11 +140,13 @@ LIMITS = Limits()
 class Evidence:
     """The facts that the checks of one recording share. `airframe`: `None` if it is not known.
 
-    **Arguments:** of `self_checks`.
+    **Arguments:** of `self_checks`. `seconds`: how much of the flight is looked at [s], see `richest`.
     """
 
-    def __init__(self, recording: Recording, airframe: Airframe | None, limits: Limits = LIMITS):
-        self.logged, self.airframe, self.limits = recording, airframe, limits
+    def __init__(
+        self, recording: Recording, airframe: Airframe | None, limits: Limits = LIMITS, *, seconds: float = math.inf
+    ):
+        self.logged, self.airframe, self.limits, self.seconds = recording, airframe, limits, seconds
 
     @functools.cached_property
     def plausible(self) -> Plausible:
@@ -154,15 +159,25 @@ class Evidence:
         """Every stretch of the flight: usable ones, and others with the reason."""
         return stretches(self.plausible.recording, self.airframe)
 
+    @property
+    def usable(self) -> list[Stretch]:
+        """The stretches of the flight that can be used."""
+        return [each for each in self.every if not each.reason]
+
+    def richest(self, parts: Sequence[Stretch]) -> list[Stretch]:
+        """The pieces of some parts that tell the most, of at most `seconds`."""
+        return richest(self.plausible.recording, parts, torques_of(self.airframe), self.seconds)
+
     @functools.cached_property
     def stretches(self) -> tuple[Recording, ...]:
-        """The usable stretches of the flight."""
+        """The usable stretches of the flight; those that tell the most, if it is longer than `seconds`."""
         recording = self.plausible.recording
         if recording.stretch is not None:  # joined flights are usable
             edges = np.flatnonzero(np.diff(recording.stretch)) + 1
             ends = zip([0, *edges], [*edges, recording.time.size], strict=True)
             return tuple(recording.rows(slice(int(begin), int(end))) for begin, end in ends)
-        return tuple(cut(recording, each) for each in self.every if not each.reason and each.length >= RULES.shortest)
+        parts = [each for each in self.usable if each.length >= RULES.shortest]
+        return tuple(cut(recording, each) for each in self.richest(parts))
 
     @functools.cached_property
     def airborne(self) -> tuple[Recording, ...]:
@@ -195,12 +210,13 @@ class Evidence:
     @functools.cached_property
     def rest(self) -> Float[np.ndarray, "3"] | None:
         """The specific force at rest before the first stretch in flight [m/s^2]. `None`: never at rest, or moved."""
-        recording, begin = self.plausible.recording, min((float(each.time[0]) for each in self.stretches), default=0.0)
+        recording = self.plausible.recording
+        begin = min((each.begin for each in self.usable), default=0.0) if self.stretches else 0.0
         before = np.count_nonzero(recording.time < begin - RULES.margin)
         length = max(round(self.limits.rest / recording.dt), 4)
         if recording.specific_force is None or before < 4 * length:
             return None
-        sensed = np.hstack([recording.specific_force, GRAVITY * recording.states[:, RATES]])[:before]
+        sensed = np.hstack([recording.specific_force[:before], GRAVITY * recording.states[:before, RATES]])
         blocks = sensed[before % length :].reshape(-1, length, 6)
         still = (blocks.std(axis=1) < self.limits.still * GRAVITY).all(axis=1)  # False for NaN
         means = blocks[still, :, :3].mean(axis=1)
