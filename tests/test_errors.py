@@ -10,6 +10,8 @@ from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors,
 
 import jaxos4
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 MAKE = {
     "ibss": jaxos4.IBSS,
@@ -41,7 +43,6 @@ FLIGHTS = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "model_class", "channels", "free", "scale", "least", "most"), FLIGHTS)
 def test_errors_are_as_large_as_they_claim(name, model_class, channels, free, scale, least, most):
     estimates, unit = noisy(MAKE[name], model_class, channels, free, scale), scale * bound(model_class, channels, free)
@@ -104,7 +105,6 @@ def test_exact_flights_give_the_truth(model_class, channels, free):
     assert (error[~tiny] < 1e-8).all(), error
 
 
-@pytest.mark.slow
 @every_case
 def test_never_succeeds_with_a_wrong_answer(model_class, channels, free):
     """Each parameter in turn outside the bracket, on either side, by a tenth of its half-width or by its full width."""
@@ -124,7 +124,6 @@ def test_never_succeeds_with_a_wrong_answer(model_class, channels, free):
         assert_chi_square(error[kept], np.linalg.inv(estimates.covariance[kept]))
 
 
-@pytest.mark.slow
 def test_a_truth_beyond_the_hard_limits_is_reported():
     offset = np.concatenate([4.5 * SIDES] * 4)
     problem, states, omega, _, _ = lanes(noisy_states(LANES, seed=1))

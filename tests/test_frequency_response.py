@@ -48,7 +48,8 @@ def fly_in_gusts(trials, gain):
     return u, np.diff(measured, axis=0, append=rate[None] + noise[-1:]) / dt, dt
 
 
-@pytest.mark.parametrize("gain", [1.0, pytest.param(1.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("gain", [1.0, 1.5])
 def test_intervals_hold_the_truth_although_a_controller_answers_gusts(gain):
     trials = 200
     u, y, dt = fly_in_gusts(trials, gain)

@@ -48,6 +48,7 @@ def soft():
     return [soft_flight(seed, gust=2.0) for seed in range(3)]
 
 
+@pytest.mark.slow
 def test_a_controller_and_inflow_make_no_sensor_late(soft):
     """By cross-spectra alone, the gyro seems 11 ms late, and the accelerometer 6 ms early."""
     for flight in soft:
