@@ -78,7 +78,7 @@ class Airframe(eqx.Module):
     gravity: Float[Numeric, ""] = eqx.field(converter=as_constant, default=GRAVITY)
     max_rotor_speed: Float[Numeric, ""] = eqx.field(converter=as_constant, default=math.inf)
     sensor_rotation: Float[Numeric, "3"] = eqx.field(converter=as_constant, default=(0.0, 0.0, 0.0))
-    guessed: tuple[str, ...] = eqx.field(static=True, default=())
+    guessed: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
 
     @property
     def guesses_drag(self) -> bool:

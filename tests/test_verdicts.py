@@ -22,7 +22,7 @@ from jaxos4.identification.results import Constant, ParameterEstimate, Predictio
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, judge, reason_lines
+from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, judge, reason_lines, reservation
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -124,7 +124,24 @@ def test_an_axis_that_answers_otherwise_than_the_model_has_a_reservation(ratio, 
     if move is not None:
         assert doubts[0].moves["Iy"].share == pytest.approx(move, abs=1e-3)
         assert doubts[0].moves["Iy"].deviations == pytest.approx(20 * move, rel=0.01)
-        assert f"from 4 to 20 Hz, pitch answers the rotors {ratio:.2f}" in str(doubts[0])
+        more = f"{100 * abs(ratio - 1):.0f} % {'more' if ratio > 1 else 'less'} strongly than the model"
+        assert f"from 4 to 20 Hz, the vehicle pitches {more}" in str(doubts[0])
+
+
+@pytest.mark.parametrize(("share", "status"), [(0.9, RESERVED), (1.1, CONTRADICTED)])
+def test_a_reservation_that_moves_a_quantity_by_more_than_itself_contradicts_it(share, status):
+    doubts = [reservation("cause", "b", {"Ix": Move(share, 9.0)})]
+    assert verdict_of("Ix", Quantity(), doubts).status == status
+    assert judge({"Ix": Quantity()}, doubts).result("successful", ["Ix"]) == (
+        "successful" if status == RESERVED else "implausible"
+    )
+
+
+def test_a_quantity_is_not_identified_without_those_that_it_requires():
+    unknown = Quantity(missing="it hardly rolls")
+    found = judge({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, []).verdicts
+    assert found["damping"].status == MISSING
+    assert found["damping"].reasons == ("it cannot be trusted without Ix",)
 
 
 def test_predictions_reach_as_far_as_their_skill_is_clear():

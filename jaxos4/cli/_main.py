@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Prints what no encoding can print, as names of files may hold, and nothing if an output was closed."""
+    """Escapes characters that a stream cannot encode, and opens closed streams on the null device."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))

@@ -223,7 +223,10 @@ def drag_error(answer: Answer) -> float:
 
 
 def ratio_error(airframe: Airframe, excess: float) -> float:
-    """The same of an airframe. `excess`: by which share the thrust exceeds the airframe's."""
+    """The standard deviation of an airframe's ratio of drag to thrust, as a share.
+
+    `excess`: by which share the thrust exceeds the airframe's.
+    """
     if airframe.guesses_drag:
         return TABLES.guessed_drag
     return abs(excess) if abs(excess) > TABLES.other_thrust else 0.0

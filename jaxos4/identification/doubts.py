@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from ..airframe import AXES, INERTIAS, YAW
+from ..airframe import AXES, INERTIAS, PITCH, YAW
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import decisive_horizon
 from ..estimate import REACH
@@ -105,7 +105,7 @@ def doubts_of_vehicle(
         *doubts_of_predictions(skill, still),
         *_doubts_of_sample_time(data, answer, sample_times, constants),
         *stronger_or_weaker(response, constants),
-        *(_doubts_of_limits(answer) if search == "at_bound" else _doubts_of_search(search, quantities)),
+        *((search == "at_bound" and [*_doubts_of_limits(answer)]) or _doubts_of_search(search, quantities)),
     ]
 
 
@@ -150,7 +150,7 @@ def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
     of_axes = {"roll": ("alpha1", "alpha2", "alpha3"), "pitch": ("alpha4", "alpha5", "alpha6")}
     of_axes |= {"yaw": ("alpha7", "alpha8", "rotor_reaction")}
     of_axis = (each.inertia for each in AXES if name in of_axes[each.motion] or name.startswith(each.motion))
-    return *of_axis, *own
+    return (*of_axis, *own) or INERTIAS
 
 
 def few_parts(seconds: float) -> Iterator[Doubt]:
@@ -170,9 +170,11 @@ def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Cons
         agreement, row = found.agreement(), constants.get(axis.inertia)
         if row is not None and agreement.excludes_one(TOLERANCE.share):
             ratio, (low, high) = agreement.ratio, agreement.interval
-            share = max(ratio, 1 / ratio) - 1
+            # Beyond twice, the inertia would move by more than what is left of it.
+            share = ratio - 1 if ratio > 2 else abs(1 / ratio - 1)
+            verb = f"{axis.motion}es" if axis == PITCH else f"{axis.motion}s"
             yield reservation(
-                f"from {agreement.low:g} to {agreement.high:g} Hz, the vehicle {axis.motion}s {_compared(ratio)} the "
+                f"from {agreement.low:g} to {agreement.high:g} Hz, the vehicle {verb} {_compared(ratio)} the "
                 f"model (95 %: {low:.2f} to {high:.2f} times)",
                 f"fly more {axis.motion}, or look at its frequency response for what the model lacks",
                 {axis.inertia: Move(share, share * row.estimate / row.std)},
@@ -189,12 +191,14 @@ def _compared(ratio: float) -> str:
 def _doubts_of_sample_time(
     data: Data, answer: Answer, sample_times: Sequence[SampleTime], constants: Mapping[str, Constant]
 ) -> Iterator[Doubt]:
-    """A gyro that vibrates; an inertia that is another one at the next longer sample time, or else the next shorter."""
+    """Innovations that are not white; an inertia that changes with the sample time."""
     step, steps = float(answer.problem.flight.dt), [each.sample_time for each in sample_times]
-    if step not in steps or len(steps) < 2:
+    place = steps.index(step) if step in steps else 0
+    if len(steps) < 2:
         yield from vibration(answer.disturbances, step, vibrates=data.vibrates)
+        if sample_times:
+            yield from _correlated(sample_times[place], {})
         return
-    place = steps.index(step)
     own, other = sample_times[place], sample_times[place + 1 if place + 1 < len(steps) else place - 1]
     both = [(name, row, other.constants[name]) for name, row in own.constants.items() if name in other.constants]
     moves = {
@@ -202,12 +206,7 @@ def _doubts_of_sample_time(
         for name, one, two in both
     }
     yield from vibration(answer.disturbances, step, moves, data.vibrates)
-    if white_limit(own) < abs(own.correlation) <= PLAUSIBLE.vibration:
-        yield reservation(
-            f"innovations of the body rates correlate by {own.correlation:.2g}, and by more at other sample times",
-            "log faster, or before the filters of the gyro",
-            moves,
-        )
+    yield from _correlated(own, moves)
     for name in (each for each in moved(own, other) if each in constants):
         values = [f"{each.constants[name].estimate:.3g} at {1e3 * each.sample_time:.3g} ms" for each in (own, other)]
         yield contradiction(
@@ -215,6 +214,13 @@ def _doubts_of_sample_time(
             "the sensors vibrate, or the model lacks an effect: see the figure of inertia against sample time",
             {name: moves[name]},
         )
+
+
+def _correlated(row: SampleTime, moves: Mapping[str, Move]) -> Iterator[Doubt]:
+    """Innovations that are less correlated than by vibration, and yet not white."""
+    if white_limit(row) < abs(row.correlation) <= PLAUSIBLE.vibration:
+        cause = f"innovations of the body rates correlate by {row.correlation:.2g} at {1e3 * row.sample_time:.3g} ms"
+        yield reservation(cause, "log faster, or before the filters of the gyro", moves)
 
 
 def vibration(

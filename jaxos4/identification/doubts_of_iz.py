@@ -9,7 +9,7 @@ from .results import Constant, ParameterEstimate
 from .verdict import TOLERANCE, Doubt, Move, refusal, reservation
 
 _FLAT = 0.6  # Iz over Ix + Iy of a vehicle with its rotors in a plane is rarely smaller; of a lamina it is 1
-_MEASURE = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
+MEASURE = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
 _REACTION = "rotor_reaction"
 
 
@@ -19,21 +19,22 @@ def doubts_of_iz(
     """The doubts about Iz. `table`: of the parameters. `constants`: the moments of inertia that are judged."""
     if YAW.inertia in constants:
         yield from _drag(answer)
-        yield from _flat(constants)
-        yield from _rotor_inertia(table, constants[YAW.inertia])
+        # All of these would be one fault: a wrong drag coefficient.
+        signs = [*_flat(constants), *_rotor_inertia(table, constants[YAW.inertia])]
+        yield from sorted(signs, key=lambda doubt: doubt.share_of(YAW.inertia))[-1:]
 
 
 def _drag(answer: Answer) -> Iterator[Doubt]:
     """A ratio of drag to thrust that nobody measured: Iz is proportional to it."""
     excess, moves = thrust_excess(answer), {YAW.inertia: None}
     if answer.problem.model.airframe.guesses_drag:
-        yield refusal("unidentifiable", "`drag_coefficient` is a guess, to which Iz is proportional", _MEASURE, moves)
+        yield refusal("unidentifiable", "`drag_coefficient` is a guess, to which Iz is proportional", MEASURE, moves)
     elif drag_error(answer):
         cause = (
             f"the rotors give {100 * abs(excess):.0f} % {'more' if excess > 0 else 'less'} thrust than the airframe "
             "says, so that the ratio of drag to thrust, to which Iz is proportional, may be off as much"
         )
-        yield refusal("unidentifiable", cause, _MEASURE, moves)
+        yield refusal("unidentifiable", cause, MEASURE, moves)
 
 
 def _flat(constants: Mapping[str, Constant]) -> Iterator[Doubt]:
@@ -46,7 +47,7 @@ def _flat(constants: Mapping[str, Constant]) -> Iterator[Doubt]:
         share = z.estimate / (x.estimate + y.estimate)
         yield reservation(
             f"Iz is only {share:.2g} times Ix + Iy; of a flat vehicle it is {_FLAT:g} to 1 times",
-            f"if `drag_coefficient` is uncertain, {_MEASURE}",
+            f"if `drag_coefficient` is uncertain, {MEASURE}",
             {YAW.inertia: Move(least / z.estimate - 1, (least - z.estimate) / z.std)},
         )
 
@@ -64,9 +65,9 @@ def _rotor_inertia(table: Mapping[str, ParameterEstimate], iz: Constant) -> Iter
         off = by_axis[0] - by_yaw[0]
         if abs(off) > TOLERANCE.sure * math.hypot(by_axis[1], by_yaw[1]):
             yield reservation(
-                f"the inertia of a rotor is {by_yaw[0]:.2g} kg m^2 by its reaction in yaw, and {by_axis[0]:.2g} by "
-                f"{axis.motion}",
-                f"fly more yaw; if `drag_coefficient` is uncertain, {_MEASURE}",
+                f"by {axis.motion}, the inertia of the rotors is {by_axis[0] / by_yaw[0]:.2g} times that by their "
+                "reaction in yaw",
+                f"fly more yaw; if `drag_coefficient` is uncertain, {MEASURE}",
                 {YAW.inertia: Move(abs(off) / by_yaw[0], abs(off) / by_yaw[0] * iz.estimate / iz.std)},
             )
 

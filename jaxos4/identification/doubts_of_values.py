@@ -10,6 +10,7 @@ from ..analysis.inertia import fit_inertia
 from ..estimators import FilterError
 from ..models.abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
+from ..results import result_names
 from .answers import Answer
 from .results import Constant, ParameterEstimate, RigidBody
 from .search import Optimum, deviations
@@ -119,7 +120,7 @@ def _odd_motors(
             yield reservation(
                 f"{parameter.name} = {row.estimate:.2g} is unusual (expected: {row.bracket[0]:.2g} to "
                 f"{row.bracket[1]:.2g})",
-                "log rotor speeds, or the battery's voltage at 10 Hz or more",
+                "log rotor speeds",
                 follow(parameter.name, usual),
             )
 
@@ -156,7 +157,7 @@ def consequences(
         return {}
     other = optimum.restricted(FilterError(tolerance=PROFILE.tolerance), {name: value})
     others = {each: names for each, names in model.quantities.items() if name not in names}
-    if not other.converged:
+    if str(result_names(other.estimate.result)) not in ("successful", "at_bound"):
         return dict.fromkeys((*constants, *others))
     moved, std = other.values, deviations(answer.estimate.covariance)
     gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]

@@ -10,6 +10,7 @@ from .verdict import IDENTIFIED, MISSING, RESERVED, TOLERANCE, pooled_status
 
 _ROUND = 5.0  # s; flights are not planned more precisely
 _MOST = 300.0  # s, about one battery: beyond it a stronger motion is the better advice
+_VAGUE = "it is known to"
 _REPEAT = "nothing is missing; repeat the flight and compare the results with `jaxos4 compare`"
 
 
@@ -27,7 +28,9 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
     motions, known, flown, advised = [], [], set(), {}
     for axis in AXES:
         spread, fitted = spreads.get(axis.inertia, 0.0), counted.get(axis.inertia, [])
-        if fitted and TOLERANCE.vague < spread < math.inf:
+        whys = [why for each in fitted for why in each.verdicts[axis.inertia].reasons if why.startswith(_VAGUE)]
+        helps = not whys or any("fly" in why for why in whys)  # no flight measures a drag coefficient
+        if fitted and helps and TOLERANCE.vague < spread < math.inf:
             every = (each.provenance.fitted_seconds for each in fitted)
             motions.append(_more(axis.motion, spread, sum(x for x in every if isinstance(x, float))))
             flown.add(f"fly more {axis.motion}")
@@ -63,6 +66,8 @@ def _more(motion: str, spread: float, seconds: float) -> str:
     `seconds`: how long was fitted until now [s].
     """
     lacking = (spread / TOLERANCE.vague) ** 2 - 1  # information, in multiples of that of the flights until now
+    if not seconds:
+        return f"more {motion}"
     if seconds * lacking <= _MOST:
         return f"{_ROUND * math.ceil(seconds * lacking / _ROUND):.0f} s more {motion}"
     return f"{motion} as long as before but {lacking**0.5:.2g} times as strong"
@@ -77,7 +82,7 @@ def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
         yield from (each.remedy for each in doubts if any(each.cause in said for said in verdict.reasons))
         for said in verdict.reasons:
             cause, _, remedy = said.rpartition("; ")
-            if cause and not cause.startswith("it is known to") and not any(each.cause in said for each in doubts):
+            if cause and not cause.startswith(_VAGUE) and not any(each.cause in said for each in doubts):
                 yield remedy
             elif verdict.status == MISSING and not found.is_vehicle and not doubts:
                 yield "fly what `jaxos4 design` proposes"

@@ -6,9 +6,10 @@ import numpy as np
 
 from ..airframe import AXES, YAW
 from ..models.abstract import PARAMETER_NAMES
-from ..models.terms import SAG
+from ..models.terms import SAG, VOLTAGE_EXPONENT
 from ..results import NINETY_FIVE
-from .answers import Answer
+from .answers import Answer, drag_error
+from .doubts_of_iz import MEASURE
 from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
 from .uncertainty import PRIOR_NOTE
 from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Quantity
@@ -36,7 +37,9 @@ def vehicle_quantities(
             value = f"{row.estimate:.4g} +- {half:.2g} {row.unit} (95 %){condition}"
             notes = _notes(answer, {alpha: table[alpha]}, shares)
             remedy = f"fly more {axis.motion}, or longer"
-            if shares.get(SAG, 0.0) > TOLERANCE.prior:
+            if axis == YAW and drag_error(answer):
+                remedy = MEASURE
+            elif shares.get(SAG, 0.0) > TOLERANCE.prior and VOLTAGE_EXPONENT not in own.names:
                 remedy = f"log rotor speeds, or the battery's voltage at 10 Hz or more, or {remedy}"
             found[axis.inertia] = Quantity(value, half / row.estimate, reservations=notes, remedy=remedy)
     for quantity, names in model.quantities.items():

@@ -1,7 +1,7 @@
 """The sample time of a vehicle's fit: the shortest at which the answer does not depend on it.
 
 Short samples contain the vibration of the sensors. Long samples hide motion. The flight is fitted at several sample
-times, from the longest on. A sample time that the user gives is fitted in the same way, and longer ones beside it.
+times. A sample time that the user gives is fitted in the same way, and longer ones beside it.
 
 The rule: the shortest sample time at which the innovations of the body rates are nearly white, and the moments of
 inertia are those of the next longer samples with an answer, within two standard deviations, and known nearly as well.
@@ -49,25 +49,37 @@ class SampleTimeRule(NamedTuple):
 RULE = SampleTimeRule()
 
 
+Fits = tuple[Sequence[Data[InnovationsProblem]], list[Optimum], list[SampleTime]]
+"""Data, optimum and answer at several sample times, the shortest first."""
+
+
 def fit_sample_times(
     several: Sequence[Data[InnovationsProblem]], solver: AbstractEstimator, *, choose: bool, progress: Progress
-) -> tuple[list[Optimum], list[SampleTime]]:
-    """The optimum and the answer at each sample time, the shortest first.
+) -> Fits:
+    """The fits at the sample times that can be compared.
 
-    Where commands are answered within a sample, feedthroughs hide nearly all that is compared. If the sample time is to
-    be chosen, such samples are fitted only if no shorter ones have white innovations.
+    Samples of commands that hold the controller's answers are another kind: feedthroughs hide nearly all that they
+    show. They are fitted only if no others have white innovations, and the kind with the least correlated is returned.
+
+    `choose`: whether the sample time is to be chosen; otherwise the kind of the first counts.
     """
-    clear = [each for each in several if not each.hides_answers] if choose else []
-    optima: list[Optimum] = []
-    rows: list[SampleTime] = []
-    for some in filter(None, (clear, several[len(clear) :])):
+    kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
+    best: Fits = [], [], []
+    for some in filter(None, kinds):
+        if not choose and some[0] is not several[0]:
+            continue
+        found = search_sample_times(some, solver, progress=progress)
+        progress("computing intervals")
+        rows = [sample_time_of(corrected(x, data)) for x, data in zip(found, some, strict=True)]
+        if not best[2] or _least_correlation(rows) < _least_correlation(best[2]):
+            best = some, found, rows
         if any(row.constants and is_white(row) for row in rows):
             break
-        found = search_sample_times(some, solver, progress=progress)
-        optima += found
-        progress("computing intervals")
-        rows += [sample_time_of(corrected(x, data)) for x, data in zip(found, some, strict=True)]
-    return optima, rows
+    return best
+
+
+def _least_correlation(rows: Sequence[SampleTime]) -> float:
+    return min((abs(row.correlation) for row in rows if row.constants), default=math.inf)
 
 
 def search_sample_times(
@@ -75,8 +87,8 @@ def search_sample_times(
 ) -> list[Optimum]:
     """The optimum at each sample time.
 
-    The search for all parameters starts at the answer of the sample time before, if that is a minimum. It starts anew
-    where feedthroughs end: with commands, they hide nearly all that is compared, and the answer is far off.
+    The search for all parameters starts at the answer of the sample time before, if that is a minimum. It starts at the
+    bracket's centre where feedthroughs are no longer estimated.
 
     **Arguments:** `several`: one flight at several sample times, each twice the one before.
     """

@@ -43,7 +43,8 @@ class Likelihoods(NamedTuple):
     - `segments`: the parts of a flight, which are filtered in parallel. Their disagreement shows errors of the model.
       There are more from twice `recordings` recordings on. None is shorter than `seconds` [s].
     - `tolerance`: of `FilterError`: it stops within 0.05 standard deviations of the minimum.
-    - `controller`: a log whose rows are at most this far apart holds every run of the controller [s].
+    - `controller`: up to this sample time, torque hardly answers what is measured in its own sample, if that is an
+      instant or if motors follow commands [s].
     - `sigma`: the scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
     """
 
@@ -83,10 +84,12 @@ class VehicleCase:
         `FilterError` searches at all sample times, and another estimator then at the chosen one.
         """
         solver, is_default = FilterError(tolerance=LIKELIHOODS.tolerance), self.estimator == DEFAULT
+        data = self.data[0]
         compared = self.data if is_default or len(self.data) > 1 else ()
-        optima, rows = fit_sample_times(compared, solver, choose=self.choose, progress=progress)
+        fitted, optima, rows = fit_sample_times(compared, solver, choose=self.choose, progress=progress)
         place = chosen_place(rows) if self.choose and rows else 0
-        data = self.data[place]
+        if fitted:
+            data = fitted[place]
         if is_default:
             optimum = optima[place]
         else:
@@ -159,7 +162,8 @@ def _data(
     if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
         value, error = prepared.level  # the flight says how the accelerometer errs along z
         bracket = {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
-    if voltage is not None and SAG in model.parameter_names and not isinstance(bracket, Bracket):
+    powered = any(VOLTAGE in TERMS[term].needs for term in terms)
+    if powered and voltage is not None and SAG in model.parameter_names and not isinstance(bracket, Bracket):
         unseen = max(map(unseen_sag, recordings))  # a logged voltage contains the rest
         center, half_width = (float(each[model.parameter_names.index(SAG)]) for each in (model.alpha, model.half_width))
         bracket = {SAG: [unseen * (center - half_width), unseen * (center + half_width)], **(bracket or {})}
@@ -176,7 +180,6 @@ def _data(
     held_out, tested_seconds, notes = _held_out(recordings, validate, prepared, shooting, model)
     stretch = prepared.fitted.stretch
     number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
-    powered = any(VOLTAGE in TERMS[term].needs for term in terms)
     provenance = Provenance(
         flights=[recording.name for recording in recordings],
         validate=None if validate is None else validate.name,
@@ -241,7 +244,7 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     capacity = capacity_of(finest.fitted.time.shape[0])
     flight, inputs = shooting.flight, _input_innovations(shooting, capacity)
-    # Neither torque before an instant answers it, nor does that of motors, which are slow.
+    # Torque before an instant cannot answer it. Motors answer more slowly than a short sample lasts.
     is_late = float(flight.averaging_time) == 0.0 or COMMANDS in prepared.available
     return InnovationsProblem(
         with_room(shooting, capacity),

@@ -98,6 +98,10 @@ class Doubt(msgspec.Struct, frozen=True):
         """The status that it leaves to a quantity if nothing says how far the quantity would move."""
         return {"successful": RESERVED, "implausible": CONTRADICTED}.get(self.result, MISSING)
 
+    def share_of(self, name: str) -> float:
+        """By which share the quantity of this name would move; 0 if nothing says how far."""
+        return 0.0 if (move := self.moves.get(name)) is None else move.share
+
     def status_left(self, name: str, tolerance: Tolerance = TOLERANCE) -> str:
         """The status of the quantity of this name if this were the only doubt."""
         if name not in self.moves:
@@ -187,9 +191,10 @@ def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt], tolerance
         for place, status in enumerate(_statuses_left(doubts, name, tolerance)):
             causes[status].append(_reason(doubts[place], name))
             # A reservation that contradicts together with another decides nothing by itself.
-            if status not in _TRUSTED and doubts[place].status_left(name, tolerance) not in _TRUSTED:
-                is_reservation = doubts[place].severity == RESERVED
-                refusals[name].append((place, "implausible" if is_reservation else doubts[place].result))
+            doubt = doubts[place]
+            is_reservation, alone = doubt.severity == RESERVED, doubt.status_left(name, tolerance)
+            if status not in _TRUSTED and (not is_reservation or alone not in _TRUSTED):
+                refusals[name].append((place, "implausible" if is_reservation else doubt.result))
         causes[RESERVED] += quantity.reservations
         if quantity.missing and not causes[MISSING]:
             causes[MISSING].append(quantity.missing)

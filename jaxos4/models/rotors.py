@@ -157,11 +157,13 @@ class Motor(NamedTuple):
       of its current.
     - `shortest_lag`: the lag that acts is at least this share of a sample, so that a step stays finite wherever a
       search looks.
+    - `emptiest`: no load takes more than the rest of the battery's voltage.
     - `least`: smaller numbers under a root or in a quotient count as this.
     """
 
     smooth = 0.005
     shortest_lag = 0.05
+    emptiest = 0.5
     least = 1e-6
 
     lag: Scalar
@@ -173,7 +175,7 @@ class Motor(NamedTuple):
 
     def supplied(self, command: Float[Array, "4"], omega: Float[Array, "4"]) -> Float[Array, "4"]:
         """The commands [rad/s] that act when the rotors turn at `omega`. Commands are calibrated in hover."""
-        return command * (1 - self.sag * (jnp.mean((omega / self.hover) ** 3) - 1))
+        return command * jnp.maximum(1 - self.sag * (jnp.mean((omega / self.hover) ** 3) - 1), self.emptiest)
 
     def command(self, omega: Speed) -> Speed:
         """The command [rad/s] that keeps a speed."""

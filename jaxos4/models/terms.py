@@ -33,8 +33,8 @@ _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
 VERTICAL_BIAS = _FORCE_BIASES[2]
 """The parameter that is the constant error of the accelerometer along z."""
-SAG = "battery_sag"
-"""The parameter that is the share of the battery's voltage that the load of hover takes."""
+SAG, VOLTAGE_EXPONENT = "battery_sag", "voltage_exponent"
+"""The share of the battery's voltage that the load of hover takes; the power of the logged voltage."""
 
 T = TypeVar("T")
 Values = Mapping[str, Float[Array, "..."]]
@@ -229,9 +229,9 @@ _OWN: dict[str, Term] = {
     ),
     "voltage": Term(
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
-        (Parameter("voltage_exponent", "1", 0.5, center=0.5),),
+        (Parameter(VOLTAGE_EXPONENT, "1", 0.5, center=0.5),),
         needs=frozenset({VOLTAGE, COMMANDS}),
-        command=_scaled(lambda values, grid: _known(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"]),
+        command=_scaled(lambda values, grid: _known(grid.voltage, VOLTAGE, "voltage") ** values[VOLTAGE_EXPONENT]),
     ),
     "fade": Term(
         "commands lose effect as the battery empties: battery_fade [1/s], the share of rotor speed lost in a second",

@@ -17,8 +17,8 @@ def unseen_sag(recording: Recording) -> float:
     A voltage that is logged slowly is held or interpolated between its measurements; both are counted by the changes of
     its slope.
     """
-    voltage = recording.voltage
-    if voltage is None or voltage.size < 3:
+    voltage = np.empty(0) if recording.voltage is None else recording.voltage[recording.voltage > 0]
+    if voltage.size < 3:
         return 1.0
     steps, usual = np.diff(voltage), float(np.median(np.abs(voltage)))
     changes = np.abs(np.diff(steps)) > 1e-9 * usual

@@ -1,4 +1,4 @@
-"""What the torque tells that the log does not: answers of a controller that knows more.
+"""Input innovations: the part of torque and thrust that the past does not predict.
 
 All of the torque is known before its sample, but for its *input innovation* v. Two things make v depend on what the
 filter compares and estimates:
@@ -16,10 +16,10 @@ See `docs/method/filter_error.md`.
 import numpy as np
 from jaxtyping import Float, Int
 
-FEEDTHROUGHS = 2
-"""The largest number of input innovations of a body rate."""
 COUNTS = (2, 2, 1, 1)
-"""Those of roll, pitch, yaw and thrust. A second one of yaw would hide the reaction of the rotors."""
+"""The numbers of input innovations of roll, pitch, yaw and thrust. A second one of yaw would hide the reaction of the
+rotors."""
+FEEDTHROUGHS = max(COUNTS)
 # The share of a signal that rounding may have made.
 _ROUNDING = 1e-6
 # The rows of one matrix product: more would not fit the cache, and BLAS would divide so small a product among threads.
@@ -41,7 +41,8 @@ def input_innovations(
     combinations of the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch. The sign
     of a combination is arbitrary.
 
-    - `inputs`: in equal parts of each sample, in any unit. `measured`: the rate or specific force; NaN counts as 0.
+    - `inputs`: in equal parts of each sample, in any unit.
+    - `measured`: the rate or specific force; NaN counts as the mean.
     - `stretch`: the number of the uninterrupted stretch of each sample.
     - `dt`: sample time [s]. `memory`: how far back the past reaches [s], at least three samples.
     """
@@ -52,7 +53,8 @@ def input_innovations(
         return found
     series = np.ones((samples, parts + 2))
     series[:, :parts] = _standard(inputs)
-    series[:, parts] = _standard(np.nan_to_num(measured))
+    known = measured[np.isfinite(measured)]
+    series[:, parts] = _standard(np.nan_to_num(measured - (known.mean() if known.size else 0.0)))
     rest = _unexplained(series, parts, rows, lags)
     _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))

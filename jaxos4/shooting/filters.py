@@ -71,7 +71,8 @@ class _Known(NamedTuple):
 class InputGains(NamedTuple):
     """What a unit of each input innovation adds to the estimates at the end of its sample, by feedthrough.
 
-    - `driven`: to the rate [rad/s]. `disturbance`: to the disturbance [rad/s^2].
+    - `driven`: to the rate [rad/s], or to the force besides the model's [m/s^2].
+    - `disturbance`: to the disturbance [rad/s^2], or [m/s^2].
     """
 
     driven: tuple[Float[Array, " channels *segments"], ...]
@@ -113,15 +114,15 @@ def _advance(
     driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
     rates = move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates
     driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
-    told = tuple(_told(gains, row.inputs) for gains in feedback.by_input)
-    later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, told[0], strict=True)
+    added = tuple(_by_inputs(gains, row.inputs) for gains in feedback.by_input)
+    later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, added[0], strict=True)
     driven = tuple(x + a * d + gain * e + v for x, a, d, gain, e, v in later)
-    faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, told[1], strict=True)
+    faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, added[1], strict=True)
     disturbance = tuple(share * d + gain * e + v for share, d, gain, e, v in faded)
     return _emptied(_Known(driven, disturbance), row.restarts_next), errors
 
 
-def _told(gains: tuple[Array, ...], inputs: Float[Array, "feedthroughs channels segments"]) -> Channels:
+def _by_inputs(gains: tuple[Array, ...], inputs: Float[Array, "feedthroughs channels segments"]) -> Channels:
     """What input innovations add to an estimate, by channel."""
     each = (v * (k if k.ndim > 1 else k[:, None]) for k, v in zip(gains, inputs, strict=True))
     return sum(each, jnp.zeros(inputs.shape[1:], dtype=float))
@@ -274,7 +275,9 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
     seen = jnp.where(missing[:, None], 0.0, inputs)
     row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, seen, observed.restart, following)
-    explained, known_noise = (jax.vmap(_told, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough))
+    explained, known_noise = (
+        jax.vmap(_by_inputs, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough)
+    )
     fed = explained, jnp.square(known_noise), jnp.moveaxis(inputs, 2, 1)
     data = row, observed.counts, fed, forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)

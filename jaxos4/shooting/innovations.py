@@ -163,9 +163,9 @@ class InnovationsProblem(AbstractProblem):
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
         data = self.problem.measured(), self.flight.dt, self.least_noise
-        told = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
+        has_input = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
         return self.noise_unknowns.after(
-            self.problem.unknowns, self.channels, *data, told=told, answers_within=self.answers_within
+            self.problem.unknowns, self.channels, *data, has_input=has_input, answers_within=self.answers_within
         )
 
     @property

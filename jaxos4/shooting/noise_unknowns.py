@@ -69,12 +69,12 @@ class NoiseUnknowns(NamedTuple):
         dt: Scalar,
         least_noise: Float[Array, " channels"],
         *,
-        told: Bool[Array, "channels feedthroughs"],
+        has_input: Bool[Array, "channels feedthroughs"],
         answers_within: Bool[Array, ""],
     ) -> Unknowns:
         """The parameters, then noise, gains and feedthroughs of each channel, in brackets from the measurements.
 
-        `told`: which input innovations a channel has. `answers_within`: see `InnovationsProblem`.
+        `has_input`: which input innovations a channel has. `answers_within`: see `InnovationsProblem`.
         """
         if self.longest_smoothing >= self.shortest_of_force:
             raise ValueError(
@@ -93,14 +93,14 @@ class NoiseUnknowns(NamedTuple):
         highest = highest.at[:, 3:].set(jnp.where(rate, first[:, 3:], np.log(self.longest_smoothing)))
         lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))
         free = jnp.ones(first.shape, dtype=bool).at[:, 3:].set(~rate)
-        more = 3 * told.shape[1]
+        more = 3 * has_input.shape[1]
         first, lowest, highest = (
             jnp.pad(x, ((0, 0), (0, more)), constant_values=value)
             for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf))
         )
-        # A gain of nothing is no unknown.
-        free = jnp.concatenate([free, told, told, told & rate & answers_within], axis=1)
-        names = tuple(each.format(name) for name in channels for each in own_names(count, told.shape[1]))
+        # An input innovation that is always 0 has no gain to estimate.
+        free = jnp.concatenate([free, has_input, has_input, has_input & rate & answers_within], axis=1)
+        names = tuple(each.format(name) for name in channels for each in own_names(count, has_input.shape[1]))
         precision = jnp.full(first.size, self.precision)
         return Unknowns(
             names=own.names + names,
@@ -125,4 +125,8 @@ def own_names(count: int, feedthroughs: int) -> tuple[str, ...]:
 
 
 def _unit(name: str) -> str:
-    return "1" if name.startswith("log") else "rad/s^2" if "disturbance" in name else "rad/s"
+    if name.startswith("log"):
+        return "1"
+    if name.startswith("a"):
+        return "m/s^2"
+    return "rad/s^2" if "disturbance" in name else "rad/s"
