@@ -12,7 +12,7 @@ import jaxos4
 CRAZYFLIE = pathlib.Path(jaxos4.__file__).with_name("airframes") / "crazyflie.toml"
 def fly(case, out):
     airframe = jaxos4.load_airframe("crazyflie")
-    loop = jaxos4.ClosedLoop(airframe, gust=2.0, logged="speeds")
+    loop = jaxos4.ClosedLoop(airframe, gust=1.0, logged="speeds")
     flight = jaxos4.closed_loop.fly_standard(loop, duration=case["seconds"], seed=case["seed"])
     jaxos4.write_flight(flight, out / f"{case['name']}.csv", airframe)
     shutil.copy(CRAZYFLIE, out / f"{case['name']}.toml")

@@ -214,4 +214,4 @@ def test_a_flight_in_gusts_has_the_same_answer_at_8_and_32_ms():
         if name in ("alpha3", "alpha6"):
             assert abs(own - value) < 3 * std
             assert abs(other - value) < 3 * longer
-            assert longer < 0.04 * value
+            assert longer < 0.05 * value  # what the torque tells of the controller's knowledge costs a fifth

@@ -193,8 +193,8 @@ def _add_force_bias(force: Vector, values: Values) -> Vector:
     return x, y, z
 
 
-# Small vehicles have 0.02 to 0.1 s. A time constant of less than -0.002 s is neither chance nor rounding.
-_LAG = Parameter("rotor_lag", "s", 0.025, center=0.035, contradiction=_limits((-0.002, _INF, _LATE, _CLOCKS)))
+# Rotors of 2 to 15 inches have 0.01 to 0.08 s. A time constant of less than -0.002 s is neither chance nor rounding.
+_LAG = Parameter("rotor_lag", "s", 0.035, center=0.045, contradiction=_limits((-0.002, _INF, _LATE, _CLOCKS)))
 
 _OWN: dict[str, Term] = {
     "offset": Term(
