@@ -10,6 +10,7 @@ from ..analysis.inertia import fit_inertia
 from ..estimators import FilterError
 from ..models.abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
+from ..models.terms import DAMPED
 from ..results import result_names
 from .answers import Answer
 from .results import Constant, ParameterEstimate, RigidBody
@@ -46,6 +47,7 @@ class Plausible(NamedTuple):
 
 
 PLAUSIBLE = Plausible()
+_RARE = 0.015  # s; motors that were logged less often look like damping
 ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
 
 
@@ -96,8 +98,8 @@ def doubts_of_values(
     for name, row in parameters.items():
         if row.estimate is not None and row.std is not None:
             estimated[name], stds[name] = (row.estimate, row.std if row.bound is None else row.bound), row.std
-    yield from (doubt for _, doubt in contradicted(model, fixed))
-    wrong = dict(contradicted(model, estimated, follow))
+    yield from (doubt for _, doubt in contradicted(model, fixed, log_step=log_step))
+    wrong = dict(contradicted(model, estimated, follow, log_step=log_step))
     yield from wrong.values()
     if not any(parameter.scales_torque for parameter in wrong):
         yield from _impossible_inertias(constants, model.airframe)
@@ -126,9 +128,13 @@ def _odd_motors(
 
 
 def contradicted(
-    model: AbstractModel, estimated: Estimated, follow: Consequences = lambda name, value: {}
+    model: AbstractModel,
+    estimated: Estimated,
+    follow: Consequences = lambda name, value: {},
+    *,
+    log_step: float = 0.0,
 ) -> Iterator[tuple[Parameter, Doubt]]:
-    """The parameters whose values physics or the airframe forbid.
+    """The parameters whose values physics or the airframe forbid. `log_step`: see `doubts_of_values`.
 
     The doubt moves other quantities as if the parameter had the value expected from the airframe.
     """
@@ -141,7 +147,9 @@ def contradicted(
         if why is not None:
             own: Moves = dict.fromkeys([owner[parameter.name]] if parameter.name in owner else [])
             others = dict.fromkeys((*INERTIAS, "thrust")) if parameter.scales_torque else follow(parameter.name, usual)
-            yield parameter, contradiction(f"{parameter.name} = {value:.2g} {why[0]}", why[1], {**others, **own})
+            rare = ": motors were logged too rarely" * (why[0] == DAMPED and log_step > _RARE)
+            cause = f"{parameter.name} = {value:.2g} {why[0]}{rare}"
+            yield parameter, contradiction(cause, why[1], {**others, **own})
 
 
 def consequences(

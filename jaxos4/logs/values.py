@@ -162,7 +162,7 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
             if field not in cleaned:
                 cleaned[field] = logged.copy()
             cleaned[field][:, place] = filled(column) if field == "omega" else column
-    return Plausible(recording._replace(**cleaned), impossible, clipped)
+    return Plausible(recording._replace(**cleaned) if cleaned else recording, impossible, clipped)
 
 
 def _isolated(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:

@@ -139,7 +139,9 @@ _BENT = f"is not between 0 (thrust linear in the command) and {STEEPEST:g}: no m
 _CLIMB = "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`"
 _GROWS = "is negative: no inflow makes thrust grow with the velocity along z"
 _CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, and fly climbs and descents"))
-_SPARSE = "1/s is more than rotors give (1)", "log motors at 100 Hz or more, on board; else the model lacks an effect"
+DAMPED = "1/s is more than rotors give (1)"
+"""The cause of a damping that contradicts physics."""
+_SPARSE = DAMPED, "log motors at 100 Hz or more, on board; else the model lacks an effect"
 _DAMPED = _limits((-_INF, 2.5, *_SPARSE))
 _OFF = "m/s^2: a levelled accelerometer is off by less than 0.6, so the thrust does not match the weight"
 _LEVEL = _limits((-0.6, 0.6, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
