@@ -85,6 +85,7 @@ class Data(Generic[L]):
     - `provenance`: data, settings and versions. `seconds`: how long the fitted measurements of a vehicle last [s].
     - `held_out`: what is not fitted, if there is anything.
     - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
+    - `motor_step`: the longest time between new values of the motors in the logs [s].
     - `vibrates`: the body rates that vibrate, each with its frequency [Hz].
     - `follows_commands`: whether rotor speeds are computed from commands.
     """
@@ -97,6 +98,7 @@ class Data(Generic[L]):
     held_out: HeldOut | None = None
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
+    motor_step: float = 0.0
     vibrates: Mapping[str, float] = dataclasses.field(default_factory=dict)
     follows_commands: bool = False
 

@@ -101,7 +101,9 @@ def doubts_of_vehicle(
         *few_parts(data.seconds),
         *_doubts_of_weak_axes(weak),
         *doubts_of_iz(answer, table, constants),
-        *doubts_of_values(answer.problem.model, judged, constants, fixed, data.log_step, follow),
+        *doubts_of_values(
+            answer.problem.model, judged, constants, fixed, data.log_step, follow, motor_step=data.motor_step
+        ),
         *doubts_of_predictions(skill, still),
         *_doubts_of_sample_time(data, answer, sample_times, constants),
         *stronger_or_weaker(response, constants),

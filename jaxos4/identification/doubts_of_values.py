@@ -86,11 +86,13 @@ def doubts_of_values(
     fixed: Mapping[str, tuple[float, float]] = {},
     log_step: float = 0.0,
     follow: Consequences = lambda name, value: {},
+    *,
+    motor_step: float = 0.0,
 ) -> Iterator[Doubt]:
     """The doubts about the parameters and moments of inertia of a vehicle.
 
-    `fixed`: parameters that are not estimated. `log_step`: the longest sample of the logs [s]. `follow`: how far the
-    quantities move if a parameter has another value.
+    `fixed`: parameters that are not estimated. `log_step`: the longest sample of the logs [s]; `motor_step`: the
+    longest between new values of motors. `follow`: how far the quantities move if a parameter has another value.
 
     The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
     """
@@ -98,8 +100,8 @@ def doubts_of_values(
     for name, row in parameters.items():
         if row.estimate is not None and row.std is not None:
             estimated[name], stds[name] = (row.estimate, row.std if row.bound is None else row.bound), row.std
-    yield from (doubt for _, doubt in contradicted(model, fixed, log_step=log_step))
-    wrong = dict(contradicted(model, estimated, follow, log_step=log_step))
+    yield from (doubt for _, doubt in contradicted(model, fixed, motor_step=motor_step))
+    wrong = dict(contradicted(model, estimated, follow, motor_step=motor_step))
     yield from wrong.values()
     if not any(parameter.scales_torque for parameter in wrong):
         yield from _impossible_inertias(constants, model.airframe)
@@ -132,9 +134,9 @@ def contradicted(
     estimated: Estimated,
     follow: Consequences = lambda name, value: {},
     *,
-    log_step: float = 0.0,
+    motor_step: float = 0.0,
 ) -> Iterator[tuple[Parameter, Doubt]]:
-    """The parameters whose values physics or the airframe forbid. `log_step`: see `doubts_of_values`.
+    """The parameters whose values physics or the airframe forbid. `motor_step`: see `doubts_of_values`.
 
     The doubt moves other quantities as if the parameter had the value expected from the airframe.
     """
@@ -147,7 +149,7 @@ def contradicted(
         if why is not None:
             own: Moves = dict.fromkeys([owner[parameter.name]] if parameter.name in owner else [])
             others = dict.fromkeys((*INERTIAS, "thrust")) if parameter.scales_torque else follow(parameter.name, usual)
-            rare = ": motors were logged too rarely" * (why[0] == DAMPED and log_step > _RARE)
+            rare = ": motors were logged too rarely" * (why[0] == DAMPED and motor_step > _RARE)
             cause = f"{parameter.name} = {value:.2g} {why[0]}{rare}"
             yield parameter, contradiction(cause, why[1], {**others, **own})
 

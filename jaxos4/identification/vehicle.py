@@ -200,6 +200,7 @@ def _data(
         held_out=held_out,
         findings=prepared.findings,
         log_step=prepared.log_step,
+        motor_step=prepared.motor_step,
         vibrates=prepared.vibrates,
         follows_commands=COMMANDS in prepared.available,
         clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),

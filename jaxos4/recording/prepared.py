@@ -71,6 +71,7 @@ class Prepared(NamedTuple):
     - `notes`: what the reader changed, and which stretches are not used.
     - `findings`: what the logs show that concerns moments of inertia, or contradicts another quantity.
     - `log_step`: the longest sample of the logs [s].
+    - `motor_step`: the longest time between new values of the motors in the logs [s].
     - `vibrates`: the rates with a line in the gyro's spectrum, and its frequency [Hz], see `vibrating_rates`.
     """
 
@@ -86,6 +87,7 @@ class Prepared(NamedTuple):
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
+    motor_step: float = 0.0
     vibrates: Mapping[str, float] = MappingProxyType({})
 
     @property
@@ -167,6 +169,7 @@ def prepare(
             notes=tuple(notes),
             findings=tuple(found),
             log_step=slowest,
+            motor_step=max(slowest, *(each.evidence.motor_step for each in every)),
             vibrates=vibrates,
         )
         for step, flown in zip(steps, coarse, strict=True)
