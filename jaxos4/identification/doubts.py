@@ -29,7 +29,7 @@ from .results import (
     RigidBody,
     SampleTime,
 )
-from .sample_time import moved, white_limit
+from .sample_time import is_white, moved
 from .search import Optimum
 from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Doubt, Move, contradiction, refusal, reservation
 
@@ -220,7 +220,7 @@ def _doubts_of_sample_time(
 
 def _correlated(row: SampleTime, moves: Mapping[str, Move]) -> Iterator[Doubt]:
     """Innovations that are less correlated than by vibration, and yet not white."""
-    if white_limit(row) < abs(row.correlation) <= PLAUSIBLE.vibration:
+    if not is_white(row) and abs(row.correlation) <= PLAUSIBLE.vibration:
         cause = f"innovations of the body rates correlate by {row.correlation:.2g} at {1e3 * row.sample_time:.3g} ms"
         yield reservation(cause, "log faster, or before the filters of the gyro", moves)
 

@@ -28,6 +28,7 @@ def vehicle_quantities(
     """
     model, own, found = answer.problem.model, answer.problem.unknowns, {}
     shares = dict(zip(own.names, np.square(answer.bound / np.asarray(own.half_width)).tolist(), strict=True))
+    half_widths = dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))
     for axis in AXES:
         row, alpha = constants.get(axis.inertia), axis.inverse
         if row is None:
@@ -47,7 +48,7 @@ def vehicle_quantities(
         which = f"the flights say less about {', '.join(unseen)} than the bracket; fly with more motion"
         rows = {name: table[name] for name in names if name in table}
         reservations = ((which,) if unseen else ()) + _notes(answer, rows, shares)
-        wide = tuple(_too_wide(rows, dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))))
+        wide = tuple(_too_wide(rows, half_widths))
         missing = which if not rows else "; ".join(wide) if len(wide) == len(rows) else ""
         axes = {axis.inertia for axis in AXES for name in names if name.startswith(axis.motion) and axis != YAW}
         found[quantity] = Quantity("", 0.0, missing, (*reservations, *wide), requires=tuple(sorted(axes)))

@@ -122,14 +122,9 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
     return next((i for i in clean[:-1] if _agree(rows[i], rows[longer[i]])), clean[0])
 
 
-def white_limit(row: SampleTime) -> float:
-    """The largest correlation of innovations that are nearly white."""
-    return RULE.white + RULE.chance / math.sqrt(max(row.samples, 1))
-
-
 def is_white(row: SampleTime) -> bool:
     """Whether innovations are nearly white."""
-    return abs(row.correlation) <= white_limit(row)
+    return abs(row.correlation) <= RULE.white + RULE.chance / math.sqrt(max(row.samples, 1))
 
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:

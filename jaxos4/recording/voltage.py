@@ -20,7 +20,7 @@ def unseen_sag(recording: Recording) -> float:
     voltage = np.empty(0) if recording.voltage is None else recording.voltage[recording.voltage > 0]
     if voltage.size < 3:
         return 1.0
-    steps, usual = np.diff(voltage), float(np.median(np.abs(voltage)))
+    steps, usual = np.diff(voltage), float(np.median(voltage))
     changes = np.abs(np.diff(steps)) > 1e-9 * usual
     is_held = np.count_nonzero(steps) <= np.count_nonzero(changes) / 2 + 1
     measured = np.count_nonzero(steps if is_held else changes)
