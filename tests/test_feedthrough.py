@@ -14,7 +14,7 @@ from jaxos4.closed_loop import fly_standard
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.shooting import InnovationsProblem
-from jaxos4.shooting.feedthrough import FEEDTHROUGHS, input_innovations
+from jaxos4.shooting.feedthrough import FEEDTHROUGHS, input_innovations, lagged
 from jaxos4.shooting.gains import LogNoise
 
 DT, SAMPLES = 0.01, 600
@@ -63,6 +63,12 @@ def test_innovations_are_what_the_past_does_not_tell(rng):
         for lag in range(1, 11):
             past = np.column_stack([torque[10 - lag : SAMPLES - lag, :, axis], rates[10 - lag : SAMPLES - lag, axis]])
             np.testing.assert_allclose(own.T @ past / len(own), 0.0, atol=1e-9)
+
+
+def test_lagged_innovations_are_those_of_the_samples_before_in_the_same_stretch():
+    found = lagged(np.arange(1.0, 8.0), np.array([0, 0, 0, 0, 1, 1, 1]), 3)
+    expected = [[1, 0, 0], [2, 1, 0], [3, 2, 1], [4, 3, 2], [5, 0, 0], [6, 5, 0], [7, 6, 5]]
+    np.testing.assert_array_equal(found, expected)
 
 
 def assert_same_directions(found, expected, *, atol):

@@ -23,7 +23,7 @@ from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.voltage import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, input_innovations
+from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, input_innovations, lagged
 from .answers import Solution
 from .checks import Checked, check_vehicle
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
@@ -244,34 +244,37 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     segments = int(np.clip(seconds / LIKELIHOODS.seconds, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     capacity = capacity_of(finest.fitted.time.shape[0])
-    flight, inputs = shooting.flight, _input_innovations(shooting, capacity)
+    flight, commanded = shooting.flight, COMMANDS in prepared.available
     # Torque before an instant cannot answer it. Motors answer more slowly than a short sample lasts.
-    is_late = float(flight.averaging_time) == 0.0 or COMMANDS in prepared.available
+    is_late = float(flight.averaging_time) == 0.0 or commanded
     return InnovationsProblem(
         with_room(shooting, capacity),
         segments=segments,
         least_noise=least_noise,
-        input_innovations=inputs,
+        input_innovations=_input_innovations(shooting, capacity, commanded=commanded),
         answers_within=not (is_late and float(flight.dt) <= LIKELIHOODS.controller),
     )
 
 
 def _input_innovations(
-    shooting: ShootingProblem, capacity: int
+    shooting: ShootingProblem, capacity: int, *, commanded: bool
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
     """Those of the body rates and of the vertical force, of a flight that is padded to `capacity` samples."""
     flight, columns = shooting.flight, shooting.columns
     if flight.within is None:
         return None
-    samples, mixer = flight.time.shape[0], np.asarray(shooting.model.airframe.mixer)
+    dt, (samples,), mixer = float(flight.dt), flight.time.shape, np.asarray(shooting.model.airframe.mixer)
     inputs = np.square(np.asarray(flight.within)) @ mixer.T
     stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
-    measured, found = shooting.recorded(), np.zeros((capacity, FEEDTHROUGHS, columns.size))
-    for channel, column in enumerate(columns):
+    is_lagged = commanded and dt <= LIKELIHOODS.controller
+    counts = LAGGED_COUNTS if is_lagged else COUNTS
+    found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
+    for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
         if axis is not None:
-            own = input_innovations(inputs[:, :, axis], measured[:, channel], stretch, float(flight.dt), COUNTS[axis])
-            found[:samples, : COUNTS[axis], channel] = own
+            torque, count = inputs[:, :, axis], counts[axis]
+            own = input_innovations(torque, measured, stretch, dt, 1 if is_lagged else count)
+            found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
     return found
 
 

@@ -9,6 +9,8 @@ filter compares and estimates:
 - A controller that runs faster than the log measures rates that the log lacks. Its answers tell of rates and
   disturbances, so that the estimates of the filter are corrected by unknown gains times v. Without these gains, the
   error of the filter correlates with the torque that follows, and all parameters are biased.
+- Motors follow a command of the log until its next row, but the commands of such a controller change sooner. The torque
+  is wrong by a share of v for as long as the motors take to follow, so that the v of a few samples count (`lagged`).
 
 See `docs/method/filter_error.md`.
 """
@@ -20,6 +22,9 @@ COUNTS = (2, 2, 1, 1)
 """The numbers of input innovations of roll, pitch, yaw and thrust. A second one of yaw would hide the reaction of the
 rotors."""
 FEEDTHROUGHS = max(COUNTS)
+LAGGED_COUNTS = (3, 3, 3, 1)
+"""The same if motors follow commands in short samples: the innovation of the sample, and those of samples before. With
+fewer, rotor_lag and rotor_delay have several minima, and with more, the motors' own answer is lost."""
 # The share of a signal that rounding may have made.
 _ROUNDING = 1e-6
 # The rows of one matrix product: more would not fit the cache, and BLAS would divide so small a product among threads.
@@ -60,6 +65,17 @@ def input_innovations(
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
     scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
     found[rows] = np.sqrt(len(rows)) * rest @ scaled[:, :count]
+    return found
+
+
+def lagged(
+    innovation: Float[np.ndarray, " samples"], stretch: Int[np.ndarray, " samples"], count: int
+) -> Float[np.ndarray, "samples count"]:
+    """An innovation beside those of the `count` - 1 samples before; 0 before the beginning of a stretch."""
+    found = np.zeros((len(innovation), count))
+    for lag in range(count):
+        rows = np.arange(lag, len(innovation))
+        found[rows, lag] = np.where(stretch[rows] == stretch[rows - lag], innovation[rows - lag], 0.0)
     return found
 
 
