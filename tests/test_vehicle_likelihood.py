@@ -18,7 +18,7 @@ from jaxos4.identification import answers, uncertainty, vehicle
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
 from jaxos4.identification.sample_time import chosen_place, moved, sample_time_of, search_sample_times
-from jaxos4.identification.uncertainty import Profile, corrected
+from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
@@ -117,14 +117,14 @@ def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
 
 def all_of_one_kind(monkeypatch):
     """Samples of commands at all sample times hold answers of the controller, so that all are compared."""
-    monkeypatch.setattr(vehicle, "LIKELIHOODS", vehicle.LIKELIHOODS._replace(controller=0.0))
+    monkeypatch.setattr(vehicle, "UNANSWERED", 0.0)
 
 
 @pytest.mark.slow
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
-    monkeypatch.setattr(uncertainty, "PROFILE", Profile(well_known=0.0))
-    monkeypatch.setattr(answers, "TABLES", answers.TABLES._replace(noted=1.002))
+    monkeypatch.setattr(uncertainty, "WELL_KNOWN", 0.0)
+    monkeypatch.setattr(answers, "NOTED", 1.002)
     all_of_one_kind(monkeypatch)
     with compiled_programs() as programs:
         found = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))

@@ -13,6 +13,7 @@ from experiments.verdicts.faults import scaled, thinned
 from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
+from jaxos4.identification import verdict
 from jaxos4.identification.answers import Solution, vehicle_constants
 from jaxos4.identification.doubts import doubts_of_log, few_parts, stronger_or_weaker
 from jaxos4.identification.doubts_of_values import consequences, doubts_of_values
@@ -22,7 +23,7 @@ from jaxos4.identification.results import Constant, ParameterEstimate, Predictio
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.identification.verdict import Doubt, Move, Quantity, Tolerance, judge, reason_lines, reservation
+from jaxos4.identification.verdict import Doubt, Move, Quantity, judge, reason_lines, reservation
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -37,8 +38,8 @@ def flown(airframe=CRAZYFLIE, *, duration=20.0, seed=0, name="flight.csv", **loo
     return Recording.of(fly_standard(jaxos4.ClosedLoop(airframe, **settings), duration=duration, seed=seed), name)
 
 
-def verdict_of(name, quantity, doubts, *tolerance):
-    return judge({name: quantity}, doubts, *tolerance).verdicts[name]
+def verdict_of(name, quantity, doubts):
+    return judge({name: quantity}, doubts).verdicts[name]
 
 
 @pytest.mark.parametrize(
@@ -91,13 +92,13 @@ def test_reservations_add_up_beside_an_impossible_parameter(moves, results, stat
     assert status == RESERVED or len(found.reasons) == 2
 
 
-def test_a_quantity_that_is_hardly_known_is_not_identified():
+def test_a_quantity_that_is_hardly_known_is_not_identified(monkeypatch):
     statuses = [verdict_of("Ix", Quantity(spread=spread), []).status for spread in (0.1, 0.3, 0.5)]
     assert statuses == [IDENTIFIED, RESERVED, MISSING]
-    strict = Tolerance(unknown=0.05)
-    assert verdict_of("Ix", Quantity(spread=0.1), [], strict).status == MISSING
     missing = verdict_of("Iz", Quantity(missing="it hardly yaws"), [])
     assert (missing.status, missing.reasons) == (MISSING, ("it hardly yaws",))
+    monkeypatch.setattr(verdict, "TOO_UNCERTAIN", 0.05)
+    assert verdict_of("Ix", Quantity(spread=0.1), []).status == MISSING
 
 
 def test_a_flight_with_too_few_parts_identifies_no_inertia():

@@ -22,7 +22,7 @@ from experiments.monte_carlo import Row, continued, fill, print_table
 from experiments.verdicts.run import LOST, agreements, print_responses, share
 from jaxos4 import FrequencyResponse
 from jaxos4.analysis.frequency_response import Agreement
-from jaxos4.identification.verdict import TOLERANCE
+from jaxos4.identification.verdict import MAX_SHARE
 from jaxos4.models.terms import default_terms
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -93,7 +93,7 @@ def print_reservations(groups: dict[str, list[Row]]) -> None:
             shares = []
             for factor in TOO_WEAK:
                 agreements = (Agreement(factor * ratio, error, math.nan, math.nan) for ratio, error in every)
-                reserved = [each.excludes_one(TOLERANCE.share) for each in agreements]
+                reserved = [each.excludes_one(MAX_SHARE) for each in agreements]
                 shares.append(share(sum(reserved), len(reserved)))
             lines.append((name, axis, *shares))
     print_table(

@@ -20,30 +20,9 @@ _RIDGE = 1e-13
 _BOUNDLESS = 700.0  # a logarithm whose factor is still a number
 
 
-class ResponseSettings(NamedTuple):
-    """What tunes a frequency response.
-
-    - `resolution`, `highest`: how far apart frequencies are, and the highest [Hz]: few vehicles move faster.
-    - `memory`: of the regression [s], as long as the flight controller's answer. A longer one finds the same, less
-      precisely. `fewest_lags`: of a memory that is shorter than this in samples.
-    - `answer`: for this long [s], rotors and controller show what the controller knows and the log does not.
-    - `samples`: the regression needs this many for each of its coefficients.
-    - `low`, `high`: the band in which the model is compared [Hz].
-    - `unclear`: the standard deviation of a gain, as a share of the model's, from which on the gain does not count.
-    """
-
-    resolution: float = 1.0
-    highest: float = 40.0
-    memory: float = 0.1
-    fewest_lags: int = 4
-    answer: float = 0.016
-    samples: int = 8
-    low: float = 4.0
-    high: float = 20.0
-    unclear: float = 0.5
-
-
-RESPONSE = ResponseSettings()
+LOW, HIGH = 4.0, 20.0  # Hz; the band in which the model is compared
+HIGHEST = 40.0  # Hz; few vehicles move faster
+UNCLEAR = 0.5  # standard deviation of a gain, as a share of the model's, from which on the gain does not count
 
 
 class Agreement(NamedTuple):
@@ -93,7 +72,7 @@ class AxisResponse(NamedTuple):
     covariance: Float[np.ndarray, "frequencies frequencies"]
     averages: float
 
-    def agreement(self, low: float = RESPONSE.low, high: float = RESPONSE.high) -> Agreement:
+    def agreement(self, low: float = LOW, high: float = HIGH) -> Agreement:
         """How strongly the vehicle answers compared with the model, from `low` to `high` [Hz]."""
         clear = self.clear & (self.frequency >= low) & (self.frequency <= high)
         if not clear.any():
@@ -124,7 +103,7 @@ class AxisResponse(NamedTuple):
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
         """Whether the gain at each frequency is known to half of the model's, whatever the gain."""
-        return self.gain * self.error < RESPONSE.unclear
+        return self.gain * self.error < UNCLEAR
 
 
 class FrequencyResponse(NamedTuple):
@@ -206,12 +185,18 @@ def _parts(
     return caused, by_rates
 
 
+RESOLUTION = 1.0  # Hz; between frequencies
+MEMORY = 0.1  # s; as long as the flight controller's answer. A longer one finds the same, less precisely.
+MIN_LAGS = 4  # samples of a memory
+ANSWER = 0.016  # s; for this long, rotors and controller show what the controller knows and the log does not
+SAMPLES = 8  # for each coefficient of the regression, at the least
+
+
 def response(
     u: Float[np.ndarray, " samples"],
     y: Float[np.ndarray, " samples"],
     usable: Bool[np.ndarray, " samples"],
     dt: float,
-    settings: ResponseSettings = RESPONSE,
 ) -> AxisResponse:
     """The frequency response from u to y, in closed loop too.
 
@@ -222,10 +207,10 @@ def response(
 
     **Arguments:** signals with one sample every `dt` [s], and which of them are `usable`.
     """
-    lags, apart = max(round(settings.memory / dt), settings.fewest_lags), settings.resolution
-    frequency = np.arange(apart, min(0.4 / dt, settings.highest + apart / 2), apart)
+    lags, apart = max(round(MEMORY / dt), MIN_LAGS), RESOLUTION
+    frequency = np.arange(apart, min(0.4 / dt, HIGHEST + apart / 2), apart)
     rows = np.flatnonzero(np.convolve(usable, np.ones(lags + 1))[: usable.size] > lags + 0.5)
-    if rows.size < settings.samples * (2 * lags + 2):
+    if rows.size < SAMPLES * (2 * lags + 2):
         nothing = np.full(frequency.size, np.nan)
         return AxisResponse(frequency, nothing, nothing, nothing, np.diag(nothing), 0.0)
     before = rows[:, None] - np.arange(lags + 1)
@@ -244,7 +229,7 @@ def response(
         root = np.sqrt(variance) * inverse_root[:-1]
         return np.log(1 + b / a), slopes @ root, variance / np.abs(a) ** 2
 
-    (whole, spread, disturbed), (late, *_) = regression(0), regression(max(round(settings.answer / dt), 1))
+    (whole, spread, disturbed), (late, *_) = regression(0), regression(max(round(ANSWER / dt), 1))
     answered = np.real(late - whole)
     caused = np.real(np.einsum("fi,ij,fj->f", shift.conj(), np.cov(u[before].T), shift)) / (lags + 1)
     return AxisResponse(

@@ -23,25 +23,12 @@ from .vehicle import RigidVehicle
 _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. Rotor 1 is the airframe's first."
 
 
-class Assumed(NamedTuple):
-    """Constants that simulators need and no flight shows.
-
-    - `lag`: for RotorPy and Gazebo, which need one: too short to notice [s].
-    - `radius`, `thickness`: of a drawn rotor, in arms. `rotor_mass`: of its link in Gazebo, as a share of the
-      vehicle's.
-    - `shortest`: MuJoCo keeps enough past controls for the delay in scenes with time steps down to this [s].
-    - `slowdown`: links of rotors in Gazebo turn this many times slower than the rotors, for long time steps.
-    """
-
-    lag: float = 1e-3
-    radius: float = 0.5
-    thickness: float = 0.02
-    shortest: float = 0.0002
-    rotor_mass: float = 1e-3
-    slowdown: float = 10.0
-
-
-_ASSUMED = Assumed()
+# Constants that simulators need and no flight shows.
+LAG = 1e-3  # s; too short to notice, for RotorPy and Gazebo, which need one
+RADIUS, THICKNESS = 0.5, 0.02  # of a drawn rotor, in arms
+ROTOR_MASS = 1e-3  # of its link in Gazebo, as a share of the vehicle's
+SHORTEST = 0.0002  # s; MuJoCo keeps enough past controls for the delay in scenes with time steps down to this
+SLOWDOWN = 10.0  # times that links of rotors in Gazebo turn slower than the rotors, for long time steps
 
 
 class Target(NamedTuple):
@@ -97,8 +84,8 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
         made = f"Made by jaxos4 {__version__} from {found.source}."
         notes = (f"Note: {note}" for note in found.notes)
         comments = [made, *lines, *warning, _FRAME, *notes]
-        sizes = {"radius": _ASSUMED.radius * vehicle.arm, "thickness": _ASSUMED.thickness * vehicle.arm}
-        sizes["lag"] = vehicle.lag or _ASSUMED.lag
+        sizes = {"radius": RADIUS * vehicle.arm, "thickness": THICKNESS * vehicle.arm}
+        sizes["lag"] = vehicle.lag or LAG
         values = {"vehicle": vehicle, "comments": comments, **sizes, **target.values(vehicle)}
         return _templates(target.suffix).get_template(f"{to}{target.suffix}.j2").render(values)
 
@@ -153,8 +140,8 @@ def _check_draws(samples: int, seed: int, *, least: int = 0) -> None:
 def _mujoco(vehicle: RigidVehicle) -> dict[str, Any]:
     """The controls are the thrusts of the rotors [N]. Constant forces of the rotors make the constant torque."""
     constant = vehicle._replace(torque=np.zeros(3)).hover_thrust - vehicle.hover_thrust
-    delayed = math.ceil(vehicle.delay / _ASSUMED.shortest) + 1
-    return {"constant": constant, "delayed": delayed, "shortest": _ASSUMED.shortest}
+    delayed = math.ceil(vehicle.delay / SHORTEST) + 1
+    return {"constant": constant, "delayed": delayed, "shortest": SHORTEST}
 
 
 def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
@@ -164,16 +151,16 @@ def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
         """The inertia of a unit mass at a place about the origin [m^2]."""
         return place @ place * np.eye(3) - np.outer(place, place)
 
-    share = _ASSUMED.rotor_mass * vehicle.mass
+    share = ROTOR_MASS * vehicle.mass
     # The link of a rotor is a thin disc.
-    about_axis = vehicle.rotor_inertia or share * (_ASSUMED.radius * vehicle.arm) ** 2 / 2
+    about_axis = vehicle.rotor_inertia or share * (RADIUS * vehicle.arm) ** 2 / 2
     rotor = np.diag([about_axis / 2, about_axis / 2, about_axis])
     places = np.column_stack([vehicle.rotor_positions, np.zeros(4)])
     mass = vehicle.mass - 4 * share
     center = -share * places.sum(axis=0) / mass
     rest = np.diag(vehicle.inertia) - 4 * rotor - mass * steiner(center)
     body = mass, center, rest - share * sum(steiner(place) for place in places)
-    return {"body": body, "rotor": (share, np.zeros(3), rotor), "slowdown": _ASSUMED.slowdown}
+    return {"body": body, "rotor": (share, np.zeros(3), rotor), "slowdown": SLOWDOWN}
 
 
 def _drone_models(vehicle: RigidVehicle) -> dict[str, Any]:

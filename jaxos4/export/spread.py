@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import AXES, INERTIAS, YAW, Airframe
-from ..identification.answers import TABLES, UNIT, ratio_error
+from ..identification.answers import GUESSED_DRAG, SCALE_ERROR, UNIT, ratio_error
 from ..identification.results import Identification
-from ..identification.verdict import CONTRADICTED, IDENTIFIED, RESERVED, TOLERANCE
+from ..identification.verdict import CONTRADICTED, IDENTIFIED, MAX_SHARE, RESERVED
 from ..linalg import covariance_root
 from ..models.flight_model import without_recording
 from ..models.terms import TERMS
 from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle
 
 DRAG, ROTOR_INERTIA, GAIN, REACTION = "drag_coefficient", "rotor_inertia", "thrust_gain", "rotor_reaction"
-_GUESS = TABLES.guessed_drag  # of a moment of inertia too: those of published quadrotors are within 40 % of the guess
+_GUESS = GUESSED_DRAG  # of a moment of inertia too
 _RESERVED, _REFUSED = "widened by the reservations of its verdict", "as wide as a guess: its verdict refuses it"
 _MISSING = "a guess: it was not identified"
 _BLOCK = 32  # draws made together: the usual vehicle needs one, and one with several dampings near 0 some dozens
@@ -80,7 +80,7 @@ def spread_of(
     rows = [list(file.parameters).index(name) for name in known]
     covariance, widened = slopes @ np.array(file.covariance)[np.ix_(rows, rows)] @ slopes.T, {}
     if GAIN in known:  # the scale of the accelerometer is one factor of thrust and moments of inertia
-        scale = TABLES.scale * values[GAIN] * slopes[:, known.index(GAIN)]
+        scale = SCALE_ERROR * values[GAIN] * slopes[:, known.index(GAIN)]
         covariance += np.outer(scale, scale)
     for place, (name, (quantity, size, guess)) in enumerate(_sizes(file, mean, others).items()):
         spared = name == YAW.inertia and DRAG in constants
@@ -153,7 +153,7 @@ def _reservations(file: Identification, quantity: str, *, spared: bool = False) 
     """
     left = [(doubt.status_left(quantity), doubt.moves.get(quantity)) for doubt in file.doubts]
     # A reservation that does not say how far it moves the quantity is taken to move it as far as a reservation may.
-    moves = [TOLERANCE.share if move is None else move.share for status, move in left if status == RESERVED]
+    moves = [MAX_SHARE if move is None else move.share for status, move in left if status == RESERVED]
     refusing = sum(status not in (IDENTIFIED, RESERVED) for status, _ in left)
     verdict = file.verdicts.get(quantity)
     # Without a doubt: it was not estimated well, or reservations contradict it together.

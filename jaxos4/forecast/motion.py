@@ -24,25 +24,10 @@ PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10]
 """The places of the parts of a state in an array of 13. The attitude is the quaternion w, x, y, z, body to earth."""
 
 
-class Tuning(NamedTuple):
-    """The settings of predictions of whole flights.
-
-    - `memory`: a recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
-    - `push`: the standard deviation of an offset of the specific force, and of the force that a model lacks [m/s^2].
-    - `push_time`: the correlation time of the latter [s].
-    - `settled`: the rows after which the covariance of a filter no longer changes.
-    - `draws`: the futures of each start for the band.
-    - `ninety_five`: half the width of a 95 % interval in their standard deviations (Student).
-    - `chunk`: the number of starts that fly in one call of a program.
-    """
-
-    memory: float = 5.0
-    push: float = 1.0
-    push_time: float = 0.25
-    settled: int = 512
-    draws: int = 64
-    ninety_five: float = 1.9977
-    chunk: int = 32
+MEMORY = 5.0  # s; offsets of a recording are forgotten with this time constant: batteries and propellers change slowly
+# Standard deviation [m/s^2] of an offset of the specific force, and of the force that a model lacks; its correlation
+# time.
+PUSH, PUSH_TIME = 1.0, 0.25
 
 
 class Motion(NamedTuple):
@@ -219,7 +204,6 @@ def known_at_samples(
     measured: tuple[Float[Array, "samples 13"], Float[Array, "samples 6"], Float[Array, "3"]],
     noise: LogNoise,
     prior: Float[Array, "6"],
-    tuning: Tuning,
 ) -> tuple[Known, Forcing, Float[Array, "futures samples 6"]]:
     """The knowledge at each sample, by the first row of `parameters`; forcing and offsets of each row: see `Futures`.
 
@@ -232,9 +216,9 @@ def known_at_samples(
     state, accelerations, velocity_noise = measured
     rates, inputs = flight.states[:, RATES], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
-    kept = jnp.exp(-flight.dt / tuning.memory)
+    kept = jnp.exp(-flight.dt / MEMORY)
     sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), velocity_noise])
-    weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt, tuning)
+    weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt)
 
     def of_future(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
@@ -264,14 +248,13 @@ def _offset_weights(
     prior: Array,
     kept: Scalar,
     dt: Scalar,
-    tuning: Tuning,
 ) -> tuple[Float[Array, "samples 6"], Float[Array, "samples 6"]]:
     """The factor of the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
 
     The mean of a recording's residuals is drawn to 0 as far as offsets are known not to differ.
     """
     channels = np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
-    strength, time_constant = (jnp.full(6, x) for x in (tuning.push, tuning.push_time))
+    strength, time_constant = (jnp.full(6, x) for x in (PUSH, PUSH_TIME))
     strength = strength.at[channels].set(jnp.exp(noise.strength))
     smoothing = 0.0 if noise.smoothing is None else jnp.where(is_rate(noise.strength), 0.0, jnp.exp(noise.smoothing))
     time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant) + smoothing)

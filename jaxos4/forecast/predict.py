@@ -27,7 +27,12 @@ from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .flight_prediction import FlightPrediction
 from .measured import Measured, constant_rates, regressed
-from .motion import PARTS, Futures, Tuning, fly_chunk, known_at_samples, settled, turned
+from .motion import PARTS, PUSH, Futures, fly_chunk, known_at_samples, settled, turned
+
+DRAWS = 64  # futures of a start for the band
+HALF_BAND = 1.9977  # standard deviations of this many futures from the middle of a 95 % band to its end (Student)
+SETTLED = 512  # rows after which the covariance of a filter no longer changes
+CHUNK = 32  # starts that fly in one call of a program
 
 
 class Vehicle(NamedTuple):
@@ -174,13 +179,13 @@ def _predicted(
     seed: int,
 ) -> FlightPrediction:
     """The prediction of a flight of this name. The regression is fitted to `trained`, or to the flight's first half."""
-    tuning, measured, problem = Tuning(), Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
+    measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     missing = tuple(part for part in ("position", "velocity") if not measured.has(part))
     start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed, tuning)
+    begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed)
     ahead, trained = start[:, None] + np.arange(1, steps + 1), measured.first_half if trained is None else trained
     gravity = float(vehicle.model.airframe.gravity)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
@@ -193,7 +198,7 @@ def _predicted(
         begin=begin,
         predicted=states[:, 0],
         unaware=states[:, 1],
-        half_width=tuning.ninety_five * np.sqrt(spread**2 + sensors**2),
+        half_width=HALF_BAND * np.sqrt(spread**2 + sensors**2),
         measured=measured.states[ahead],
         constant=constant_rates(begin, steps, dt),
         regression=regressed(trained, begin, measured.omega[ahead - 1], dt, gravity),
@@ -252,7 +257,6 @@ def _fly(
     noise: LogNoise,
     steps: int,
     seed: int,
-    tuning: Tuning,
 ) -> tuple[
     Float[np.ndarray, "starts 13"], Float[np.ndarray, "starts 2 steps 13"], Float[np.ndarray, "starts steps 12"]
 ]:
@@ -261,8 +265,7 @@ def _fly(
     A position that was not measured is 0, a velocity that of dead reckoning, without an offset of the force.
     """
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, problem.flight.dt
-    draws, chunk = tuning.draws, tuning.chunk
-    parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(draws, generator)]))
+    parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(DRAWS, generator)]))
     model = dataclasses.replace(vehicle.model, recordings=(0,) * (int(measured.stretch.max()) + 1))
     state, samples, noise = measured.states.copy(), len(measured.stretch), jax.tree.map(as_float, noise)
     if "velocity" in missing:
@@ -273,19 +276,19 @@ def _fly(
     accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
     padding = ((0, problem.flight.time.size - samples), (0, 0))
     rows, changes = (as_float(np.pad(x, padding, constant_values=np.nan)) for x in (state, accelerations))
-    prior = as_float(np.append(vehicle.offset, [tuning.push * ("velocity" not in missing)] * 3))
+    prior = as_float(np.append(vehicle.offset, [PUSH * ("velocity" not in missing)] * 3))
     seen, length = (rows, changes, as_float(measured.noise[3:6])), jax.device_put(np.asarray(samples))
-    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, seen, noise, prior, tuning)
+    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, seen, noise, prior)
 
-    after, added, absorbed = jax.tree.map(np.asarray, settled(noise, dt, tuning.settled))
-    errors = _pairs(after, generator.standard_normal((draws, channels, 2)))
-    gusts = _pairs(added, generator.standard_normal((draws, steps, channels, 2)))
-    off = generator.standard_normal((draws, 6))
+    after, added, absorbed = jax.tree.map(np.asarray, settled(noise, dt, SETTLED))
+    errors = _pairs(after, generator.standard_normal((DRAWS, channels, 2)))
+    gusts = _pairs(added, generator.standard_normal((DRAWS, steps, channels, 2)))
+    off = generator.standard_normal((DRAWS, 6))
     drawn = errors, np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
     surely = jax.tree.map(lambda x: as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])), drawn)
     futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
-    chunks = (np.minimum(np.arange(i, i + chunk), start.size - 1) for i in range(0, start.size, chunk))
+    chunks = (np.minimum(np.arange(i, i + CHUNK), start.size - 1) for i in range(0, start.size, CHUNK))
     found = [fly_chunk(vehicle.model, futures, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]
     states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[: start.size] for i in range(2))
     return state[start], states, spread

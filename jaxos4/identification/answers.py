@@ -39,26 +39,13 @@ UNIT = "kg m^2"
 NEGATIVE_NOTE = "negative, which is impossible; set to 0"
 
 
-class Tables(NamedTuple):
-    """Settings of the table of answers.
-
-    - `scale`: an accelerometer, with what forward flight adds to the lift of rotors, has a scale known to this share.
-    - `guessed_drag`: the standard deviation of a guessed drag coefficient, as a share: the coefficients of published
-      quadrotors are within 40 % of the guess, with exceptions.
-    - `other_thrust`: a thrust that differs from the airframe's by more than this share shows that its coefficients were
-      not measured together, so that their ratio may differ as much.
-    - `unknown`: the standard deviation of an alpha that was not estimated, in half-widths: as good as unknown.
-    - `noted`: a factor of an interval from this one on is noted: it is printed with one decimal.
-    """
-
-    scale: float = 0.01
-    guessed_drag: float = 0.4
-    other_thrust: float = 0.1
-    unknown: float = 1e3
-    noted: float = 1.05
-
-
-TABLES = Tables()
+SCALE_ERROR = 0.01  # share to which an accelerometer's scale is known, with what forward flight adds to the lift
+GUESSED_DRAG = 0.4  # standard deviation of a guess, as a share: published quadrotors are within it, with exceptions
+# A thrust that differs from the airframe's by more than this share shows that its coefficients were not measured
+# together, so that their ratio may differ as much.
+OTHER_THRUST = 0.1
+UNKNOWN = 1e3  # half-widths; standard deviation of an alpha that was not estimated
+NOTED = 1.05  # the least factor of an interval that is noted, with one decimal
 
 
 class Answer(NamedTuple):
@@ -170,7 +157,7 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
     if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
         notes.append("outside the network's interval")
     factor = answer.profiled.get(name, 1.0)
-    if factor >= TABLES.noted:
+    if factor >= NOTED:
         notes.append(f"interval {factor:.1f} times as long, by the profile of the likelihood")
     return "; ".join(notes)
 
@@ -228,8 +215,8 @@ def ratio_error(airframe: Airframe, excess: float) -> float:
     `excess`: by which share the thrust exceeds the airframe's.
     """
     if airframe.guesses_drag:
-        return TABLES.guessed_drag
-    return abs(excess) if abs(excess) > TABLES.other_thrust else 0.0
+        return GUESSED_DRAG
+    return abs(excess) if abs(excess) > OTHER_THRUST else 0.0
 
 
 def vehicle_constants(answer: Answer) -> RigidBody:
@@ -244,10 +231,10 @@ def vehicle_constants(answer: Answer) -> RigidBody:
             alpha[place] /= values[gain]
             slopes[place, place], slopes[place, gain] = 1 / values[gain], -alpha[place] / values[gain]
     slopes[~known] = 0.0
-    unknown = np.where(known, 0.0, (TABLES.unknown * np.asarray(bracket.half_width)[:8]) ** 2)
+    unknown = np.where(known, 0.0, (UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = slopes @ np.asarray(answer.estimate.covariance) @ slopes.T + np.diag(unknown)
     # What no likelihood sees makes all moments of inertia wrong by one factor.
-    scale = TABLES.scale * bool(gains)
+    scale = SCALE_ERROR * bool(gains)
     shared = scale * np.where(np.isin(np.arange(8), INVERSES), alpha, 0.0)
     covariance += shared[:, None] * shared
     covariance[YAW.place, YAW.place] += (drag_error(answer) * alpha[YAW.place]) ** 2

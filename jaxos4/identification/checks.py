@@ -15,7 +15,7 @@ from ..analysis.prediction import Predictions
 from ..analysis.traces import Traces, os4_traces
 from ..bracket import GAUSSIAN_PRIOR
 from ..estimate import AbstractEstimator
-from ..recording.motion import EXCITED
+from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
 from ..shooting import with_room
 from .answers import Answer, channel_fits, overwhelmed, parameter_table, rigid_body, vehicle_constants
@@ -153,6 +153,6 @@ def _still_axes(answer: Answer, predicted: Predictions) -> tuple[str, ...]:
     for axis, measured in zip(AXES, np.moveaxis(predicted.measured, 2, 0), strict=True):
         noise = answer.disturbances[axis.rate].sensor if axis.rate in answer.disturbances else 0.0
         seen = measured[np.isfinite(measured)]
-        if not seen.size or seen.std() < max(EXCITED.weak, EXCITED.over_noise * noise):
+        if not seen.size or seen.std() < max(WEAK, OVER_NOISE * noise):
             still.append(axis.motion)
     return tuple(still)

@@ -18,7 +18,7 @@ from ..results import meaning, result_names
 from .answers import Answer, overwhelmed
 from .data import Data
 from .doubts_of_iz import doubts_of_iz
-from .doubts_of_values import ALL_INERTIAS, PLAUSIBLE, consequences, doubts_of_alphas, doubts_of_values
+from .doubts_of_values import ALL_INERTIAS, consequences, doubts_of_alphas, doubts_of_values
 from .results import (
     COLOURED,
     ChannelFit,
@@ -31,8 +31,14 @@ from .results import (
 )
 from .sample_time import is_white, moved
 from .search import Optimum
-from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Doubt, Move, contradiction, refusal, reservation
+from .verdict import MAX_SHARE, PREDICTIONS, RIGID_BODY, Doubt, Move, contradiction, refusal, reservation
 
+# s; fitted measurements that last less give moments of inertia a reservation; those that last less than half of it do
+# not identify them. Segments last 1.25 s, and the jackknife compares at least four parts.
+MIN_SECONDS = 10.0
+VIBRATION = 0.4  # innovations that correlate more bias filter error more than its intervals say
+MAX_SAMPLE = 0.008  # s; longer samples would hide the motion with the vibration
+NO_SKILL = 2.0  # standard errors below 0 of the skill at the shortest horizon: the inertia is not identified
 _NOT_LOWEST = (
     "the likelihood has several maxima, and the search did not find the highest",
     "fly more roll, pitch and yaw, or choose another part with `begin` and `end`",
@@ -157,10 +163,10 @@ def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
 
 def few_parts(seconds: float) -> Iterator[Doubt]:
     """Measurements that last too few `seconds` to compare parts: nothing shows whether intervals are too narrow."""
-    if seconds < TOLERANCE.seconds:
+    if seconds < MIN_SECONDS:
         cause = f"only {seconds:.1f} s were fitted, too few to compare parts of the flight"
-        said = f"{cause}: intervals may be too narrow", f"fly for {2 * TOLERANCE.seconds:g} s or longer", ALL_INERTIAS
-        yield refusal("unidentifiable", *said) if 2 * seconds < TOLERANCE.seconds else reservation(*said)
+        said = f"{cause}: intervals may be too narrow", f"fly for {2 * MIN_SECONDS:g} s or longer", ALL_INERTIAS
+        yield refusal("unidentifiable", *said) if 2 * seconds < MIN_SECONDS else reservation(*said)
 
 
 def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Constant]) -> Iterator[Doubt]:
@@ -170,7 +176,7 @@ def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Cons
     """
     for axis, found in zip(AXES, response, strict=True):
         agreement, row = found.agreement(), constants.get(axis.inertia)
-        if row is not None and agreement.excludes_one(TOLERANCE.share):
+        if row is not None and agreement.excludes_one(MAX_SHARE):
             ratio, (low, high) = agreement.ratio, agreement.interval
             # Beyond twice, the inertia would move by more than what is left of it.
             share = ratio - 1 if ratio > 2 else abs(1 / ratio - 1)
@@ -220,7 +226,7 @@ def _doubts_of_sample_time(
 
 def _correlated(row: SampleTime, moves: Mapping[str, Move]) -> Iterator[Doubt]:
     """Innovations that are less correlated than by vibration, and yet not white."""
-    if not is_white(row) and abs(row.correlation) <= PLAUSIBLE.vibration:
+    if not is_white(row) and abs(row.correlation) <= VIBRATION:
         cause = f"innovations of the body rates correlate by {row.correlation:.2g} at {1e3 * row.sample_time:.3g} ms"
         yield reservation(cause, "log faster, or before the filters of the gyro", moves)
 
@@ -236,12 +242,10 @@ def vibration(
     **Arguments:** `sample_time`: of the fitted data [s]. `moves`: of the moments of inertia to another sample time.
     `vibrates`: the rates that vibrate, each with its frequency [Hz].
     """
-    longer = f"average to longer samples by `sample_time` {2 * sample_time:g}, or " * (
-        2 * sample_time <= PLAUSIBLE.longest_sample
-    )
+    longer = f"average to longer samples by `sample_time` {2 * sample_time:g}, or " * (2 * sample_time <= MAX_SAMPLE)
     for axis in AXES:
         row = disturbances.get(axis.rate)
-        if row is not None and abs(row.correlation) > PLAUSIBLE.vibration:
+        if row is not None and abs(row.correlation) > VIBRATION:
             frequency = vibrates.get(axis.rate)
             why = "the model lacks an effect, or the gyro vibrates"
             yield contradiction(
@@ -276,7 +280,7 @@ def doubts_of_predictions(skill: PredictionSkill | None, still: Sequence[str] = 
         named.append(f"{axis.rate} {values[place]:.2g} at {skill.horizons[place]:.2g} s")
         # Far ahead, what nobody can foresee is larger than what the rotors do. That says nothing of the inertia.
         near |= not values[0] > 0
-        if values[0] + PLAUSIBLE.hopeless * (own.std[0] or 0.0) < 0:
+        if values[0] + NO_SKILL * (own.std[0] or 0.0) < 0:
             moves[axis.inertia] = None
     if poor:
         motions = " and ".join(poor)

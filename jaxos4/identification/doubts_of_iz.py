@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from ..airframe import PITCH, ROLL, YAW
 from .answers import Answer, drag_error, thrust_excess
 from .results import Constant, ParameterEstimate
-from .verdict import TOLERANCE, Doubt, Move, refusal, reservation
+from .verdict import MAX_PRIOR, SIGNIFICANT, Doubt, Move, refusal, reservation
 
 _FLAT = 0.6  # Iz over Ix + Iy of a vehicle with its rotors in a plane is rarely smaller; of a lamina it is 1
 MEASURE = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
@@ -43,7 +43,7 @@ def _flat(constants: Mapping[str, Constant]) -> Iterator[Doubt]:
         return
     x, y, z = (constants[axis.inertia] for axis in (ROLL, PITCH, YAW))
     least, error = _FLAT * (x.estimate + y.estimate), math.hypot(z.std, _FLAT * x.std, _FLAT * y.std)
-    if least - z.estimate > TOLERANCE.sure * error:
+    if least - z.estimate > SIGNIFICANT * error:
         share = z.estimate / (x.estimate + y.estimate)
         yield reservation(
             f"Iz is only {share:.2g} times Ix + Iy; of a flat vehicle it is {_FLAT:g} to 1 times",
@@ -63,7 +63,7 @@ def _rotor_inertia(table: Mapping[str, ParameterEstimate], iz: Constant) -> Iter
         if by_yaw is None or by_axis is None:
             continue
         off = by_axis[0] - by_yaw[0]
-        if abs(off) > TOLERANCE.sure * math.hypot(by_axis[1], by_yaw[1]):
+        if abs(off) > SIGNIFICANT * math.hypot(by_axis[1], by_yaw[1]):
             yield reservation(
                 f"by {axis.motion}, the inertia of the rotors is {by_axis[0] / by_yaw[0]:.2g} times that by their "
                 "reaction in yaw",
@@ -79,7 +79,7 @@ def _quotient(table: Mapping[str, ParameterEstimate], name: str, inverse: str) -
     for row in rows:
         if row is None or not row.estimate or row.estimate <= 0 or not row.std or not isinstance(row.bracket, tuple):
             return None
-        if (row.std / (row.bracket[1] - row.bracket[0]) * 2) ** 2 > TOLERANCE.prior:
+        if (row.std / (row.bracket[1] - row.bracket[0]) * 2) ** 2 > MAX_PRIOR:
             return None
         values.append(row.estimate)
         squares += (row.std / row.estimate) ** 2

@@ -1,7 +1,6 @@
 """Doubts that the estimated values raise: physics or the airframe forbids them."""
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,38 +14,18 @@ from ..results import result_names
 from .answers import Answer
 from .results import Constant, ParameterEstimate, RigidBody
 from .search import Optimum, deviations
-from .uncertainty import PROFILE
-from .verdict import RIGID_BODY, TOLERANCE, Doubt, Move, Moves, contradiction, refusal, reservation
+from .uncertainty import PROFILE_TOLERANCE
+from .verdict import IMPROBABLE, RIGID_BODY, SIGNIFICANT, Doubt, Move, Moves, contradiction, refusal, reservation
 
 Estimated = Mapping[str, tuple[float, float]]
 """Value and standard deviation of each parameter that has an estimate."""
 Consequences = Callable[[str, float], Mapping[str, Move | None]]
 """The changes of quantities if a parameter has another value; see `consequences`."""
 
-
-class Plausible(NamedTuple):
-    """Limits of what is physically plausible for a vehicle.
-
-    - `heaviest`, `lightest`: the squared radius of gyration, as a share of that of all mass at the rotors; the second
-      is that of a heavy centre.
-    - `coupling`: aerodynamic moments may look like a gyroscopic coupling (alpha1, alpha4, alpha7) of this size.
-    - `vibration`: innovations that correlate more bias filter error more than its intervals say.
-    - `longest_sample`: longer ones [s] would hide the motion with the vibration.
-    - `hopeless`: an inertia is not identified if its skill at the shortest horizon is this many standard errors
-      below 0.
-    - `longest_delay`: of rotors [s]; more is an error of clocks.
-    """
-
-    heaviest: float = 1.5
-    lightest: float = 0.01
-    coupling: float = 0.25
-    vibration: float = 0.4
-    longest_sample: float = 0.008
-    hopeless: float = 2.0
-    longest_delay: float = 0.04
-
-
-PLAUSIBLE = Plausible()
+# The squared radius of gyration, as a share of that of all mass at the rotors; the second is that of a heavy centre.
+HEAVIEST, LIGHTEST = 1.5, 0.01
+COUPLING = 0.25  # of alpha1, alpha4 and alpha7: aerodynamic moments may look like a gyroscopic coupling of this size
+MAX_DELAY = 0.04  # s; a longer delay of rotors is an error of clocks
 _RARE = 0.015  # s; motors that were logged less often look like damping
 ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
 
@@ -60,18 +39,18 @@ def doubts_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) ->
     gyro, moves = "check the scale, the axes and the signs of the gyro, and the time stamps", {RIGID_BODY: None}
     for name in (axis.coupling for axis in AXES):
         row = table[name]
-        if row.estimate is not None and row.std is not None and abs(row.estimate) - TOLERANCE.sure * row.std > 1:
+        if row.estimate is not None and row.std is not None and abs(row.estimate) - SIGNIFICANT * row.std > 1:
             cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as that of every rigid body"
             yield contradiction(cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket))
     rotor, largest = body.constants.get("J_R"), body.constants.get(YAW.inertia)
     if rotor is not None and largest is not None:
-        remedy, room = "check `rotor_spins`, and which rotor is which", TOLERANCE.sure * rotor.std
+        remedy, room = "check `rotor_spins`, and which rotor is which", SIGNIFICANT * rotor.std
         if rotor.estimate + room < 0:
             yield contradiction(f"J_R = {rotor.estimate:.3g} kg m^2 is negative", remedy, moves)
         elif rotor.estimate - room > largest.estimate:
             cause = f"J_R = {rotor.estimate:.3g} kg m^2 is larger than the {YAW.inertia} of the vehicle"
             yield contradiction(cause, remedy, moves)
-    if body.consistency_p is not None and body.consistency_p < TOLERANCE.consistent:
+    if body.consistency_p is not None and body.consistency_p < IMPROBABLE:
         cause = f"the alphas are not those of one rigid body (p = {body.consistency_p:.1g})"
         yield contradiction(cause, f"use the alphas alone; if they should be of a rigid body, {gyro}", moves)
     elif body.is_rigid_body is False:
@@ -145,7 +124,7 @@ def contradicted(
         if parameter.contradiction is None or parameter.name not in estimated:
             continue
         value, std = estimated[parameter.name]
-        why = parameter.contradiction(value, TOLERANCE.sure * std)
+        why = parameter.contradiction(value, SIGNIFICANT * std)
         if why is not None:
             own: Moves = dict.fromkeys([owner[parameter.name]] if parameter.name in owner else [])
             others = dict.fromkeys((*INERTIAS, "thrust")) if parameter.scales_torque else follow(parameter.name, usual)
@@ -165,7 +144,7 @@ def consequences(
     model, own, values = answer.problem.model, optimum.likelihood.problem.unknowns, optimum.values
     if not np.asarray(own.free)[own.names.index(name)]:
         return {}
-    other = optimum.restricted(FilterError(tolerance=PROFILE.tolerance), {name: value})
+    other = optimum.restricted(FilterError(tolerance=PROFILE_TOLERANCE), {name: value})
     others = {each: names for each, names in model.quantities.items() if name not in names}
     if str(result_names(other.estimate.result)) not in ("successful", "at_bound"):
         return dict.fromkeys((*constants, *others))
@@ -189,9 +168,9 @@ def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) 
     radius_squared = np.square(np.asarray(airframe.rotor_positions)).sum(axis=1).max()
     limit = float(airframe.mass) * radius_squared
     for name, row in constants.items():
-        largest, least = PLAUSIBLE.heaviest * limit * (2 if name == YAW.inertia else 1), PLAUSIBLE.lightest * limit
-        beyond = row.estimate - TOLERANCE.sure * row.std > largest
-        if beyond or row.estimate + TOLERANCE.sure * row.std < least:
+        largest, least = HEAVIEST * limit * (2 if name == YAW.inertia else 1), LIGHTEST * limit
+        beyond = row.estimate - SIGNIFICANT * row.std > largest
+        if beyond or row.estimate + SIGNIFICANT * row.std < least:
             compared = f"more than the {largest:.2g}" if beyond else f"less than the {least:.2g}"
             scale = "`drag_coefficient`" if name == YAW.inertia else "`thrust_coefficient`, `max_rotor_speed`"
             yield contradiction(
@@ -202,7 +181,7 @@ def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) 
     for name, one in constants.items() if len(constants) == len(INERTIAS) else ():
         (second, two), (third, three) = (each for each in constants.items() if each[0] != name)
         excess = one.estimate - two.estimate - three.estimate
-        if excess > TOLERANCE.sure * np.sqrt(one.std**2 + two.std**2 + three.std**2) + 0.05 * one.estimate:
+        if excess > SIGNIFICANT * np.sqrt(one.std**2 + two.std**2 + three.std**2) + 0.05 * one.estimate:
             remedy = (
                 "if `drag_coefficient` is a guess, measure it; else fly more yaw"
                 if name == YAW.inertia
@@ -225,14 +204,14 @@ def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) 
     for axis in AXES:
         name, moves = axis.inverse, {axis.inertia: None}
         value, std = estimated.get(name, (0.0, 0.0))
-        if value + TOLERANCE.sure * std < 0:
+        if value + SIGNIFICANT * std < 0:
             opposite = True
             yield contradiction(
                 f"{name} = {value:.3g} is negative: {axis.motion} answers the rotors with the opposite sign",
                 "check `rotor_positions` and `rotor_spins`, and the axes of the log",
                 moves,
             )
-        elif value <= TOLERANCE.sure * std and axis != YAW:
+        elif value <= SIGNIFICANT * std and axis != YAW:
             yield refusal(
                 "unidentifiable",
                 f"{axis.motion} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
@@ -248,15 +227,15 @@ def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) 
         if name in estimated:
             alpha[i] = estimated[name][0]
         if name in couplings:
-            variance[i] = stds[name] ** 2 + PLAUSIBLE.coupling**2
+            variance[i] = stds[name] ** 2 + COUPLING**2
         elif name in inverses:  # the others need the inertia of the rotors too
             variance[i] = np.inf if name == YAW.inverse and airframe.guesses_drag else stds[name] ** 2
     p_value, without_yaw = (_p_value(model, alpha, variance, unknown) for unknown in ([], [YAW.place]))
-    if p_value < TOLERANCE.consistent:
+    if p_value < IMPROBABLE:
         yield contradiction(
             f"alpha1, alpha4 and alpha7 contradict the inertias of alpha3, alpha6 and alpha8 (p = {p_value:.1g})",
             "check the axes and signs of the gyro, `rotor_positions` and `drag_coefficient`",
-            ALL_INERTIAS if without_yaw < TOLERANCE.consistent else {YAW.inertia: None},
+            ALL_INERTIAS if without_yaw < IMPROBABLE else {YAW.inertia: None},
         )
 
 
@@ -271,17 +250,17 @@ def _p_value(model: CorrectedOS4, alpha: np.ndarray, variance: np.ndarray, unkno
 def _unseen(estimated: Estimated, log_step: float, follow: Consequences) -> Iterator[Doubt]:
     """A lag or delay of the rotors that the log is too slow to show. `log_step`: its longest sample [s]."""
     lag, error = estimated.get("rotor_lag", (np.inf, 0.0))
-    if -TOLERANCE.sure * error <= lag < log_step - TOLERANCE.sure * error:
+    if -SIGNIFICANT * error <= lag < log_step - SIGNIFICANT * error:
         yield contradiction(
             f"rotor_lag = {lag:.2g} s is shorter than a sample of the log, {log_step:.2g} s",
             "log faster, or leave out the term `motor` or `lag`",
             {**follow("rotor_lag", log_step), "motors": None},
         )
     delay, error = estimated.get("rotor_delay", (0.0, 0.0))
-    if abs(delay) - TOLERANCE.sure * error > PLAUSIBLE.longest_delay:
+    if abs(delay) - SIGNIFICANT * error > MAX_DELAY:
         how = "late" if delay < 0 else "early"
         yield contradiction(
             f"rotor_delay = {delay:.2g} s: motors are recorded {1e3 * abs(delay):.0f} ms {how}, more than any rotor",
             "check the time stamps of motors and gyro",
-            {**follow("rotor_delay", float(np.copysign(PLAUSIBLE.longest_delay, delay))), "motors": None},
+            {**follow("rotor_delay", float(np.copysign(MAX_DELAY, delay))), "motors": None},
         )

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from ..airframe import AXES, INERTIAS
 from ..results import NINETY_FIVE
 from .results import Identification
-from .verdict import IDENTIFIED, MISSING, RESERVED, TOLERANCE, pooled_status
+from .verdict import IDENTIFIED, MISSING, RESERVED, UNCERTAIN, pooled_status
 
 _ROUND = 5.0  # s; flights are not planned more precisely
 _MOST = 300.0  # s, about one battery: beyond it a stronger motion is the better advice
@@ -30,13 +30,13 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
         spread, fitted = spreads.get(axis.inertia, 0.0), counted.get(axis.inertia, [])
         whys = [why for each in fitted for why in each.verdicts[axis.inertia].reasons if why.startswith(_VAGUE)]
         helps = not whys or any("fly" in why for why in whys)  # no flight measures a drag coefficient
-        if fitted and helps and TOLERANCE.vague < spread < math.inf:
+        if fitted and helps and UNCERTAIN < spread < math.inf:
             every = (each.provenance.fitted_seconds for each in fitted)
             motions.append(_more(axis.motion, spread, sum(x for x in every if isinstance(x, float))))
             flown.add(f"fly more {axis.motion}")
             known.append(f"{axis.inertia} {100 * spread:.3g} %")
     if motions:
-        advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * TOLERANCE.vague:.0f} %"]
+        advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * UNCERTAIN:.0f} %"]
     for name, own in counted.items():
         for remedy in dict.fromkeys(each for each in _remedies(name, own) if each.split(",")[0] not in flown):
             # A remedy that begins another one adds nothing to it.
@@ -65,7 +65,7 @@ def _more(motion: str, spread: float, seconds: float) -> str:
 
     `seconds`: how long was fitted until now [s].
     """
-    lacking = (spread / TOLERANCE.vague) ** 2 - 1  # information, in multiples of that of the flights until now
+    lacking = (spread / UNCERTAIN) ** 2 - 1  # information, in multiples of that of the flights until now
     if not seconds:
         return f"more {motion}"
     if seconds * lacking <= _MOST:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -32,20 +32,8 @@ from .problem import Intervals, bracket_of, os4_problem
 from .results import COLOURED, has_answer
 from .settings import FlightSettings, class_name, name_and_class
 
-
-class NoiseLevels(NamedTuple):
-    """Settings with which the noise levels of the sensors are found from residuals.
-
-    - `passes`: they are computed at most this often before the last estimate.
-    - `settled`: they have settled if none changes by more than this share. Weights this close to the right ones cost
-      less than 1 % of the efficiency.
-    """
-
-    passes: int = 3
-    settled: float = 0.2
-
-
-NOISE_LEVELS = NoiseLevels()
+MAX_PASSES = 3  # in which noise levels are found from residuals, before the last estimate
+SETTLED = 0.2  # largest change of a noise level; weights this close to the right ones cost under 1 % of the efficiency
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,14 +185,14 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
         return jax.block_until_ready(estimator(shared))
 
     estimates = [search(problem, 0)]
-    for number in range(1, NOISE_LEVELS.passes + 2):
+    for number in range(1, MAX_PASSES + 2):
         last, before = estimates[-1], np.asarray(problem.sigma)
         if not has_answer(last):
             break
         problem = problem.reweighted(evaluate(problem, last.parameters, last.initial_state).errors)
-        settled = (np.abs(np.asarray(problem.sigma) / before - 1) < NOISE_LEVELS.settled).all()
+        settled = (np.abs(np.asarray(problem.sigma) / before - 1) < SETTLED).all()
         failed = estimator.shoots and bool(last.result != RESULTS.successful)
-        is_last = settled or failed or number > NOISE_LEVELS.passes
+        is_last = settled or failed or number > MAX_PASSES
         if not is_last or not estimator.shoots:
             estimates.append(search(problem, number))
         if is_last:

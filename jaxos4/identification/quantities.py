@@ -12,7 +12,7 @@ from .answers import Answer, drag_error
 from .doubts_of_iz import MEASURE
 from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
 from .uncertainty import PRIOR_NOTE
-from .verdict import PREDICTIONS, RIGID_BODY, TOLERANCE, Quantity
+from .verdict import MAX_PRIOR, PREDICTIONS, RIGID_BODY, Quantity
 
 
 def vehicle_quantities(
@@ -40,7 +40,7 @@ def vehicle_quantities(
             remedy = f"fly more {axis.motion}, or longer"
             if axis == YAW and drag_error(answer):
                 remedy = MEASURE
-            elif shares.get(SAG, 0.0) > TOLERANCE.prior and VOLTAGE_EXPONENT not in own.names:
+            elif shares.get(SAG, 0.0) > MAX_PRIOR and VOLTAGE_EXPONENT not in own.names:
                 remedy = f"log rotor speeds, or the battery's voltage at 10 Hz or more, or {remedy}"
             found[axis.inertia] = Quantity(value, half / row.estimate, reservations=notes, remedy=remedy)
     for quantity, names in model.quantities.items():
@@ -79,7 +79,7 @@ def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str,
             # Only an airframe that has such a constant can be wrong about it.
             check = "check the airframe, or " if name in (*PARAMETER_NAMES, *of_airframe) else ""
             found.append(f"{name} is outside its bracket; {check}give a wider `bracket`")
-    resting = (name for name in rows if shares[name] > TOLERANCE.prior)
+    resting = (name for name in rows if shares[name] > MAX_PRIOR)
     return *found, *(f"{name} rests on its bracket for {100 * shares[name]:.0f} %" for name in resting)
 
 

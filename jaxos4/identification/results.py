@@ -16,7 +16,7 @@ from ..results import result_names
 from ..shooting import ShootingProblem
 from .data import Provenance
 from .tables import dataframe, dataset, series
-from .verdict import TOLERANCE, Doubt, Verdict
+from .verdict import Doubt, Verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ..report import Plots
 
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
+LATE = 0.005  # s; motors that act earlier than they are recorded by more are recorded late
 
 
 def has_answer(estimate: Estimate) -> bool:
@@ -276,7 +277,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def motor_clock(self) -> str:
         """The delay of the recorded motors in words, if `rotor_delay` is clearly negative; else empty."""
         delay = self.parameters.get("rotor_delay")
-        if delay is None or delay.estimate is None or delay.estimate > -TOLERANCE.late:
+        if delay is None or delay.estimate is None or delay.estimate > -LATE:
             return ""
         return f"motors are recorded {-1e3 * delay.estimate:.0f} ms late"
 

@@ -11,7 +11,6 @@ If there is none: the shortest with white innovations. If there is none either: 
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -26,28 +25,12 @@ from .results import Constant, SampleTime
 from .search import Optimum, search
 from .uncertainty import corrected
 
-
-class SampleTimeRule(NamedTuple):
-    """When an answer does not depend on the sample time.
-
-    - `white`, `chance`: the limit of a correlation of white innovations: the first, plus so many standard errors. The
-      largest of 24 correlations (3 rates, 8 lags) is compared.
-    - `agree`, `discrete`: two answers agree within so many standard deviations and this share, which allows for errors
-      of discretisation.
-    - `wider`: intervals that are longer by this factor than those of samples twice as long agree with anything.
-    - `near`: an unknown that is this share of the way to its limit, or further, is no start for another search.
-    """
-
-    white: float = 0.06
-    chance: float = 3.0
-    agree: float = 2.0
-    discrete: float = 0.03
-    wider: float = 1.5
-    near: float = 0.95
-
-
-RULE = SampleTimeRule()
-
+WHITE = 0.06  # correlation of innovations that counts as none, and that is expected of chance in standard errors:
+CHANCE = 3.0  # the largest of 24 correlations (3 rates, 8 lags) is compared
+AGREE = 2.0  # standard deviations between two answers that agree
+DISCRETE = 0.03  # share of a value that errors of discretisation add to it
+WIDER = 1.5  # intervals longer by this factor than those of samples twice as long agree with anything
+NEAR_LIMIT = 0.95  # share of the way to its limit from which on an unknown is no start for another search
 
 Fits = tuple[Sequence[Data[InnovationsProblem]], list[Optimum], list[SampleTime]]
 """Data, optimum and answer at several sample times, the shortest first."""
@@ -109,7 +92,7 @@ def start_of(likelihood: InnovationsProblem, found: Estimate) -> Float[np.ndarra
     own, start = likelihood.problem.unknowns, np.asarray(found.parameters)
     off = np.abs(start[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
     # Near a limit, the answer may be another minimum.
-    is_minimum = str(result_names(found.result)) == "successful" and (off < RULE.near * REACH).all()
+    is_minimum = str(result_names(found.result)) == "successful" and (off < NEAR_LIMIT * REACH).all()
     return start if is_minimum else None
 
 
@@ -124,7 +107,7 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
 
 def is_white(row: SampleTime) -> bool:
     """Whether innovations are nearly white."""
-    return abs(row.correlation) <= RULE.white + RULE.chance / math.sqrt(max(row.samples, 1))
+    return abs(row.correlation) <= WHITE + CHANCE / math.sqrt(max(row.samples, 1))
 
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:
@@ -136,14 +119,14 @@ def _agree(row: SampleTime, other: SampleTime) -> bool:
 def _vague(row: SampleTime, other: SampleTime) -> bool:
     """Whether another sample time knows Ix or Iy clearly better."""
     both = {ROLL.inertia, PITCH.inertia} & row.constants.keys() & other.constants.keys()
-    return any(row.constants[name].std > RULE.wider * other.constants[name].std for name in both)
+    return any(row.constants[name].std > WIDER * other.constants[name].std for name in both)
 
 
 def moved(row: SampleTime, other: SampleTime) -> list[str]:
     """The moments of inertia that another sample time contradicts."""
 
     def differs(one: Constant, two: Constant) -> bool:
-        return abs(one.estimate - two.estimate) > RULE.agree * max(one.std, two.std) + RULE.discrete * one.estimate
+        return abs(one.estimate - two.estimate) > AGREE * max(one.std, two.std) + DISCRETE * one.estimate
 
     both = [name for name in row.constants if name in other.constants]
     return [name for name in both if differs(row.constants[name], other.constants[name])]

@@ -18,22 +18,11 @@ from ..shooting.gains import LogNoise
 from .data import Progress, silent
 from .results import Disturbance, has_answer
 
-
-class Pretests(NamedTuple):
-    """When a parameter is fixed and all others are searched again.
-
-    - `negative`: a parameter that must not be negative is fixed at 0 if it is so by this many standard deviations.
-    - `rise`: parameters near their plain values are fixed there unless that raises the cost, prior included, by more:
-      near it, a cost with kinks is not quadratic, and standard deviations are too small.
-    - `near`: a plain value that is further off than this many standard deviations is never tried.
-    """
-
-    negative: float = 2.0
-    rise: float = 5.0
-    near: float = 12.0
-
-
-PRETESTS = Pretests()
+NEGATIVE = 2.0  # standard deviations below 0 from which a parameter that must not be negative is fixed at 0
+NEAR_PLAIN = 12.0  # standard deviations; further from its plain value, a parameter is never tried there
+# Parameters near their plain values are fixed there unless that raises the cost, prior included, by more: near a plain
+# value, a cost with kinks is not quadratic, and standard deviations are too small.
+MAX_RISE = 5.0
 
 
 class Optimum(NamedTuple):
@@ -140,9 +129,7 @@ def search(
 def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
     """The parameters that are negative, though physics forbids it, fixed at 0."""
     negative = {
-        row.name: (value, std)
-        for row, value, std in _rows(before)
-        if row.nonnegative and value < -PRETESTS.negative * std
+        row.name: (value, std) for row, value, std in _rows(before) if row.nonnegative and value < -NEGATIVE * std
     }
     if not negative:
         return before
@@ -159,13 +146,13 @@ def _at_plain_values(estimator: AbstractEstimator, before: Optimum, progress: Pr
     plain = {
         row.name: row.plain
         for row, value, std in _rows(before)
-        if row.plain is not None and std > 0 and abs(value - row.plain) < PRETESTS.near * std
+        if row.plain is not None and std > 0 and abs(value - row.plain) < NEAR_PLAIN * std
     }
     if not plain:
         return before
     progress("fitting again without what the flights hardly show")
     after = before.restricted(estimator, plain)
-    if has_answer(after.estimate) and after.cost - before.cost < PRETESTS.rise:
+    if has_answer(after.estimate) and after.cost - before.cost < MAX_RISE:
         return after._replace(plain=tuple(plain))
     return before._replace(rollouts=after.rollouts)
 

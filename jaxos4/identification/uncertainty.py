@@ -13,7 +13,6 @@ A likelihood can have several maxima. If the cost is lower at an end than at the
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -35,39 +34,16 @@ PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for
 _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 
 
-class Jackknife(NamedTuple):
-    """Settings of the comparison of parts of flights.
-
-    - `most`, `fewest`: the most parts, and the fewest that can show a disagreement.
-    - `chance`: the probability that parts of a flight that the model explains are taken to disagree.
-    """
-
-    most: int = 20
-    fewest: int = 4
-    chance: float = 0.05
-
-
-class Profile(NamedTuple):
-    """Settings of the search for the upper end of an interval.
-
-    - `well_known`: a standard deviation of at most this share: the cost is nearly quadratic in the interval.
-    - `fits`: the most fits for one end. `close`: they end once the root of twice the rise of the cost is this close to
-      1.96. `slope`: the root grows by 1 in each standard deviation if the cost is quadratic, and by this at least.
-    - `tolerance`: of each fit, which needs one or two steps. A cost that is too large by it moves an end by 1 %.
-    - `lower`: an end whose cost is lower by more shows that the optimum is not the minimum.
-    - `minima`: the most minima whose ends are looked at.
-    """
-
-    well_known: float = 0.1
-    fits: int = 3
-    close: float = 0.1
-    slope: float = 0.1
-    tolerance: float = 0.04
-    lower: float = 0.1
-    minima: int = 3
-
-
-JACKKNIFE, PROFILE = Jackknife(), Profile()
+MAX_PARTS = 20  # of flights that are compared
+MIN_PARTS = 4  # fewer cannot show a disagreement
+CHANCE = 0.05  # probability that parts of a flight that the model explains are taken to disagree
+WELL_KNOWN = 0.1  # share of a value; with a smaller standard deviation, the cost is nearly quadratic in the interval
+MAX_FITS = 3  # for one end of an interval
+CLOSE = 0.1  # fits end if the root of twice the rise of the cost is this close to 1.96
+MIN_SLOPE = 0.1  # of this root by standard deviations; 1 if the cost is quadratic
+PROFILE_TOLERANCE = 0.04  # of a fit, one or two steps; a cost that is too large by this moves an end by 1 %
+LOWER = 0.1  # an end whose cost is lower by more shows that the optimum is not the minimum
+MAX_MINIMA = 3  # whose ends are looked at
 _CLEAR = 1e-5  # the least share of a scaled unknown that the others do not explain, as a root
 
 
@@ -119,16 +95,16 @@ def at_lowest(
 
     A search that did not converge has no profile.
     """
-    for left in reversed(range(PROFILE.minima)):
+    for left in reversed(range(MAX_MINIMA)):
         answer, factors, lower = corrected(optimum, data), {}, None
         if not optimum.converged:
             return answer
-        poor = optimum.std > PROFILE.well_known * np.abs(optimum.values[: optimum.whole.count])
+        poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.whole.count])
         for place in sorted({*INVERSES} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
             end, fit = upper_end(optimum, place)
             optimum = optimum._replace(rollouts=fit.rollouts)
-            if fit.converged and optimum.cost - fit.cost > PROFILE.lower:
+            if fit.converged and optimum.cost - fit.cost > LOWER:
                 lower = fit.values
                 break
             factors[optimum.whole.names[place]] = max(end / NINETY_FIVE, 1.0)
@@ -156,21 +132,21 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
 
     **Returns:** the end in standard deviations above the optimum, and the last fit at an end.
     """
-    solver, covariance = FilterError(tolerance=PROFILE.tolerance), np.asarray(optimum.estimate.covariance)
+    solver, covariance = FilterError(tolerance=PROFILE_TOLERANCE), np.asarray(optimum.estimate.covariance)
     # How the minimum moves with this parameter, in steps of its standard deviation.
     along = covariance[:, place] / np.sqrt(covariance[place, place])
     unknowns, at, root, end, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
-    for _ in range(PROFILE.fits):
+    for _ in range(MAX_FITS):
         unknowns, before, at = unknowns + (end - at) * along, at, end
         fixed = {optimum.whole.names[place]: float(unknowns[place])}
         other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
         rise, unknowns, last = other.cost - optimum.cost, other.values, root
-        if not other.converged or rise < -PROFILE.lower:
+        if not other.converged or rise < -LOWER:
             break
         root = np.sqrt(max(2 * rise, 0.0))
-        end = at + (NINETY_FIVE - root) / max((root - last) / (at - before), PROFILE.slope)
+        end = at + (NINETY_FIVE - root) / max((root - last) / (at - before), MIN_SLOPE)
         end = float(np.clip(end, at / 2, 2 * at))
-        if abs(root - NINETY_FIVE) < PROFILE.close:
+        if abs(root - NINETY_FIVE) < CLOSE:
             break
     return end, other
 
@@ -194,8 +170,8 @@ def _widening(
 
 def parts_of(segments: int, recording: Int[np.ndarray, " segments"]) -> list[Int[np.ndarray, " segments"]]:
     """The ways to divide segments into parts: into blocks of neighbours, and into recordings if there are enough."""
-    ways = [np.arange(segments) * min(segments, JACKKNIFE.most) // segments, recording]
-    return [way for way in ways if np.unique(way).size >= JACKKNIFE.fewest]
+    ways = [np.arange(segments) * min(segments, MAX_PARTS) // segments, recording]
+    return [way for way in ways if np.unique(way).size >= MIN_PARTS]
 
 
 def _solved(
@@ -249,4 +225,4 @@ def disagreement(
     likelihood = np.diagonal(np.linalg.inv(whole / np.outer(scale, scale))) / scale**2
     ratio = variance / likelihood
     freedom = numbers.size - 1
-    return np.sqrt(np.where(ratio > chdtri(freedom, JACKKNIFE.chance) / freedom, np.maximum(ratio, 1.0), 1.0))
+    return np.sqrt(np.where(ratio > chdtri(freedom, CHANCE) / freedom, np.maximum(ratio, 1.0), 1.0))

@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -37,26 +37,14 @@ DEFAULT = "filter-error"
 """The estimator of a vehicle, which flies in closed loop."""
 
 
-class Likelihoods(NamedTuple):
-    """Settings of the likelihood of a vehicle.
-
-    - `segments`: the parts of a flight, which are filtered in parallel. Their disagreement shows errors of the model.
-      There are more from twice `recordings` recordings on. None is shorter than `seconds` [s].
-    - `tolerance`: of `FilterError`: it stops within 0.05 standard deviations of the minimum.
-    - `controller`: up to this sample time, torque hardly answers what is measured in its own sample, if that is an
-      instant or if motors follow commands [s].
-    - `sigma`: the scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
-    """
-
-    segments: int = 16
-    recordings: int = 4
-    seconds: float = 1.25
-    tolerance: float = 1e-3
-    controller: float = 0.005
-    sigma: float = 0.5
-
-
-LIKELIHOODS = Likelihoods()
+SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
+RECORDINGS = 4  # from twice this many on, there are more segments
+MIN_SEGMENT = 1.25  # s
+TOLERANCE = 1e-3  # of `FilterError`: it stops within 0.05 standard deviations of the minimum
+# Up to this sample time [s], torque hardly answers what is measured in its own sample, if that is an instant or if
+# motors follow commands.
+UNANSWERED = 0.005
+SIGMA = 0.5  # rad/s; the scale of the errors of a simulation, for networks
 GUESS_REACH = 4.0  # alpha8 may be this many times a guess too small or too large: published drag torques differ as much
 
 
@@ -83,7 +71,7 @@ class VehicleCase:
 
         `FilterError` searches at all sample times, and another estimator then at the chosen one.
         """
-        solver, is_default = FilterError(tolerance=LIKELIHOODS.tolerance), self.estimator == DEFAULT
+        solver, is_default = FilterError(tolerance=TOLERANCE), self.estimator == DEFAULT
         data = self.data[0]
         compared = self.data if is_default or len(self.data) > 1 else ()
         fitted, optima, rows = fit_sample_times(compared, solver, choose=self.choose, progress=progress)
@@ -230,9 +218,7 @@ def with_estimator(
 
 def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingProblem:
     """The problem of a vehicle's flight: its rates, and what its model says of specific force."""
-    return ShootingProblem(
-        model, flight, sigma=np.full(12, LIKELIHOODS.sigma), channels="rates", method="rk4", **settings
-    )
+    return ShootingProblem(model, flight, sigma=np.full(12, SIGMA), channels="rates", method="rk4", **settings)
 
 
 def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared) -> InnovationsProblem:
@@ -240,8 +226,8 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     recordings = max(prepared.recordings) + 1
     # Segments are as many for all sample times, and last a while at the longest.
     seconds = float(finest.fitted.dt) * finest.fitted.time.shape[0]
-    most = LIKELIHOODS.segments * max(recordings // LIKELIHOODS.recordings, 1)
-    segments = int(np.clip(seconds / LIKELIHOODS.seconds, 2 * recordings if recordings > 1 else 1, most))
+    most = SEGMENTS * max(recordings // RECORDINGS, 1)
+    segments = int(np.clip(seconds / MIN_SEGMENT, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     capacity = capacity_of(finest.fitted.time.shape[0])
     flight, commanded = shooting.flight, COMMANDS in prepared.available
@@ -252,7 +238,7 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
         segments=segments,
         least_noise=least_noise,
         input_innovations=_input_innovations(shooting, capacity, commanded=commanded),
-        answers_within=not (is_late and float(flight.dt) <= LIKELIHOODS.controller),
+        answers_within=not (is_late and float(flight.dt) <= UNANSWERED),
     )
 
 
@@ -266,7 +252,7 @@ def _input_innovations(
     dt, (samples,), mixer = float(flight.dt), flight.time.shape, np.asarray(shooting.model.airframe.mixer)
     inputs = np.square(np.asarray(flight.within)) @ mixer.T
     stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
-    is_lagged = commanded and dt <= LIKELIHOODS.controller
+    is_lagged = commanded and dt <= UNANSWERED
     counts = LAGGED_COUNTS if is_lagged else COUNTS
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):

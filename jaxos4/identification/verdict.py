@@ -28,34 +28,16 @@ ADVICE = {
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 
 
-class Tolerance(msgspec.Struct, frozen=True):
-    """Limits of a verdict: the change that a doubt may cause, and the accuracy that is needed.
-
-    - `share`, `deviations`: a doubt that moves a quantity by more than both contradicts it, unless it is a mere
-      `reservation` that moves it by less than its own size; by more than one of them makes a reservation, by less is a
-      note. Errors of discretisation reach 3 %, and an interval allows for one standard deviation. Moves of reservations
-      add up; see `judge`.
-    - `vague`, `unknown`: half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a
-      reservation, or is not identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
-    - `seconds`: how long the fitted measurements must last [s] for moments of inertia without a reservation; below half
-      of it, these are not identified. Segments last 1.25 s, and the jackknife compares at least four parts.
-    - `prior`: the share of the information about a parameter that its bracket may give without a reservation.
-    - `late`: motors that act earlier than they are recorded by more than this are recorded late [s].
-    - `sure`, `consistent`: what exceeds chance: this many standard deviations, or a probability below the second.
-    """
-
-    share: float = 0.05
-    deviations: float = 1.0
-    vague: float = 0.1
-    unknown: float = 0.4
-    seconds: float = 10.0
-    prior: float = 0.25
-    late: float = 0.005
-    sure: float = 3.0
-    consistent: float = 1e-3
-
-
-TOLERANCE = Tolerance()
+# A doubt that moves a quantity by more than this share (errors of discretisation reach 3 %), and by more than these
+# standard deviations, contradicts it, unless it is a mere `reservation` that moves it by less than its own size; by
+# more than one of them makes a reservation, by less is a note. Moves of reservations add up; see `judge`.
+MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
+# Half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a reservation, or is not
+# identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
+UNCERTAIN, TOO_UNCERTAIN = 0.1, 0.4
+MAX_PRIOR = 0.25  # share of the information about a parameter that its bracket may give without a reservation
+SIGNIFICANT = 3.0  # standard deviations that exceed chance
+IMPROBABLE = 1e-3  # a smaller probability exceeds chance
 
 
 class Move(msgspec.Struct, frozen=True):
@@ -68,9 +50,10 @@ class Move(msgspec.Struct, frozen=True):
     share: float
     deviations: float
 
-    def limits_exceeded(self, tolerance: Tolerance) -> int:
+    @property
+    def limits_exceeded(self) -> int:
         """The number of the two limits that it exceeds."""
-        return (self.share > tolerance.share) + (self.deviations > tolerance.deviations)
+        return (self.share > MAX_SHARE) + (self.deviations > MAX_DEVIATIONS)
 
 
 Moves = Mapping[str, Move | None]
@@ -102,7 +85,7 @@ class Doubt(msgspec.Struct, frozen=True):
         """By which share the quantity of this name would move; 0 if nothing says how far."""
         return 0.0 if (move := self.moves.get(name)) is None else move.share
 
-    def status_left(self, name: str, tolerance: Tolerance = TOLERANCE) -> str:
+    def status_left(self, name: str) -> str:
         """The status of the quantity of this name if this were the only doubt."""
         if name not in self.moves:
             return IDENTIFIED
@@ -110,7 +93,7 @@ class Doubt(msgspec.Struct, frozen=True):
             return self.severity
         # Nobody can use a value that may be off by more than itself.
         worst = RESERVED if self.severity == RESERVED and move.share <= 1 else CONTRADICTED
-        return (IDENTIFIED, RESERVED, worst)[move.limits_exceeded(tolerance)]
+        return (IDENTIFIED, RESERVED, worst)[move.limits_exceeded]
 
 
 def reservation(cause: str, remedy: str, moves: Moves) -> Doubt:
@@ -182,26 +165,26 @@ class Judgement(NamedTuple):
         return min((each for name in refused for each in self.refusals[name]), default=without_doubt)[1]
 
 
-def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt], tolerance: Tolerance = TOLERANCE) -> Judgement:
+def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt]) -> Judgement:
     """The verdict for each quantity. `doubts`: all of the identification."""
     verdicts, refusals = {}, {}
     for name, quantity in quantities.items():
         causes: dict[str, list[str]] = {status: [] for status in STATUSES}
         refusals[name] = []
-        for place, status in enumerate(_statuses_left(doubts, name, tolerance)):
+        for place, status in enumerate(_statuses_left(doubts, name)):
             causes[status].append(_reason(doubts[place], name))
             # A reservation that contradicts together with another decides nothing by itself.
             doubt = doubts[place]
-            is_reservation, alone = doubt.severity == RESERVED, doubt.status_left(name, tolerance)
+            is_reservation, alone = doubt.severity == RESERVED, doubt.status_left(name)
             if status not in _TRUSTED and (not is_reservation or alone not in _TRUSTED):
                 refusals[name].append((place, "implausible" if is_reservation else doubt.result))
         causes[RESERVED] += quantity.reservations
         if quantity.missing and not causes[MISSING]:
             causes[MISSING].append(quantity.missing)
         known = f"it is known to {100 * quantity.spread:.0f} % only; {quantity.remedy}"
-        if quantity.spread > tolerance.unknown:
+        if quantity.spread > TOO_UNCERTAIN:
             causes[MISSING].append(known)
-        elif quantity.spread > tolerance.vague:
+        elif quantity.spread > UNCERTAIN:
             causes[RESERVED].append(known)
         status = next((each for each in STATUSES[:0:-1] if causes[each]), IDENTIFIED)
         verdicts[name] = Verdict(status, quantity.value, tuple(causes[status]) if status != IDENTIFIED else ())
@@ -213,17 +196,17 @@ def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt], tolerance
     return Judgement(verdicts, refusals)
 
 
-def _statuses_left(doubts: Sequence[Doubt], name: str, tolerance: Tolerance) -> list[str]:
+def _statuses_left(doubts: Sequence[Doubt], name: str) -> list[str]:
     """The status that each doubt leaves to the quantity of this name.
 
     Reservations of known size add up. If one of them is impossible, and together they exceed what one doubt may move,
     they contradict the quantity: an impossible parameter shows that the model errs, and another doubt by how much.
     """
-    alone = [doubt.status_left(name, tolerance) for doubt in doubts]
+    alone = [doubt.status_left(name) for doubt in doubts]
     reserved = (i for i, status in enumerate(alone) if status == RESERVED)
     sized = {i: move for i in reserved if (move := doubts[i].moves[name]) is not None}
     total = Move(sum(move.share for move in sized.values()), sum(move.deviations for move in sized.values()))
-    if all(doubts[i].severity == RESERVED for i in sized) or total.limits_exceeded(tolerance) < 2:
+    if all(doubts[i].severity == RESERVED for i in sized) or total.limits_exceeded < 2:
         return alone
     return [CONTRADICTED if i in sized else status for i, status in enumerate(alone)]
 

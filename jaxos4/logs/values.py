@@ -107,32 +107,11 @@ class Plausible(NamedTuple):
     clipped: Mapping[str, tuple[int, float, float]]
 
 
-class Rules(NamedTuple):
-    """The implausible values of a channel, by its usual range, from the quantile 0.005 to 0.995.
-
-    - `fewest`: values; fewer have no usual range.
-    - `spread`: a value is impossible if it lies this many times further from the median than the end of the range, and
-      most of the six `neighbours` around it do not. Fast manoeuvres last for more than three samples.
-    - `times`, `equal`: values are clipped if this many are equal to the largest one, and this many times more than lie
-      just below, within a share `near` of the range. A signal without limits has a single largest value. A value that
-      is held counts once.
-    - `levels`: with more repeated values than this, a signal is coarse, and the level below the largest counts as near.
-      If so few values are most of the signal, it is at rest: they are counts of noise, and not the end of a range.
-    """
-
-    fewest: int = 20
-    spread: float = 8.0
-    neighbours: tuple[int, ...] = (-3, -2, -1, 1, 2, 3)
-    times: float = 3.0
-    equal: int = 4
-    near: float = 0.01
-    levels: int = 10
+# The usual range of a channel is that from its quantile 0.005 to 0.995.
+MIN_VALUES = 20  # fewer have no usual range
 
 
-RULES = Rules()
-
-
-def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
+def plausible(recording: Recording) -> Plausible:
     """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before.
 
     A rotor's measured speed is taken out if it is `dropped`, too.
@@ -143,7 +122,7 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
     for name, field, place in [*states, *force, *((f"rotor {i + 1}", "omega", i) for i in range(4))]:
         logged = getattr(recording, field)
         column = logged[:, place].copy()  # one at a time: a long log has 400 MB
-        wrong = _isolated(column, rules)
+        wrong = _isolated(column)
         if name.startswith("rotor") and not recording.commanded:
             wrong |= dropped(recording.time, column)
         if wrong.any():
@@ -152,7 +131,7 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
             column[wrong] = np.nan
         known = np.count_nonzero(np.isfinite(column))
         for sign in (1.0, -1.0) if name in ("p", "q", "r", *FORCE_NAMES) else ():
-            stuck = _stuck(sign * column, rules)
+            stuck = _stuck(sign * column)
             if stuck.any():
                 end, number = float(column[stuck][0]), int(stuck.sum())
                 count, share, before = clipped.get(name, (0, 0.0, end))
@@ -165,43 +144,57 @@ def plausible(recording: Recording, *, rules: Rules = RULES) -> Plausible:
     return Plausible(recording._replace(**cleaned) if cleaned else recording, impossible, clipped)
 
 
-def _isolated(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:
+# A value is impossible if it lies this many times further from the median than the end of the range, and most of the
+# six around it do not. Fast manoeuvres last for more than three samples.
+FAR = 8.0
+AROUND = np.array([-3, -2, -1, 1, 2, 3])
+
+
+def _isolated(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
     """Whether each value lies far outside of the usual range, while most of those around it do not."""
     out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
-    if known.size < rules.fewest:
+    if known.size < MIN_VALUES:
         return out
     x = values[known]
     least, middle, most = np.quantile(x, (0.005, 0.5, 0.995))
-    far = (x < middle - rules.spread * (middle - least)) | (x > middle + rules.spread * (most - middle))
+    far = (x < middle - FAR * (middle - least)) | (x > middle + FAR * (most - middle))
     if least == most or not far.any():
         return out
-    at, around = np.flatnonzero(far), np.array(rules.neighbours)
-    wild = far[np.clip(at[:, None] + around, 0, x.size - 1)].sum(axis=1)
-    out[known[at[wild < around.size / 2]]] = True
+    at = np.flatnonzero(far)
+    wild = far[np.clip(at[:, None] + AROUND, 0, x.size - 1)].sum(axis=1)
+    out[known[at[wild < AROUND.size / 2]]] = True
     return out
 
 
-def _stuck(values: Float[np.ndarray, " samples"], rules: Rules) -> Bool[np.ndarray, " samples"]:
+# Values are clipped if this many are equal to the largest one, and this many times more than lie just below, within a
+# share of the range. A signal without limits has a single largest value. A value that is held counts once.
+EQUAL, TIMES, NEAR = 4, 3.0, 0.01
+# With more repeated values than this, a signal is coarse, and the level below the largest counts as near. If so few
+# values are most of the signal, it is at rest: they are counts of noise, and not the end of a range.
+LEVELS = 10
+
+
+def _stuck(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
     """Whether each value equals the largest one, if too many do to be chance."""
     out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
-    if known.size < rules.fewest:
+    if known.size < MIN_VALUES:
         return out
     x = values[known]
-    near = rules.near * float(np.subtract(*np.quantile(x, (0.995, 0.005))))
+    near = NEAR * float(np.subtract(*np.quantile(x, (0.995, 0.005))))
     top = x >= x.max() - 1e-4 * near
-    if near <= 0 or top.sum() < rules.equal:
+    if near <= 0 or top.sum() < EQUAL:
         return out
     held = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]])))
     usual = float(np.quantile(held, 0.9))  # samples for which a value is held
     edges = np.flatnonzero(np.diff(np.concatenate([[0], top.astype(int), [0]])))
     at_top = np.ceil((edges[1::2] - edges[::2]) / usual).sum()
     levels, counts = np.unique(x, return_counts=True)
-    if 2 * np.sort(counts)[-rules.levels :].sum() > x.size:
+    if 2 * np.sort(counts)[-LEVELS:].sum() > x.size:
         return out
     levels = levels[counts > 1]
-    if levels.size > rules.levels:
+    if levels.size > LEVELS:
         near = max(near, 1.01 * float(np.median(np.diff(levels))))
     beside = np.count_nonzero(x[~top] >= x.max() - near) / usual
-    if at_top >= max(rules.equal, rules.times * (beside + 1)):
+    if at_top >= max(EQUAL, TIMES * (beside + 1)):
         out[known[top]] = True
     return out

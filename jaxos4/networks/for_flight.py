@@ -1,8 +1,8 @@
-"""Networks that are trained for one flight, and the settings of their training."""
+"""Networks that are trained for one flight."""
 
 import dataclasses
 import os
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,26 +17,15 @@ GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
 """A network, or its file."""
 
 
-class Training(NamedTuple):
-    """Settings with which networks are trained for a flight that is identified.
-
-    - `seed_steps`: of a network that only gives a search its start.
-    - `vehicle`: of a network for a vehicle. `windows`: this many of the flight it sees, however long that is.
-    - `flyable`: the share of a vehicle's bracket in which nearly all simulated flights can be flown.
-    """
-
-    seed_steps: int = 2000
-    vehicle: NetworkEstimator = NetworkEstimator(steps=250, batch=64, noise=(1.0, 1.0), held_out=2000)
-    windows: int = 24
-    flyable: float = 0.5
-
-
-TRAINING = Training()
+SEED_STEPS = 2000  # of training a network that only gives a search its start
+VEHICLE = NetworkEstimator(steps=250, batch=64, noise=(1.0, 1.0), held_out=2000)
+MAX_WINDOWS = 24  # that the network of a vehicle sees, however long the flight is
+FLYABLE = 0.5  # share of a vehicle's bracket in which nearly all simulated flights can be flown
 
 
 def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
     """Train a network for one flight, named `name`: briefly if shooting follows (`shoots`)."""
-    steps = TRAINING.seed_steps if shoots else NetworkEstimator.steps
+    steps = SEED_STEPS if shoots else NetworkEstimator.steps
     settings = NetworkEstimator(channels=seen_channels(problem), steps=steps)
     with named(name):
         return settings.fit(problem, bracket, key=jax.random.key(seed))
@@ -44,7 +33,7 @@ def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots
 
 def liveliest(problem: ShootingProblem) -> ShootingProblem:
     """The part of a vehicle's flight that a network sees: the windows in a row with the largest rates."""
-    windows = min(TRAINING.windows, problem.windows)
+    windows = min(MAX_WINDOWS, problem.windows)
     samples = problem.flight.time.shape[0] // problem.windows
     motion = np.nansum(np.square(problem.recorded()), axis=1).reshape(problem.windows, samples).sum(axis=1)
     first = samples * int(np.convolve(motion, np.ones(windows), "valid").argmax())
@@ -56,9 +45,9 @@ def liveliest(problem: ShootingProblem) -> ShootingProblem:
 def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> TrainedNetwork:
     """Train a network for a part of a vehicle's flight in windows, at the noise levels of the problem."""
     unknowns = problem.unknowns
-    bracket = Bracket.around(unknowns.center, TRAINING.flyable * unknowns.half_width)
+    bracket = Bracket.around(unknowns.center, FLYABLE * unknowns.half_width)
     with named(name):
-        return TRAINING.vehicle.fit(problem, bracket, key=jax.random.key(seed))
+        return VEHICLE.fit(problem, bracket, key=jax.random.key(seed))
 
 
 def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from ..logs import Recording as Recording, read_recording as read_recording
 from ..logs.values import plausible as plausible
 from .checks import (
     Finding as Finding,
-    Limits as Limits,
     different_vehicles as different_vehicles,
     self_checks as self_checks,
 )

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,48 +20,25 @@ Signs = tuple[float, ...]
 Ups = tuple[Float[np.ndarray, "_samples 3"], Float[np.ndarray, "_samples 3"]]
 
 
-class Excited(NamedTuple):
-    """When an axis counts as excited, by the deviation of its rate [rad/s], and in multiples of the gyro's noise."""
-
-    weak: float = 0.1
-    good: float = 0.3
-    over_noise: float = 5.0
+# An axis is excited weakly or well from these standard deviations of its rate on [rad/s], and weakly only if they
+# exceed this many times the gyro's noise.
+WEAK, GOOD, OVER_NOISE = 0.1, 0.3, 5.0
 
 
-EXCITED = Excited()
-
-
-class SignRules(NamedTuple):
-    """Settings with which the signs of the response to the rotors are found.
-
-    - `step`: of the samples [s].
-    - `smooth`, `slow`: samples; differences of means over them are the motion between about 2 and 20 Hz.
-    - `causal`, `shifted`: delays of the gyro after the motors [s]: lag and delay of rotors, and the same with clocks
-      that may be shifted either way. In motion of one frequency, half a period more would turn the sign.
-    - `measured`: the same as `causal` if rotor speeds were measured, which have no lag.
-    - `together`: roll, pitch and yaw are measured by one clock, and so have one delay, but for this difference [s].
-    - `seconds`: the least flight [s].
-    - `opposite`, `clear`: the least correlation, and by how much it exceeds that of another sign or pair of rotors.
-    - `wrong`: the same before a sign of the airframe is called wrong, by axis. A controller turns the sign at negative
-      shifts.
-    - `torque`: the least, as a share of all the torque of the rotors in hover.
-    """
-
-    step: float = 0.008
-    smooth: int = 3
-    slow: int = 63
-    causal: tuple[float, float] = (0.0, 0.048)
-    measured: tuple[float, float] = (0.0, 0.016)
-    together: float = 0.016
-    shifted: tuple[float, float] = (-0.04, 0.06)
-    seconds: float = 3.0
-    opposite: float = 0.4
-    clear: float = 1.5
-    wrong: tuple[tuple[float, float], ...] = ((0.7, 1.2), (0.7, 1.2), (0.5, 1.5))
-    torque: float = 0.005
-
-
-SIGNS = SignRules()
+# Delays of the gyro after the motors [s] in which the response is looked for. In motion of one frequency, half a period
+# more would turn the sign.
+COMMANDED = 0.0, 0.048  # lag and delay of rotors
+MEASURED = 0.0, 0.016  # the same for measured speeds, which have no lag
+SHIFTED = -0.04, 0.06  # the same as `COMMANDED` with clocks that may be shifted either way
+TOGETHER = 0.016  # s; the difference of the delays of roll, pitch and yaw, which are measured by one clock
+OPPOSITE = 0.4  # the least correlation that shows a sign or a pair of rotors
+CLEAR = 1.5  # times the correlation of another sign or pair
+# The same before a sign of the airframe is called wrong, by axis. A controller turns the sign at negative shifts.
+WRONG = (0.7, 1.2), (0.7, 1.2), (0.5, 1.5)
+MIN_TORQUE = 0.005  # share of all the torque of the rotors in hover
+STEP = 0.008  # s; of the samples
+SMOOTH, SLOW = 3, 63  # samples; differences of means over them are the motion between about 2 and 20 Hz
+MIN_SECONDS = 3.0  # of flight
 
 
 class Excitation(msgspec.Struct, frozen=True):
@@ -80,9 +56,7 @@ class Excitation(msgspec.Struct, frozen=True):
     verdict: str
 
 
-def excitation(
-    flight: Flight | Recording, airframe: Airframe | None = None, *, rules: Excited = EXCITED
-) -> dict[str, Excitation]:
+def excitation(flight: Flight | Recording, airframe: Airframe | None = None) -> dict[str, Excitation]:
     """The excitation of roll, pitch and yaw over the whole flight. Without a rate, it is the slope of the angle."""
     recording, found = as_recording(flight), {}
     torque = np.full(3, math.nan)
@@ -97,10 +71,10 @@ def excitation(
             measured = np.count_nonzero(seen) > 2
             rate = np.gradient(angle[seen], recording.time[seen]) if measured else np.full(1, math.nan)
         size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
-        verdict = "good" if size >= rules.good else "weak"
+        verdict = "good" if size >= GOOD else "weak"
         if math.isnan(size):
             verdict = "not measured"
-        elif size < max(rules.weak, rules.over_noise * noise):
+        elif size < max(WEAK, OVER_NOISE * noise):
             verdict = "none"
         known = [x if math.isfinite(x) else None for x in (float(torque[i]), size, noise)]
         found[axis] = Excitation(known[0], known[1], known[2], verdict)
@@ -112,24 +86,24 @@ def torques_of(airframe: Airframe | None) -> Float[np.ndarray, "axes 4"]:
     return _PAIRS if airframe is None else np.asarray(airframe.mixer, dtype=float)[:3]
 
 
-def opposite_axes(flown: Sequence[Recording], airframe: Airframe, *, signs: SignRules = SIGNS) -> dict[str, float]:
+def opposite_axes(flown: Sequence[Recording], airframe: Airframe) -> dict[str, float]:
     """The axes about which vehicles turn against the torque that the airframe gives to the rotors, in usable stretches.
 
     For each, the correlation of torque and angular acceleration with the opposite sign. Axes without clear motion and
     torque are not judged. The clocks of motors and gyro may be shifted.
     """
     mixer = np.asarray(airframe.mixer, dtype=float)[:3]
-    found = np.diagonal(_correlations(flown, mixer, signs.shifted, signs), axis1=1, axis2=2).copy()
+    found = np.diagonal(_correlations(flown, mixer, SHIFTED), axis1=1, axis2=2).copy()
     right = np.nan_to_num(found[:, :2]).max(axis=1)
-    if right.max() > signs.wrong[0][0]:
-        delays = np.linspace(*signs.shifted, len(found))
-        found[np.abs(delays - delays[np.argmax(right)]) > 1.01 * signs.together, 2] = np.nan
+    if right.max() > WRONG[0][0]:
+        delays = np.linspace(*SHIFTED, len(found))
+        found[np.abs(delays - delays[np.argmax(right)]) > 1.01 * TOGETHER, 2] = np.nan
     hover = float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
     torques = [(each.omega[:-1] ** 2 @ mixer.T).std(axis=0) for each in flown]
-    found = np.where(np.max(torques, axis=0, initial=0.0) < signs.torque * hover, np.nan, found)
+    found = np.where(np.max(torques, axis=0, initial=0.0) < MIN_TORQUE * hover, np.nan, found)
     least = np.where(np.isnan(found), np.inf, found).min(axis=0, initial=np.inf)
     most = np.where(np.isnan(found), -np.inf, found).max(axis=0, initial=-np.inf)
-    ends = zip(MOTIONS, signs.wrong, -least, most, strict=True)
+    ends = zip(MOTIONS, WRONG, -least, most, strict=True)
     return {axis: float(wrong) for axis, (least, times), wrong, right in ends if wrong > max(least, times * right)}
 
 
@@ -145,35 +119,35 @@ def refused_note(axes: Mapping[str, float]) -> str:
     )
 
 
-def rotor_signs(flown: Sequence[Recording], *, signs: SignRules = SIGNS) -> tuple[Signs, Signs, Signs | None] | None:
+def rotor_signs(flown: Sequence[Recording]) -> tuple[Signs, Signs, Signs | None] | None:
     """The places and spins of four rotors in an X, by how the vehicle turns after each pair of rotors speeds up.
 
     **Returns:** the signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from
     above; `None`: the vehicle hardly yawed). `None`: the flight does not show it, or the rotors are no X.
     """
     commanded = any(each.commanded for each in flown)
-    found = _correlations(flown, _PAIRS, signs.causal if commanded else signs.measured, signs)
-    roll, pitch = (_pair(found[:, :, axis], signs) for axis in (0, 1))
+    found = _correlations(flown, _PAIRS, COMMANDED if commanded else MEASURED)
+    roll, pitch = (_pair(found[:, :, axis]) for axis in (0, 1))
     if roll is None or pitch is None or roll == pitch:
         return None
     (yaw,) = {0, 1, 2} - {roll, pitch}
-    left = _clear_sign(found[:, roll, 0], signs) * _PAIRS[roll]
-    forward = -_clear_sign(found[:, pitch, 1], signs) * _PAIRS[pitch]
-    turn = _clear_sign(found[:, yaw, 2], signs)
+    left = _clear_sign(found[:, roll, 0]) * _PAIRS[roll]
+    forward = -_clear_sign(found[:, pitch, 1]) * _PAIRS[pitch]
+    turn = _clear_sign(found[:, yaw, 2])
     spins = tuple((-turn * _PAIRS[yaw]).tolist()) if turn else None
     return tuple(forward.tolist()), tuple(left.tolist()), spins
 
 
 def _correlations(
-    flown: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"], between: tuple[float, float], signs: SignRules
+    flown: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"], between: tuple[float, float]
 ) -> Float[np.ndarray, "delays rows 3"]:
     """Correlations of sums of squared rotor speeds with the angular accelerations after them, at 2 to 20 Hz.
 
     By delay of the gyro, `between` two [s], by row of `mixer`, and by axis; NaN: no clear motion. A controller that
     answers gusts does not change the sign.
     """
-    step = max([signs.step, *(each.dt for each in flown)])
-    pairs = [_response(each, mixer, step, signs) for each in flown if np.ptp(each.time) > 2 * signs.slow * step]
+    step = max([STEP, *(each.dt for each in flown)])
+    pairs = [_response(each, mixer, step) for each in flown if np.ptp(each.time) > 2 * SLOW * step]
     shifts = range(round(between[0] / step), round(between[1] / step) + 1)
     found = np.full((len(shifts), mixer.shape[0], len(MOTIONS)), np.nan)
     for place, shift in enumerate(shifts if pairs else ()):
@@ -182,7 +156,7 @@ def _correlations(
         acceleration = np.concatenate([b[late : max(b.shape[0] - early, 0)] for _, b in pairs])
         for i, along in enumerate(acceleration.T):
             measured = np.isfinite(torque).all(axis=1) & np.isfinite(along)
-            if np.count_nonzero(measured) * step < signs.seconds:
+            if np.count_nonzero(measured) * step < MIN_SECONDS:
                 continue
             x, y = torque[measured] - torque[measured].mean(axis=0), along[measured] - along[measured].mean()
             spreads = x.std(axis=0) * y.std()
@@ -190,23 +164,23 @@ def _correlations(
     return found
 
 
-def _clear_sign(found: Float[np.ndarray, " delays"], signs: SignRules) -> float:
+def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
     """The sign of correlations at several delays, if it is clear; 0 if not."""
     for sign in (1.0, -1.0):
-        if (sign * found).max() > max(signs.opposite, signs.clear * (-sign * found).max()):
+        if (sign * found).max() > max(OPPOSITE, CLEAR * (-sign * found).max()):
             return sign
     return 0.0
 
 
-def _pair(found: Float[np.ndarray, "delays pairs"], signs: SignRules) -> int | None:
+def _pair(found: Float[np.ndarray, "delays pairs"]) -> int | None:
     """The row of `_PAIRS` that turns the vehicle about an axis, if one of them does clearly."""
     sizes = np.abs(found).max(axis=0)
     best = int(np.argmax(sizes))
-    alone = sizes[best] > signs.clear * np.delete(sizes, best).max()  # False for NaN
-    return best if alone and _clear_sign(found[:, best], signs) else None
+    alone = sizes[best] > CLEAR * np.delete(sizes, best).max()  # False for NaN
+    return best if alone and _clear_sign(found[:, best]) else None
 
 
-def _response(flown: Recording, mixer: np.ndarray, step: float, signs: SignRules) -> tuple[np.ndarray, np.ndarray]:
+def _response(flown: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
     _, omega, rates = averages(flown.time, flown.omega, flown.states[:, RATES], held=flown.held)(step)
     acceleration = np.diff(rates, axis=0) / step
@@ -215,10 +189,10 @@ def _response(flown: Recording, mixer: np.ndarray, step: float, signs: SignRules
             acceleration[:, i] = np.nan
 
     def between(columns: np.ndarray) -> np.ndarray:
-        edge = (signs.slow - signs.smooth) // 2
+        edge = (SLOW - SMOOTH) // 2
         fast, slow = (
             np.column_stack([np.convolve(x, np.full(samples, 1 / samples), "valid") for x in columns.T])
-            for samples in (signs.smooth, signs.slow)
+            for samples in (SMOOTH, SLOW)
         )
         return fast[edge : fast.shape[0] - edge] - slow
 

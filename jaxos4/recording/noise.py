@@ -10,7 +10,6 @@ Reference: Carroll, Ruppert, Stefanski and Crainiceanu 2006, Measurement Error i
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -48,33 +47,10 @@ def force_noise(recording: Recording, *, share: float = 0.5) -> Float[np.ndarray
     return least
 
 
-class SpeedNoise(NamedTuple):
-    """Settings with which the noise of rotor speeds is found.
-
-    - `seconds`, `fewest`: how long the samples of one spectrum last [s], and how many they are at least.
-    - `neighbours`: spectra are averaged over this many neighbouring frequencies to either side.
-    - `band`: in which changes of speeds are divided into motion and noise, as shares of the highest frequency.
-    - `written`: rates at which the speeds may have been written before they were interpolated, of which one is chosen,
-      in units of the highest frequency.
-    - `passes`: of the weighted fit.
-    - `negligible`: noise with a smaller share of the power of the changes is none: it changes no answer.
-    """
-
-    seconds: float = 1.0
-    fewest: int = 32
-    neighbours: int = 2
-    band: tuple[float, float] = (0.25, 0.9)
-    written: tuple[float, ...] = (np.inf, 4.0, 2.8, 2.0, 1.7, 1.4, 1.2, 1.0)
-    passes: int = 20
-    negligible: float = 1e-3
+NEGLIGIBLE = 1e-3  # share of the power of the changes; less noise changes no answer
 
 
-SETTINGS = SpeedNoise()
-
-
-def without_noise(
-    stretches: Sequence[Recording], airframe: Airframe, settings: SpeedNoise = SETTINGS
-) -> tuple[list[Recording], float, float]:
+def without_noise(stretches: Sequence[Recording], airframe: Airframe) -> tuple[list[Recording], float, float]:
     """The stretches of one recording with the expected rotor speeds. Commands have no noise.
 
     **Returns:** also the noise's standard deviation [rad/s], and its share of the power of changes between samples.
@@ -82,22 +58,26 @@ def without_noise(
     if any(each.commanded for each in stretches):
         return list(stretches), 0.0, 0.0
     axes = np.linalg.qr(np.asarray(airframe.mixer, dtype=float).T)[0]
-    power = _power([each.omega @ axes for each in stretches], stretches[0].dt, settings)
+    power = _power([each.omega @ axes for each in stretches], stretches[0].dt)
     if power is None:
         return list(stretches), 0.0, 0.0
-    noise = _noise(power, settings)
+    noise = _noise(power)
     kept = 1 - noise[:, None] / np.maximum(power, noise[:, None] + np.finfo(float).tiny)
     share = float(noise.sum() / max(power.mean(axis=1).sum(), np.finfo(float).tiny))
-    if share < settings.negligible:
+    if share < NEGLIGIBLE:
         return list(stretches), 0.0, 0.0
     speeds = [np.maximum(_filtered(each.omega @ axes, kept) @ axes.T, 0.0) for each in stretches]
     smooth = [each._replace(omega=speed) for each, speed in zip(stretches, speeds, strict=True)]
     return smooth, float(np.sqrt(noise.mean() / 2)), share
 
 
-def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float, settings: SpeedNoise) -> Changes | None:
+SPECTRUM, MIN_SAMPLES = 1.0, 32  # s, and samples at the least, of one spectrum
+NEIGHBOURS = 2  # frequencies to either side over which spectra are averaged
+
+
+def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float) -> Changes | None:
     """The mean power of the changes from sample to sample, by frequency; that of white changes is their variance."""
-    length = 2 * (max(round(settings.seconds / dt), settings.fewest) // 2)
+    length = 2 * (max(round(SPECTRUM / dt), MIN_SAMPLES) // 2)
     weight, spectra = np.hanning(length + 1)[:-1, None], []
     for signal in signals:
         changes = np.diff(signal, axis=0)
@@ -107,12 +87,19 @@ def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float, settings: Spe
     if not spectra:
         return None
     power = np.mean(spectra, axis=0) / np.square(weight).sum()
-    around = np.pad(power, ((settings.neighbours, settings.neighbours), (0, 0)), mode="reflect")
-    windows = np.lib.stride_tricks.sliding_window_view(around, 2 * settings.neighbours + 1, axis=0)
+    around = np.pad(power, ((NEIGHBOURS, NEIGHBOURS), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(around, 2 * NEIGHBOURS + 1, axis=0)
     return windows.mean(axis=-1)
 
 
-def _noise(power: Changes, settings: SpeedNoise) -> Float[np.ndarray, " frequencies"]:
+# The band in which changes of speeds are divided into motion and noise, as shares of the highest frequency.
+BAND = 0.25, 0.9
+# Rates at which the speeds may have been written before they were interpolated, in units of the highest frequency.
+WRITTEN = np.inf, 4.0, 2.8, 2.0, 1.7, 1.4, 1.2, 1.0
+PASSES = 20  # of the weighted fit
+
+
+def _noise(power: Changes) -> Float[np.ndarray, " frequencies"]:
     """The power of the noise in the changes of each direction, by frequency.
 
     The changes of true speeds do not grow with frequency, because of the motors' lag: a constant, and a part that falls
@@ -122,7 +109,7 @@ def _noise(power: Changes, settings: SpeedNoise) -> Float[np.ndarray, " frequenc
 
     frequency = np.linspace(0, 1, len(power))
     growth = 4 * np.sin(np.pi / 2 * frequency) ** 2
-    some = slice(*(round(edge * (len(power) - 1)) for edge in settings.band))
+    some = slice(*(round(edge * (len(power) - 1)) for edge in BAND))
     directions, wanted = np.eye(power.shape[1]), np.maximum(power[some].T.ravel(), np.finfo(float).tiny)
     motion = np.hstack([np.kron(directions, growth[some, None] ** order) for order in (0, -1)])
 
@@ -130,12 +117,12 @@ def _noise(power: Changes, settings: SpeedNoise) -> Float[np.ndarray, " frequenc
         shape = growth * np.sinc(frequency / rate) ** 4
         columns, model = np.hstack([motion, np.tile(shape[some], len(directions))[:, None]]), wanted
         size = np.zeros(columns.shape[1])
-        for _ in range(settings.passes):
+        for _ in range(PASSES):
             size, _ = nnls(columns / model[:, None], wanted / model)
             model = np.maximum(columns @ size, np.finfo(float).tiny)
         return float((np.log(model) + wanted / model).sum()), size[-1] * shape
 
-    return min(map(fitted, settings.written), key=lambda each: each[0])[1]
+    return min(map(fitted, WRITTEN), key=lambda each: each[0])[1]
 
 
 def _filtered(signal: Float[np.ndarray, "samples 4"], kept: Changes) -> Float[np.ndarray, "samples 4"]:

@@ -29,30 +29,15 @@ HOLDOUT = 0.25
 _NEARLY = 1.01  # sample times that differ by less than this factor count as equal
 
 
-class Preparation(NamedTuple):
-    """Settings with which recordings become a flight to fit.
-
-    - `window`: the length of a window [s].
-    - `fewest`: samples of a window.
-    - `shortest`: the shortest sample by default [s]: no quadrotor's motion needs shorter ones.
-    - `longest`: the longest sample at which an answer is compared with that of shorter ones [s].
-    - `whole`: a sample time that the user gives becomes a multiple of the log's if that changes it by less than this
-      share.
-    - `noisy`: noise of rotor speeds is noted from this share of their changes on.
-    - `full`, `often`: the share of full speed at which a rotor is at its limit, and the share of time that is noted.
-    """
-
-    window: float = 0.25
-    fewest: int = 4
-    shortest: float = 0.004
-    longest: float = 0.032
-    whole: float = 0.05
-    noisy: float = 0.1
-    full: float = 0.999
-    often: float = 0.01
-
-
-RULES = Preparation()
+WINDOW = 0.25  # s
+MIN_SAMPLES = 4  # of a window
+SHORTEST = 0.004  # s; the shortest sample by default: no quadrotor's motion needs shorter ones
+LONGEST = 0.032  # s; the longest sample at which an answer is compared with that of shorter ones
+# A given sample time becomes a multiple of the log's if that changes it by less than this share.
+WHOLE = 0.05
+NOISY = 0.1  # share of the changes of rotor speeds from which on their noise is noted
+FULL = 0.999  # share of full speed at which a rotor is at its limit
+OFTEN = 0.01  # share of the time at this limit that is noted
 
 
 class Prepared(NamedTuple):
@@ -119,7 +104,6 @@ def prepare(
     sample_time: float | None = None,
     holdout: float = HOLDOUT,
     predicted: bool = False,
-    rules: Preparation = RULES,
 ) -> tuple[Prepared, ...]:
     """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
 
@@ -140,10 +124,10 @@ def prepare(
     for number, recording in enumerate(recordings):
         if any(recording.same_data(earlier) for earlier in recordings[:number]):
             raise InputError(f"{recording.name}: given twice; give each log once.")
-    step = finest(max(each.dt for each in recordings), sample_time, rules=rules)
+    step = finest(max(each.dt for each in recordings), sample_time)
     seconds = math.inf if predicted else fair_share(recordings, step)
     evidences = [Evidence(each, airframe, seconds=seconds) for each in recordings]
-    every = [_cleaned(each, airframe, begin, end, predicted=predicted, rules=rules) for each in evidences]
+    every = [_cleaned(each, airframe, begin, end, predicted=predicted) for each in evidences]
     if len({stretch.commanded for each in every for stretch in each.stretches}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
@@ -154,18 +138,18 @@ def prepare(
     for number, (recording, each) in enumerate(zip(recordings, every, strict=True)):
         smooth, noise, share = without_noise(each.stretches, airframe)
         stretched += [(number, stretch) for stretch in smooth]
-        if share > rules.noisy:
+        if share > NOISY:
             how = f"white noise of {noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
             notes.append(f"{recording.name}: rotor speeds have {how}; their expected values are used")
     slowest = max(stretch.dt for _, stretch in stretched)
-    steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted, rules=rules)
+    steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted)
     coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
     numbers = [number for number, _ in stretched]
     vibrates = {name: at for each in every for name, at in vibrating_rates(each.stretches).items()}
     noise = np.min([force_noise(in_body_axes(each, airframe)) for each in recordings], axis=0)
     rests = [rest for each in every if (rest := each.evidence.rest) is not None]
     return tuple(
-        _sampled(recordings, numbers, flown, airframe, step, holdout, rests, noise, rules)._replace(
+        _sampled(recordings, numbers, flown, airframe, step, holdout, rests, noise)._replace(
             notes=tuple(notes),
             findings=tuple(found),
             log_step=slowest,
@@ -183,7 +167,6 @@ def _cleaned(
     end: float | None,
     *,
     predicted: bool,
-    rules: Preparation,
 ) -> _Cleaned:
     """The stretches of one recording to fit, and what its checks find. Raises `InputError` if it cannot be used."""
     recording = evidence.logged
@@ -197,7 +180,7 @@ def _cleaned(
     usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
     if slow:
         raise InputError(f"{name}: {slow}.")
-    if limited := at_limit(evidence.plausible.recording, airframe, rules):
+    if limited := at_limit(evidence.plausible.recording, airframe):
         notes.append("; ".join(limited))
     opposite = opposite_axes(usable, airframe)
     if refused := refused_note(opposite):
@@ -212,13 +195,13 @@ def _is_judged(finding: Finding) -> bool:
     return bool({*finding.quantities} & {*INERTIAS}) or (finding.contradicted and finding.quantities != ("attitude",))
 
 
-def at_limit(recording: Recording, airframe: Airframe, rules: Preparation = RULES) -> tuple[str, str] | None:
+def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None:
     """Cause and remedy, if rotors are at full speed for a noticeable time. These stretches are not used."""
-    shares = (recording.omega >= rules.full * float(airframe.max_rotor_speed)).mean(axis=0)
+    shares = (recording.omega >= FULL * float(airframe.max_rotor_speed)).mean(axis=0)
     often = [
         f"rotor {i + 1} is at its limit for {100 * share:.0f} % of the time"
         for i, share in enumerate(shares)
-        if share > rules.often
+        if share > OFTEN
     ]
     return (f"{recording.name}: {', '.join(often)}", "fly more gently, or with a fuller battery") if often else None
 
@@ -258,12 +241,10 @@ def _richest(evidence: Evidence, parts: Sequence[Stretch]) -> tuple[list[Recordi
     return [cut(recording, each) for each in chosen], note_of(recording.name, chosen, parts)
 
 
-def _sample_times(
-    name: str, slowest: float, sample_time: float | None, *, predicted: bool, rules: Preparation
-) -> list[float]:
+def _sample_times(name: str, slowest: float, sample_time: float | None, *, predicted: bool) -> list[float]:
     """The sample times at which answers are compared [s], the shortest first. `slowest`: of the logs."""
-    if slowest > _NEARLY * rules.window / rules.fewest:
-        least = f"log at {rules.fewest / rules.window:g} Hz or more"
+    if slowest > _NEARLY * WINDOW / MIN_SAMPLES:
+        least = f"log at {MIN_SAMPLES / WINDOW:g} Hz or more"
         raise InputError(f"{name}: has one sample every {slowest:.4g} s, too few for a vehicle; {least}.")
     if sample_time is not None and slowest > sample_time * _NEARLY:
         if predicted:
@@ -272,18 +253,16 @@ def _sample_times(
                 f"{sample_time:.4g} s; give `sample_time` {slowest:.4g}, or another `validate`."
             )
         raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
-    shortest = finest(slowest, sample_time, predicted=predicted, rules=rules)
-    doublings = 0 if predicted else math.floor(math.log2(rules.longest * _NEARLY / shortest))
+    shortest = finest(slowest, sample_time, predicted=predicted)
+    doublings = 0 if predicted else math.floor(math.log2(LONGEST * _NEARLY / shortest))
     return [shortest * 2**k for k in range(max(doublings, 0) + 1)]
 
 
-def finest(
-    slowest: float, sample_time: float | None = None, *, predicted: bool = False, rules: Preparation = RULES
-) -> float:
+def finest(slowest: float, sample_time: float | None = None, *, predicted: bool = False) -> float:
     """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: that of the logs."""
-    shortest = max(rules.shortest if sample_time is None else sample_time, slowest)
+    shortest = max(SHORTEST if sample_time is None else sample_time, slowest)
     whole = max(round(shortest / slowest), 1) * slowest  # samples of whole rows
-    is_near = sample_time is None or abs(whole - shortest) < rules.whole * shortest
+    is_near = sample_time is None or abs(whole - shortest) < WHOLE * shortest
     return whole if is_near and not predicted else shortest
 
 
@@ -296,22 +275,21 @@ def _sampled(
     holdout: float,
     rests: Sequence[Float[np.ndarray, "3"]],
     noise: Float[np.ndarray, "3"],
-    rules: Preparation,
 ) -> Prepared:
     """One flight of stretches that are averaged to samples of `step` [s].
 
     `numbers`: of their recordings. `rests`: the specific force before take-off, where it is known. `noise`: the least
     of the accelerometer, see `force_noise`.
     """
-    length = round(rules.window / step)
-    if length < rules.fewest:
-        least = rules.window / rules.fewest
+    length = round(WINDOW / step)
+    if length < MIN_SAMPLES:
+        least = WINDOW / MIN_SAMPLES
         raise InputError(f"`sample_time` {step:g}: too long for a vehicle; give at most {least:g}, or log faster.")
     whole = [(number, whole_windows(each, length)) for number, each in zip(numbers, flown, strict=True)]
     whole = [(number, each) for number, each in whole if each.time.size]
     numbers, flown = tuple(number for number, _ in whole), [each for _, each in whole]
     if unused := [recording for i, recording in enumerate(recordings) if i not in numbers]:
-        raise InputError(f"{unused[0].name}: no part is as long as a window, {rules.window:g} s; leave this log out.")
+        raise InputError(f"{unused[0].name}: no part is as long as a window, {WINDOW:g} s; leave this log out.")
     moved, ups = [velocity_of(each) for each in flown], []
     if None not in moved:
         velocities, ups = zip(*moved, strict=True)

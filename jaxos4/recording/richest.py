@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..logs import Recording
 from ..logs.table import counted
-from .stretches import RULES, Stretch, cut
+from .stretches import MIN_STRETCH, Stretch, cut
 
 PIECE = 30.0  # s; shorter pieces would be chosen by their gusts, which biases a fit, and begin with unsettled filters
 MOST = 65_536  # samples of a fit, which takes more than a minute; flights of any length up to it share a program
@@ -32,7 +32,7 @@ def richest(
     """
     if sum(part.length for part in parts) <= seconds:
         return list(parts)
-    longest = max(seconds / math.ceil(seconds / PIECE), RULES.shortest)
+    longest = max(seconds / math.ceil(seconds / PIECE), MIN_STRETCH)
     pieces = [piece for part in parts for piece in _pieces(part, longest)]
     varied = np.array([_varied(cut(recording, piece), torques) for piece in pieces])
     levels = np.rint(_LEVELS * np.log2(np.maximum(varied, np.finfo(float).tiny)))

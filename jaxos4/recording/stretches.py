@@ -38,61 +38,12 @@ class Stretch(NamedTuple):
         return self.end - self.begin
 
 
-class StretchRules(NamedTuple):
-    """The rules for a usable stretch. Times in seconds, forces in multiples of gravity, unless units are given.
-
-    - `shortest`: a usable stretch, and the rest of a vehicle that lies on its side or back.
-    - `moment`: a rotor may rest or be at its limit for this long: about its lag.
-    - `carries`: the share of the weight; with less thrust for `sustained`, the vehicle does not fly. Shorter pauses of
-      thrust happen in flight, shorter bursts on the ground. The vehicle may fall; on the ground the force is `one_g`.
-    - `margin`: between the ground and free flight.
-    - `least_hover`: the share of full command; no vehicle has a thrust of 25 times its weight.
-    - `gap`: the longest without a measurement, or five samples of a slow sensor.
-    - `same`: differences below this share of a rotor's largest speed count as none.
-    - `full`: the share of the airframe's `max_rotor_speed` from which a rotor is at full speed.
-    - `impact_force`, `impact_rate`: [m/s^2], and [rad/s] within `impact_time`, that end a flight if the rotors stop
-      within `after_impact`. `before_impact` is not trusted.
-    - `bin`: means over this time; `smooth` of them are longer than the lag of any rotor.
-    - `rest`: a window in which thrust and force are compared; a gap between two resting windows is filled up to
-      `filled`.
-    - `varies`: the least standard deviation of thrust in a window, as a share of its mean.
-    - `unfelt`: the relative change of the vertical force for a relative change of thrust: 1 in flight.
-    - `steady`, `one_g`: the standard deviation of the force of a resting vehicle; the error of an accelerometer.
-    - `tilted`, `still`: the force along z of a vehicle on its side or back, and its rates [rad/s].
-    """
-
-    shortest: float = 1.0
-    moment: float = 0.1
-    carries: float = 0.3
-    sustained: float = 0.5
-    margin: float = 0.3
-    least_hover: float = 0.2
-    gap: float = 0.05
-    same: float = 1e-3
-    full: float = 0.995
-    impact_force: float = 50.0
-    impact_rate: float = 15.0
-    impact_time: float = 0.02
-    after_impact: float = 1.0
-    before_impact: float = 0.5
-    bin: float = 0.05
-    smooth: int = 4
-    rest: float = 2.0
-    filled: float = 5.0
-    varies: float = 0.2
-    unfelt: float = 0.1
-    steady: float = 0.1
-    one_g: float = 0.15
-    tilted: float = 0.5
-    still: float = 0.2
+MIN_STRETCH = 1.0  # s; of a usable stretch, and of the rest of a vehicle that lies on its side or back
+MARGIN = 0.3  # s; between the ground and free flight
+ONE_G = 0.15  # in multiples of gravity; the error of an accelerometer that feels only the weight
 
 
-RULES = StretchRules()
-
-
-def stretches(
-    flight: Flight | Recording, airframe: Airframe | None = None, *, rules: StretchRules = RULES
-) -> tuple[Stretch, ...]:
+def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
     """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
     `airframe`: the weight and the largest rotor speed. Without it, or if the thrust is below a third or above three
@@ -101,32 +52,32 @@ def stretches(
     recording = as_recording(flight)
     time, omega, dt, force = recording.time, recording.omega, recording.dt, recording.specific_force
     rates = recording.states[:, RATES]
-    share = _thrust_share(recording, airframe, rules)
+    share = _thrust_share(recording, airframe)
     landed = np.zeros(time.size, dtype=bool)
     for begin, end in recording.facts.landed:  # as the vehicle itself says
         landed |= (time >= begin - dt / 2) & (time <= end + dt / 2)
-    ground = _ground(share, dt, rules) | landed
-    saturations = _saturations(omega, airframe, dt, rules)
+    ground = _ground(share, dt) | landed
+    saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
     labels[np.any([where.any(axis=1) for where in saturations.values()], axis=0)] = _SATURATED
-    labels[_lost(recording.states, dt, rules)] = _LOST
-    labels[_crashed(rates, force, share, ground, dt, rules)] = _CRASHED
+    labels[_lost(recording.states, dt)] = _LOST
+    labels[_crashed(rates, force, share, ground, dt)] = _CRASHED
     labels[ground] = _IDLE
     labels[landed] = _GROUND
     weight = np.full(time.size, np.nan) if force is None else np.linalg.norm(force, axis=1) / STANDARD_GRAVITY
     for begin, end in _runs(labels == _IDLE):
         felt = weight[begin:end][np.isfinite(weight[begin:end])]
-        if felt.size and abs(np.median(felt) - 1) < rules.one_g:
+        if felt.size and abs(np.median(felt) - 1) < ONE_G:
             labels[begin:end] = _GROUND
     if force is not None:
-        labels[_resting(omega, force, rates, labels == _USABLE, dt, rules) & (labels != _LOST)] = _GROUND
+        labels[_resting(omega, force, rates, labels == _USABLE, dt) & (labels != _LOST)] = _GROUND
     for begin, end in _runs(labels == _USABLE):
-        if time[end - 1] - time[begin] < rules.shortest - dt / 2:
+        if time[end - 1] - time[begin] < MIN_STRETCH - dt / 2:
             labels[begin:end] = _SHORT
 
     def reason(begin: int, end: int) -> str:
         if labels[begin] != _SATURATED:
-            return _REASONS[labels[begin]].format(rules.shortest)
+            return _REASONS[labels[begin]].format(MIN_STRETCH)
         rotors = {what: np.flatnonzero(where[begin:end].any(axis=0)) + 1 for what, where in saturations.items()}
         return "; ".join(f"rotor {', '.join(map(str, which))} {what}" for what, which in rotors.items() if which.size)
 
@@ -163,9 +114,11 @@ def usable(recording: Recording, airframe: Airframe | None = None) -> list[Recor
     return [cut(recording, stretch) for stretch in stretches(recording, airframe) if not stretch.reason]
 
 
-def _thrust_share(
-    recording: Recording, airframe: Airframe | None, rules: StretchRules
-) -> Float[np.ndarray, " samples"]:
+# Share of full command with which a vehicle hovers at the least: no vehicle has a thrust of 25 times its weight.
+LEAST_HOVER = 0.2
+
+
+def _thrust_share(recording: Recording, airframe: Airframe | None) -> Float[np.ndarray, " samples"]:
     """Thrust as a share of the weight. Commands below a tenth of full scale count as idle, whatever the weight."""
     omega, commanded = recording.omega, recording.commanded
     squares = (omega**2).sum(axis=1)
@@ -179,69 +132,82 @@ def _thrust_share(
     if commanded and airframe is None and omega.max(initial=0.0) <= 1:
         full = 1.0
     if commanded and math.isfinite(full):
-        usual = max(usual, 4 * (rules.least_hover * full) ** 2)
+        usual = max(usual, 4 * (LEAST_HOVER * full) ** 2)
     return squares / max(usual, 1e-300)
 
 
-def _ground(share: Float[np.ndarray, " samples"], dt: float, rules: StretchRules) -> Samples:
+CARRIES = 0.3  # share of the weight; with less thrust, the vehicle does not fly. It may fall.
+SUSTAINED = 0.5  # s; shorter pauses of thrust happen in flight, shorter bursts on the ground
+
+
+def _ground(share: Float[np.ndarray, " samples"], dt: float) -> Samples:
     """The samples on the ground, with a margin toward flight."""
-    carried = share >= rules.carries
+    carried = share >= CARRIES
     for value in (True, False):  # short pauses in flight first, then short bursts on the ground
         for begin, end in _runs(carried != value):
-            if (end - begin) * dt < rules.sustained and begin > 0 and end < carried.size:
+            if (end - begin) * dt < SUSTAINED and begin > 0 and end < carried.size:
                 carried[begin:end] = value
-    ground, margin = ~carried, _samples(rules.margin, dt)
+    ground, margin = ~carried, _samples(MARGIN, dt)
     for begin, end in _runs(~carried):
         ground[max(begin - margin, 0) : end + margin] = True
     return ground
 
 
-def _saturations(
-    omega: np.ndarray, airframe: Airframe | None, dt: float, rules: StretchRules
-) -> dict[str, Bool[np.ndarray, "samples 4"]]:
+MOMENT = 0.1  # s; a rotor may rest or be at its limit for this long: about its lag
+SAME = 1e-3  # share of a rotor's largest speed; smaller differences count as none
+FULL = 0.995  # share of the airframe's `max_rotor_speed` from which a rotor is at full speed
+
+
+def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dict[str, Bool[np.ndarray, "samples 4"]]:
     """The samples of each rotor in which it is at its limit, or rests, for longer than a moment."""
     full_scale = math.inf if airframe is None else float(airframe.max_rotor_speed)
     found = {what: np.zeros(omega.shape, dtype=bool) for what in ("at full speed", "at rest or idle")}
     for i, speed in enumerate(omega.T):
         largest, least, usual = float(speed.max()), float(speed.min()), float(np.median(speed))
-        same = rules.same * largest
+        same = SAME * largest
         if largest <= 0:
             continue
         # Each sample that equals the one before or after it.
         equal = np.abs(np.diff(speed)) <= same
         steady = np.append(equal, False) | np.insert(equal, 0, False)
-        full, rest = speed >= rules.full * full_scale, speed <= same
+        full, rest = speed >= FULL * full_scale, speed <= same
         if largest > 1.3 * usual > 0:
             full |= steady & (speed >= largest - same)
         if least < 0.5 * usual:
             rest |= steady & (speed <= least + same)
         for where, lasting in zip((full, rest), found.values(), strict=True):
-            lasting[:, i] = _lasting(where, rules.moment / dt)
+            lasting[:, i] = _lasting(where, MOMENT / dt)
     return found
 
 
-def _lost(states: np.ndarray, dt: float, rules: StretchRules) -> Samples:
+GAP = 0.05  # s; the longest without a measurement, or five samples of a slow sensor
+
+
+def _lost(states: np.ndarray, dt: float) -> Samples:
     """The samples in gaps of the rates; without any rate, in gaps of all channels together."""
     out, seen = np.zeros(states.shape[0], dtype=bool), np.isfinite(states)
     for measured in [seen[:, c] for c in RATES if seen[:, c].any()] or [seen.any(axis=1)]:
         at = np.flatnonzero(measured)
         step = float(np.median(np.diff(at))) * dt if at.size > 1 else 0.0
-        out |= _lasting(np.asarray(~measured), max(rules.gap, 5 * step) / dt - 1)
+        out |= _lasting(np.asarray(~measured), max(GAP, 5 * step) / dt - 1)
     return out
 
 
-def _crashed(
-    rates: np.ndarray, force: np.ndarray | None, share: np.ndarray, ground: Samples, dt: float, rules: StretchRules
-) -> Samples:
+IMPACT_FORCE = 50.0  # m/s^2
+IMPACT_RATE, IMPACT_TIME = 15.0, 0.02  # rad/s within s
+BEFORE_IMPACT, AFTER_IMPACT = 0.5, 1.0  # s; not trusted; an impact ends a flight if the rotors stop within this time
+
+
+def _crashed(rates: np.ndarray, force: np.ndarray | None, share: np.ndarray, ground: Samples, dt: float) -> Samples:
     """The samples of a crash: from before an impact until the rotors stop, or the recording ends, soon after."""
     out, impact = np.zeros((2, share.size), dtype=bool)
     if force is not None:
-        impact = np.nan_to_num(np.linalg.norm(force, axis=1)) > rules.impact_force
+        impact = np.nan_to_num(np.linalg.norm(force, axis=1)) > IMPACT_FORCE
     measured, rates = np.asarray(np.isfinite(rates).all(axis=1)), np.nan_to_num(rates)
-    lag = min(max(_samples(rules.impact_time, dt), 1), share.size - 1)
-    most = rules.impact_rate * max(lag * dt / rules.impact_time, 1.0)
+    lag = min(max(_samples(IMPACT_TIME, dt), 1), share.size - 1)
+    most = IMPACT_RATE * max(lag * dt / IMPACT_TIME, 1.0)
     impact[lag:] |= (np.abs(rates[lag:] - rates[:-lag]).max(axis=1) > most) & measured[lag:] & measured[:-lag]
-    after, before = _samples(rules.after_impact, dt), _samples(rules.before_impact, dt)
+    after, before = _samples(AFTER_IMPACT, dt), _samples(BEFORE_IMPACT, dt)
     for begin in np.flatnonzero(impact):
         following = ground[begin : begin + after]
         if following.any() or begin + after >= share.size:
@@ -250,16 +216,18 @@ def _crashed(
     return out
 
 
-def _resting(
-    omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: Samples, dt: float, rules: StretchRules
-) -> Samples:
+BIN = 0.05  # s; means over this time are compared
+TILTED, STILL = 0.5, 0.2  # gravity along z of a vehicle on its side or back, and its rates [rad/s]
+
+
+def _resting(omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: Samples, dt: float) -> Samples:
     """Whether each `airborne` sample is of a vehicle at rest, by its accelerometer.
 
     In flight the specific force along z is the thrust over the mass; on the ground and in a hand it is that of gravity,
     whatever the rotors do, and on its side or back it is across their axes. Constant thrust proves nothing.
     """
     size = omega.shape[0]
-    length = max(round(rules.bin / dt), 1)
+    length = max(round(BIN / dt), 1)
     bins = size // length
     if bins < 2 or np.ptp(np.nan_to_num(force), axis=0).max() == 0:  # no accelerometer lies still to the last bit
         return np.zeros(size, dtype=bool)
@@ -268,18 +236,26 @@ def _resting(
     means = sensed[: bins * length].reshape(bins, length, -1).mean(axis=1)  # NaN where a sample is
     step, weight = length * dt, np.linalg.norm(means[:, 1:4], axis=1)
     with np.errstate(invalid="ignore"):
-        lies = (np.abs(weight - 1) < rules.one_g) & (means[:, 3] < rules.tilted) & (means[:, 4] < rules.still)
-    found = _unfelt(means, step, rules) | _lasting(lies, math.ceil(rules.shortest / step) - 1)
+        lies = (np.abs(weight - 1) < ONE_G) & (means[:, 3] < TILTED) & (means[:, 4] < STILL)
+    found = _unfelt(means, step) | _lasting(lies, math.ceil(MIN_STRETCH / step) - 1)
     return found[np.minimum(np.arange(size) // length, bins - 1)]
 
 
-def _unfelt(means: Float[np.ndarray, "bins 5"], step: float, rules: StretchRules) -> Bool[np.ndarray, " bins"]:
+SMOOTH = 4  # bins; longer than the lag of any rotor
+REST = 2.0  # s; a window in which thrust and force are compared
+FILLED = 5.0  # s; a gap between two resting windows that is filled at the most
+VARIES = 0.2  # the least standard deviation of thrust in a window, as a share of its mean
+UNFELT = 0.1  # the relative change of the vertical force for a relative change of thrust: 1 in flight
+STEADY = 0.1  # standard deviation of the force of a resting vehicle, in multiples of gravity
+
+
+def _unfelt(means: Float[np.ndarray, "bins 5"], step: float) -> Bool[np.ndarray, " bins"]:
     """The bins of windows in which thrust changes, and the accelerometer does not."""
-    kernel, edge = np.full(rules.smooth, 1 / rules.smooth), rules.smooth // 2
+    kernel, edge = np.full(SMOOTH, 1 / SMOOTH), SMOOTH // 2
     smooth = np.column_stack([np.convolve(column, kernel, "same") for column in means.T])
     smooth[:edge] = smooth[-edge:] = np.nan
     out, felt = np.zeros((2, means.shape[0]), dtype=bool)
-    wide = max(round(rules.rest / step), 4)
+    wide = max(round(REST / step), 4)
     for begin in range(0, means.shape[0] - wide // 2, max(wide // 4, 1)):
         window = smooth[begin : begin + wide]
         window = window[np.isfinite(window[:, :4]).all(axis=1)]
@@ -287,14 +263,14 @@ def _unfelt(means: Float[np.ndarray, "bins 5"], step: float, rules: StretchRules
             continue
         thrust, vertical, size = window[:, 0], window[:, 3], np.linalg.norm(window[:, 1:4], axis=1)
         mean = thrust.mean()
-        if mean <= 0 or thrust.std() < rules.varies * mean:
+        if mean <= 0 or thrust.std() < VARIES * mean:
             continue
         deviation = thrust - mean
         follows = (deviation @ vertical) / (deviation @ deviation) * mean / max(abs(vertical.mean()), 0.1)
-        gravity = abs(size.mean() - 1) < rules.one_g and size.std() < rules.steady
-        (out if gravity and abs(follows) < rules.unfelt else felt)[begin : begin + wide] = True
+        gravity = abs(size.mean() - 1) < ONE_G and size.std() < STEADY
+        (out if gravity and abs(follows) < UNFELT else felt)[begin : begin + wide] = True
     for one, following in itertools.pairwise(np.flatnonzero(out)):
-        if 1 < following - one <= rules.filled / step and not felt[one + 1 : following].any():
+        if 1 < following - one <= FILLED / step and not felt[one + 1 : following].any():
             out[one:following] = True
     return out
 

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from ..airframe import INERTIAS, MOTIONS, Airframe
 from ..analysis.diagnostics import Correlations
-from ..analysis.frequency_response import RESPONSE, AxisResponse, FrequencyResponse
+from ..analysis.frequency_response import HIGHEST, AxisResponse, FrequencyResponse
 from ..analysis.inertia import CenterOfMass
 from ..analysis.traces import Traces
 from ..flight import STATE_NAMES
@@ -240,7 +240,7 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
 def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     """Gain, phase and coherence of each axis with 95 % bands, faint where they are not clear; dashed: the model."""
     figure, panels = grid(9, columns=3, height=1.9)
-    top = min(RESPONSE.highest, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
+    top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
     for row, (name, axis) in enumerate(found._asdict().items()):
         gain, phase, coherence = panels[3 * row : 3 * row + 3]
         degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..airframe import INERTIAS
-from ..analysis.frequency_response import RESPONSE
+from ..analysis.frequency_response import HIGHEST
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
@@ -69,7 +69,7 @@ class Plots(NamedTuple):
             raise InputError("the result has no frequency response: it is of an OS4, has no answer, or is older.")
         one, ax = response[_place("axis", axis, response._fields)], _axes(ax)
         draw_response(ax, one, one.gain, gain_band(one), 1.0, self._color)
-        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, RESPONSE.highest), ylim=GAINS)
+        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, HIGHEST), ylim=GAINS)
         for which in ("x", "y"):
             log_axis(ax, which)
         return ax

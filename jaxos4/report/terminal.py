@@ -15,9 +15,9 @@ from ..identification.results import COLOURED, Constant, Identification
 from ..identification.verdict import (
     CONTRADICTED,
     IDENTIFIED,
+    IMPROBABLE,
     MISSING,
     RESERVED,
-    TOLERANCE,
     headline,
     reason_lines,
     statuses_of,
@@ -190,7 +190,7 @@ def _inertias(found: Identification) -> Section:
     ]
     verdict = ""
     if body.consistency_p is not None:
-        if body.consistency_p < TOLERANCE.consistent:
+        if body.consistency_p < IMPROBABLE:
             verdict = f"; the alphas are not those of one rigid body, p = {body.consistency_p:.1g}"
         elif not body.is_rigid_body:
             verdict = "; no rigid body has such inertias: one exceeds the sum of the other two"

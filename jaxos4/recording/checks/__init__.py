@@ -6,20 +6,17 @@ import numpy as np
 
 from ...airframe import Airframe
 from ...logs import Recording
+from .agreement import sensor_clocks, velocity_axes, wrong_axes, wrong_scale
 from .channels import (
     clipped_values,
     constant_force,
     impossible_values,
     rare_motors,
     rare_speeds,
-    sensor_clocks,
     short_flight,
     uneven_time,
-    velocity_axes,
-    wrong_axes,
-    wrong_scale,
 )
-from .evidence import LIMITS, Evidence as Evidence, Finding as Finding, Limits as Limits
+from .evidence import Evidence as Evidence, Finding as Finding
 from .mounting import (
     different_thrust as different_thrust,
     earth_axes,
@@ -58,7 +55,6 @@ def self_checks(
     recording: Recording,
     airframe: Airframe | None = None,
     *,
-    limits: Limits = LIMITS,
     checks: Sequence[Check] = CHECKS,
 ) -> tuple[Finding, ...]:
     """Check a log against itself, before anything is fitted.
@@ -67,12 +63,11 @@ def self_checks(
 
     - `recording`: as it was logged, of one vehicle.
     - `airframe`: without it, gyro and accelerometer are not compared with the rotors.
-    - `limits`: what counts as a finding.
     - `checks`: of the table.
 
     **Returns:** the findings; those that contradict quantities come first.
     """
-    return findings(Evidence(recording, airframe, limits), checks)
+    return findings(Evidence(recording, airframe), checks)
 
 
 def findings(evidence: Evidence, checks: Sequence[Check] = CHECKS) -> tuple[Finding, ...]:
@@ -82,11 +77,9 @@ def findings(evidence: Evidence, checks: Sequence[Check] = CHECKS) -> tuple[Find
     return tuple(sorted(found, key=lambda finding: not finding.contradicted))
 
 
-def different_vehicles(
-    recordings: Sequence[Recording], airframe: Airframe, *, limits: Limits = LIMITS
-) -> Finding | None:
+def different_vehicles(recordings: Sequence[Recording], airframe: Airframe) -> Finding | None:
     """Compare the thrust of recordings that should be of one vehicle: the force that each felt for its rotor speeds.
 
     Without an accelerometer, thrust is compared with the weight.
     """
-    return different_thrust([Evidence(recording, airframe, limits) for recording in recordings])
+    return different_thrust([Evidence(recording, airframe) for recording in recordings])

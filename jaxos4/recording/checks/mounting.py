@@ -8,18 +8,19 @@ from jaxtyping import Float
 
 from ...airframe import GRAVITY, INERTIAS, YAW
 from .estimates import BATCHES, Measured, batched
-from .evidence import Evidence, Finding
+from .evidence import EXPLAINED, STANDARD_ERRORS, Evidence, Finding
+
+ANGLE = 0.14  # rad about the vertical axis; 20 degrees change inertias by 8 %, 8 degrees by 1 %
 
 
 def turned_about_vertical(evidence: Evidence) -> Finding | None:
     """Gyro turned about the vertical axis: roll torque pitches the vehicle, and the attitude turns about other axes."""
     rotors, attitude = _by_rotors(evidence), _by_attitude(evidence)
-    limits = evidence.limits
     if tilted_force(evidence):
         return None  # the angle about z is known when this is corrected
 
     def turned(angle: tuple[float, float] | None) -> bool:
-        return angle is not None and abs(angle[0]) > max(limits.angle, limits.standard_errors * angle[1])
+        return angle is not None and abs(angle[0]) > max(ANGLE, STANDARD_ERRORS * angle[1])
 
     by_attitude, by_rotors = turned(attitude), turned(rotors)
     if not by_attitude and not by_rotors:
@@ -77,17 +78,21 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
     )
 
 
+UNCERTAIN = 0.2  # rad; a rotation about the vertical axis by the rotors with a larger error is that of another airframe
+SAME_ANGLE = 0.17  # rad; a rotation turns roll and pitch by the same angle, up to this
+
+
 def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     """The angle of the gyro about z and its error [rad], by roll and pitch torque. `None`: unknown, or no rotation."""
-    response, limits = evidence.response, evidence.limits
-    if response is None or response.explained[:2].sum() < limits.explained[0]:
+    response = evidence.response
+    if response is None or response.explained[:2].sum() < EXPLAINED[0]:
         return None
     sizes = np.hypot(*response.turning.value)
     (a, b), (c, d) = response.turning.value / sizes
     errors = response.turning.error / sizes
     apart = abs(math.remainder(math.atan2(-c, a) - math.atan2(b, d), math.tau))
     across = math.hypot(errors[0, 1], errors[1, 0])
-    if not apart < max(limits.same_angle, limits.standard_errors * across) or across > limits.vague:
+    if not apart < max(SAME_ANGLE, STANDARD_ERRORS * across) or across > UNCERTAIN:
         return None
     return math.atan2(b - c, a + d), across / 2
 
@@ -104,12 +109,15 @@ def _by_attitude(evidence: Evidence) -> tuple[float, float] | None:
     return math.atan2(c - b, a + d), error / (2 * size)
 
 
+ALONG_EARTH = 0.6  # slope of the horizontal force on the tilt: 1 along the earth's axes, 0 or less along the body's
+
+
 def earth_axes(evidence: Evidence) -> Finding | None:
     """Specific force along the axes of the earth: its horizontal part follows the tilt."""
     if evidence.tilt is None:
         return None
     slope, error = float(evidence.tilt.value[0]), float(evidence.tilt.error[0])
-    if slope < max(evidence.limits.along_earth, evidence.limits.standard_errors * error):
+    if slope < max(ALONG_EARTH, STANDARD_ERRORS * error):
         return None
     return Finding(
         "earth_axes",
@@ -122,25 +130,29 @@ def earth_axes(evidence: Evidence) -> Finding | None:
     )
 
 
+TILT = 0.26  # rad; of the accelerometer against the thrust. Its errors and steady wind reach half of this.
+STEADY = 0.9  # in a hand or in rolls, the mean vector of the force is shorter than this share of its mean size
+
+
 def thrust_direction(evidence: Evidence) -> Finding | None:
     """The specific force is not along z, or not as large as gravity: at rest before take-off, or else in flight.
 
     The mean in flight has drag and manoeuvres too. A vehicle that rests on a slope is not tilted in flight.
     """
-    flown, rest, limits = evidence.force, evidence.rest, evidence.limits
+    flown, rest = evidence.force, evidence.rest
     if not flown.size and rest is None:
         return None
     mean = flown.mean(axis=0) if rest is None else rest
     size = float(np.linalg.norm(mean))
     if scale := _force_scale(evidence, size):
         return scale
-    tilt, steady = _tilt(mean), limits.steady * np.linalg.norm(flown, axis=1).mean() if flown.size else math.inf
-    if tilt < limits.tilt:
+    tilt, steady = _tilt(mean), STEADY * np.linalg.norm(flown, axis=1).mean() if flown.size else math.inf
+    if tilt < TILT:
         return None
     if rest is None:
         if size < steady:
             return None
-    elif not flown.size or _tilt(flown.mean(axis=0)) < limits.tilt:
+    elif not flown.size or _tilt(flown.mean(axis=0)) < TILT:
         return None
     roll = math.atan2(mean[1], mean[2])
     level = _turn(1, -math.atan2(mean[0], math.hypot(mean[1], mean[2]))) @ _turn(0, roll)
@@ -160,23 +172,27 @@ def _tilt(force: Float[np.ndarray, "3"]) -> float:
     return math.acos(min(max(float(force[2]) / max(float(np.linalg.norm(force)), 1e-300), -1.0), 1.0))
 
 
+AT_REST = 0.05  # of the specific force before take-off, relative to gravity; accelerometers err by up to 3 %
+GRAVITY_ERROR = 0.3  # of the mean specific force in flight, which is up to 10 % larger in brisk flight
+
+
 def _force_scale(evidence: Evidence, size: float) -> Finding | None:
     """A specific force of this size [m/s^2], of a vehicle at rest or else the mean in flight, that is not gravity."""
-    limits, resting = evidence.limits, evidence.rest is not None
+    resting = evidence.rest is not None
     gravity = GRAVITY if evidence.airframe is None else float(evidence.airframe.gravity)
     off = abs(size / gravity - 1)
-    if off <= (limits.at_rest if resting else limits.gravity):
+    if off <= (AT_REST if resting else GRAVITY_ERROR):
         return None
     share = f"{size:.3g} m/s^2 at rest before take-off" if resting else f"mean specific force {size:.3g} m/s^2"
     if 0.8 < size < 1.25:
         cause, remedy = "the accelerometer is in units of g", "multiply by 9.80665"
     elif size <= 0.8:
         cause, remedy = "gravity was subtracted from the accelerometer", "log what the accelerometer measures"
-    elif off <= limits.gravity:
+    elif off <= GRAVITY_ERROR:
         cause, remedy = f"the accelerometer has an error of {100 * off:.0f} %", "calibrate it"
     else:
         cause, remedy = "the scale of the accelerometer is wrong", "give m/s^2: it measures gravity in hover"
-    return Finding("force_scale", cause, share, remedy, ("thrust",), off > limits.gravity)
+    return Finding("force_scale", cause, share, remedy, ("thrust",), off > GRAVITY_ERROR)
 
 
 def tilted_force(evidence: Evidence) -> bool:
@@ -185,15 +201,20 @@ def tilted_force(evidence: Evidence) -> bool:
     return tilted is not None and tilted.name == "force_direction"
 
 
+# Errors of the airframe's thrust, relative, by measured speeds and by commands. The fit measures the thrust by the
+# accelerometer: errors of 20 % are harmless.
+THRUST, COMMANDED_THRUST = 0.35, 1.0
+
+
 def wrong_thrust(evidence: Evidence) -> Finding | None:
     """The airframe's thrust does not carry the vehicle, by the accelerometer or by its weight."""
     every = [thrust for each in evidence.stretches if (thrust := evidence.thrust(each)) is not None]
     if not every or evidence.airframe is None:
         return None
-    force, limits = evidence.force, evidence.limits
+    force = evidence.force
     felt = float(np.linalg.norm(force.mean(axis=0))) if force.size else float(evidence.airframe.gravity)
     ratio = float(np.concatenate(every).mean()) / max(felt, 1e-3)
-    limit = limits.commanded_thrust if evidence.logged.commanded else limits.thrust
+    limit = COMMANDED_THRUST if evidence.logged.commanded else THRUST
     if 1 / (1 + limit) < ratio < 1 + limit:
         return None
     return Finding(
@@ -206,6 +227,11 @@ def wrong_thrust(evidence: Evidence) -> Finding | None:
     )
 
 
+# Differences of the thrust between two logs of one vehicle, relative, by measured speeds and by commands. A battery
+# that empties changes the thrust of a command by up to 30 %.
+VEHICLES, COMMANDED_VEHICLES = 0.1, 0.4
+
+
 def different_thrust(every: Sequence[Evidence]) -> Finding | None:
     """Recordings that are not of one vehicle: the force that each felt for its rotor speeds.
 
@@ -216,10 +242,10 @@ def different_thrust(every: Sequence[Evidence]) -> Finding | None:
     if len(ratios) < 2:
         return None
     least, most = (choose(ratios, key=lambda ratio: float(ratio.value)) for choose in (min, max))
-    limits, apart = every[0].limits, float(most.value / least.value) - 1
-    error = limits.standard_errors * np.hypot(least.error / least.value, most.error / most.value)
+    apart = float(most.value / least.value) - 1
+    error = STANDARD_ERRORS * np.hypot(least.error / least.value, most.error / most.value)
     commanded = any(evidence.logged.commanded for evidence in every)
-    if apart < max(limits.vehicles, error):
+    if apart < max(VEHICLES, error):
         return None
     return Finding(
         "different_vehicles",
@@ -227,7 +253,7 @@ def different_thrust(every: Sequence[Evidence]) -> Finding | None:
         f"the same rotors lift {100 * apart:.0f} % more in one log than in another",
         "fit them separately, each with its own mass" + ("; log the battery's voltage" if commanded else ""),
         ("thrust", *INERTIAS),
-        bool(not commanded or apart > limits.commanded_vehicles),
+        bool(not commanded or apart > COMMANDED_VEHICLES),
     )
 
 
