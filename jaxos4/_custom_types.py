@@ -1,13 +1,14 @@
 """Shapes that public signatures share, and the converters and checks of fields."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, jaxtyped
 
 Scalar = Float[Array, ""]
 Count = Int[Array, ""]
@@ -20,6 +21,18 @@ States = Float[Array, "samples 12"]
 RotorSpeeds = Float[Array, "samples 4"]
 Key = PRNGKeyArray
 Numeric = Array | np.ndarray
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class Arrays(msgspec.Struct, frozen=True, eq=False):
+    """Arrays that a file holds by name. Raises `ValueError` unless they have the shapes of their annotations."""
+
+    def __post_init__(self):
+        with jaxtyped("context"):  # a length has one name in all of them
+            for name, kind in get_type_hints(type(self)).items():
+                if not isinstance(getattr(self, name), kind):
+                    raise ValueError(f"`{name}` has another shape than the arrays beside it")
 
 
 def as_float(x: ArrayLike) -> Array:

@@ -33,6 +33,15 @@ def in_words(error: Exception, most: int = 120) -> str:
     return " ".join(str(error).split())[:most] or type(error).__name__
 
 
+def of_schema(error: Exception) -> str:
+    """A message of msgspec with the place first, and types in plain words."""
+    complaint, _, place = " ".join(str(error).split()).partition(" - at `$")
+    words = {"object": "a table", "array": "a list", "int": "a whole number", "null": "nothing"}
+    for kind, word in (words | {"float": "a number", "str": "a string", "bool": "true or false"}).items():
+        complaint = complaint.replace(f"`{kind}`", word)
+    return f"`{place.strip('.`')}`: {complaint[:1].lower()}{complaint[1:]}" if place.strip(".`") else complaint
+
+
 @contextlib.contextmanager
 def named(place: object) -> Iterator[None]:
     """Raises a `ValueError` of the block again, as an `InputError` that begins with its place."""

@@ -67,7 +67,7 @@ def unpacked(line):
 
 
 def test_the_signals_are_the_predictions_with_a_band_of_95_percent():
-    unfitted = vehicle_traces()._replace(measured=np.full((400, 3), np.nan))
+    unfitted = msgspec.structs.replace(vehicle_traces(), measured=np.full((400, 3), np.nan))
     found = identified_vehicle(traces=unfitted)
     predicted, look = found.predictions, styles(["ibss"])["ibss"]
     drawn = json.loads(identified_signals(found, look))
@@ -76,7 +76,7 @@ def test_the_signals_are_the_predictions_with_a_band_of_95_percent():
     assert drawn["shown"] == 1
     # Nothing was measured so far ahead.
     measured = np.where(np.arange(3)[:, None] > 0, np.nan, predicted.measured)
-    short = msgspec.structs.replace(found, predictions=predicted._replace(measured=measured))
+    short = msgspec.structs.replace(found, predictions=msgspec.structs.replace(predicted, measured=measured))
     assert json.loads(identified_signals(short, look))["shown"] == 0
     # The line breaks between two stretches.
     view, half = drawn["views"][1], prediction_band(predicted)
@@ -98,7 +98,8 @@ def test_fitted_and_held_out_parts_are_on_one_axis_of_all_logs():
     measured = np.where(np.arange(200)[:, None] < 150, 1.0, np.nan) * np.ones(3)
     start = np.arange(150, 170)
     ahead = Predictions(start, np.array([0.2]), np.zeros((20, 3)), np.ones((20, 1, 3)), np.full((20, 1, 3), 2.0))
-    traces = synthetic_traces(time, log, measured)._replace(start_time=time[start], start_log=log[start])
+    traces = synthetic_traces(time, log, measured)
+    traces = msgspec.structs.replace(traces, start_time=time[start], start_log=log[start])
     changes = {"traces": traces, "predictions": ahead, "provenance": {"flights": ["a.csv", "b.csv"]}}
     drawn = json.loads(identified_signals(identified_vehicle(**changes), styles(["ibss"])["ibss"]))
     (at, begin, end, name), (later, *_, other) = drawn["pieces"]

@@ -73,7 +73,9 @@ def test_a_few_wild_samples_do_not_set_the_scale_of_the_gusts():
     traces = vehicle_traces()
     wild = traces.disturbance.copy()
     wild[:2] = 1e4
-    drawn = json.loads(identified_signals(identified_vehicle(traces=traces._replace(disturbance=wild)), LOOK))
+    drawn = json.loads(
+        identified_signals(identified_vehicle(traces=msgspec.structs.replace(traces, disturbance=wild)), LOOK)
+    )
     panels = {panel["title"]: panel["reach"] for view in drawn["common"] for panel in view["panels"]}
     largest = np.abs(traces.disturbance).max()
     assert 0.9 * largest < panels["gusts [rad/s²]"] < 2 * largest

@@ -97,7 +97,9 @@ def test_predictions_in_a_file_are_few(tmp_path):
     np.testing.assert_allclose(many.predicted, synthetic_predictions(4000).predicted[::4], atol=5.1e-5)
     many = synthetic_predictions(4000).thinned(1200)
     some = synthetic_trajectories(4000)
-    some = some._replace(**{name: getattr(some, name)[:40] for name in ("start", "initial", "predicted", "measured")})
+    some = msgspec.structs.replace(
+        some, **{name: getattr(some, name)[:40] for name in ("start", "initial", "predicted", "measured")}
+    )
     found = identified_vehicle(predictions=many, trajectories=some, traces=vehicle_traces(many.start))
     written(found, tmp_path / "found.json")
     assert (tmp_path / "found.json").stat().st_size < 5e5
@@ -110,7 +112,7 @@ def test_channels_that_are_logged_rarely_stay_in_thinned_traces():
     rows = np.arange(4010)
     rare, places = (np.where(rows % 10 == first, rows + 1.0, np.nan)[:, None] for first in (3, 5))
     traces = synthetic_traces(0.002 * rows, (rows >= 2001).astype(int), np.tile(rare, 6))
-    traces = traces._replace(disturbance=np.full((4010, 3), np.nan), position=np.tile(places, 3))
+    traces = msgspec.structs.replace(traces, disturbance=np.full((4010, 3), np.nan), position=np.tile(places, 3))
     fewer = traces.thinned(401)
     np.testing.assert_allclose(fewer.time, traces.time[::10])
     expected = rows[3::10] + 1.0
@@ -142,9 +144,9 @@ DAMAGES = [
     (("trajectories", "horizons", 24), 9e9, "`trajectories`: horizons must increase"),
     (("trajectories", "horizons", 3), 0.01, "`trajectories`: horizons must increase"),
     (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
-    (("response", "roll", "phase"), [1.0], "`response.roll.phase`: has another shape"),
+    (("response", "roll", "phase"), [1.0], "`response.roll`: `phase` has another shape"),
     (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),
-    (("response", "yaw"), {}, "`response.yaw.frequency`: is not an array"),
+    (("response", "yaw"), {}, "`response.yaw`: object missing required field `frequency`"),
     (("traces", "start_time"), [0.1], "`traces"),
     (("traces", "log", 0), 7, "`traces`: is of a log that has no name"),
     (("traces", "time", 3), None, "`traces`: a time is missing"),
@@ -152,13 +154,13 @@ DAMAGES = [
     (("traces", "rotors", 0), [1.0], "`traces.rotors`: is not an array"),
     (("correlations", "bound"), [1.0], "`correlations"),
     (("skill", "horizons"), [0.1], "`skill`"),
-    (("constants", "Ix", "std"), -1.0, "`std`: is negative"),
+    (("constants", "Ix", "std"), -1.0, "`constants[...].std`: expected a number >= 0.0"),
     (("constants", "other"), 1.0, "'other' is no name"),
     (("disturbances", "p", "smoothing"), 0.05, "`disturbances.p`: `smoothing` is of a rate"),
     (("disturbances", "az", "smoothing"), 0.3, "`disturbances.az`: `smoothing` is of a rate, or not between 0"),
-    (("disturbances", "az", "time_constant"), 0.0, "`disturbances.az`: a time constant is not positive"),
-    (("disturbances", "az", "sensor"), -0.1, "`disturbances.az`: a time constant is not positive, or a standard"),
-    (("sample_times", 0, "sample_time"), 0.0, "`sample_time`: is not positive"),
+    (("disturbances", "az", "time_constant"), 0.0, "`disturbances[...].time_constant`: expected a number > 0.0"),
+    (("disturbances", "az", "sensor"), -0.1, "`disturbances[...].sensor`: expected a number >= 0.0"),
+    (("sample_times", 0, "sample_time"), 0.0, "`sample_times[0].sample_time`: expected a number > 0.0"),
     (("cost",), float("nan"), "`cost`"),
     (("airframe", "mass"), -1.0, "`mass` must be"),
     (("result",), "unheard", "`result` unheard"),

@@ -4,6 +4,7 @@ import dataclasses
 
 import equinox as eqx
 import jax
+import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, standard_flight
@@ -117,7 +118,7 @@ def test_an_axis_that_answers_otherwise_than_the_model_has_a_reservation(ratio, 
     other = jaxos4.AxisResponse(
         frequency, np.full(30, ratio), 0 * frequency, 0 * frequency, np.full((30, 30), error**2), 20.0
     )
-    response = jaxos4.FrequencyResponse(other._replace(gain=np.ones(30)), other, other)
+    response = jaxos4.FrequencyResponse(msgspec.structs.replace(other, gain=np.ones(30)), other, other)
     constants = {name: Constant(2.0, 0.1, "kg m^2") for name in ("Ix", "Iy")}
     doubts = [*stronger_or_weaker(response, constants)]
     statuses = {name: verdict_of(name, Quantity(), doubts).status for name in ("Ix", "Iy", "Iz")}

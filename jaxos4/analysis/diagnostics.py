@@ -1,17 +1,16 @@
 """Diagnostics of the residuals of a fit: their size, whether they are white, and whether they depend on the inputs."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._custom_types import Arrays
 from ..results import NINETY_FIVE
 from ..shooting import ROUNDING
 from .evaluation import Evaluation
 
 
-class Correlations(NamedTuple):
+class Correlations(Arrays, frozen=True, eq=False):
     """Correlations of the residuals of some channels: with themselves, and with the roll, pitch and yaw torque.
 
     - `own`: at 1, 2, ... samples apart.

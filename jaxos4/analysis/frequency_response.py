@@ -6,10 +6,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import Arrays, Parameters, as_float
 from ..flight import RATES
 from ..models.state import Forcing, Rates
 from ..results import NINETY_FIVE
@@ -53,7 +54,7 @@ class Agreement(NamedTuple):
         return low > 1 + share or high < 1 - share
 
 
-class AxisResponse(NamedTuple):
+class AxisResponse(Arrays, frozen=True, eq=False):
     """The frequency response of one axis. A model that is right has gain 1 and phase 0.
 
     - `frequency`: [Hz].
@@ -86,9 +87,8 @@ class AxisResponse(NamedTuple):
 
     def rounded(self, digits: int = 4) -> "AxisResponse":
         """The same with this many significant digits, which is what files keep."""
-        return self._replace(
-            **{name: significant(each, digits) for name, each in zip(self._fields, self[:-1], strict=False)}
-        )
+        arrays = {name: each for name, each in msgspec.structs.asdict(self).items() if name != "averages"}
+        return msgspec.structs.replace(self, **{name: significant(each, digits) for name, each in arrays.items()})
 
     @property
     def error(self) -> Float[np.ndarray, " frequencies"]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import Numeric, Parameters, as_float
+from .._custom_types import Arrays, Numeric, Parameters, as_float
 from ..flight import RATES, Flight
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST, ShootingProblem
@@ -21,7 +21,7 @@ HORIZONS = (0.1, 0.25, 0.5)
 """How far ahead rates are predicted, if nothing else is wanted [s]."""
 
 
-class Predictions(NamedTuple):
+class Predictions(Arrays, frozen=True, eq=False):
     """Predictions of the body rates p, q, r [rad/s] from many starts.
 
     - `start`: the sample at which each prediction starts. `initial`: the measured rates there.
@@ -49,7 +49,8 @@ class Predictions(NamedTuple):
     def thinned(self, most: int) -> "Predictions":
         """At most `most` starts, evenly chosen, with rates to 1e-4 rad/s. What is not finite is NaN."""
         every = max(-(-self.start.size // most), 1)
-        rates = (np.where(np.isfinite(each), each.round(4), np.nan)[::every] for each in self[2:])
+        rates = self.initial, self.predicted, self.measured
+        rates = (np.where(np.isfinite(each), each.round(4), np.nan)[::every] for each in rates)
         return Predictions(self.start[::every], self.horizons, *rates)
 
 

@@ -1,17 +1,17 @@
 """Signals over time that a result keeps of its flights, so that its page can be drawn again."""
 
-from typing import NamedTuple
-
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._custom_types import Arrays
 from ..flight import POSITION
 from ..models.state import CASCADE_ORDER
 from .evaluation import Evaluation
 from .frequency_response import significant
 
 
-class Traces(NamedTuple):
+class Traces(Arrays, frozen=True, eq=False):
     """Signals of the fitted flights. Channels are in cascade order: p, q, r, phi, theta, psi, then x, vx, y, vy, z, vz.
 
     - `time`, `log`: of each sample, its time in its log [s] and the number of its log.
@@ -38,7 +38,7 @@ class Traces(NamedTuple):
         blocks = np.arange(self.time.size) // every
         apart = self.log != self.log[::every][blocks]  # a block has the values of one log
         fewer = {"log": self.log[::every]}
-        for name, values in self._asdict().items():
+        for name, values in msgspec.structs.asdict(self).items():
             if values.ndim == 2:
                 rows = ((0, -len(values) % every), (0, 0))  # the last block may be shorter
                 padded = np.pad(np.where(apart[:, None], np.nan, values), rows, constant_values=np.nan)
@@ -47,7 +47,7 @@ class Traces(NamedTuple):
                 first = np.take_along_axis(cut, known.argmax(axis=1)[:, None], axis=1)[:, 0]
                 fewer[name] = significant(np.where(known.any(axis=1), first, np.nan), digits)
         times = {"time": self.time[::every].round(digits), "start_time": self.start_time.round(digits)}
-        return self._replace(**fewer | times)
+        return msgspec.structs.replace(self, **fewer | times)
 
 
 def os4_traces(found: Evaluation) -> Traces:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._custom_types import Positive
 from .._version import __version__
 from ..airframe import PRESETS, Airframe
 from ..recording.checks import Finding
@@ -62,7 +63,7 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
     windows: int | msgspec.UnsetType = msgspec.UNSET
     samples: int | msgspec.UnsetType = msgspec.UNSET
     terms: list[str] | msgspec.UnsetType = msgspec.UNSET
-    sample_time: float
+    sample_time: Positive
     fitted_seconds: float | msgspec.UnsetType = msgspec.UNSET
     tested_seconds: float | msgspec.UnsetType = msgspec.UNSET
     battery_voltage: float | msgspec.UnsetType = msgspec.UNSET

@@ -4,6 +4,7 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array
 
@@ -100,7 +101,7 @@ def vehicle_traces(
     if (parts := optimum.estimate.parts) is not None:
         # Of the innovations of the likelihood itself, which is exact for means.
         products = np.asarray(parts.products).sum(axis=0)[:3]
-        crossed = crossed._replace(own=products[:, 1:] / np.maximum(products[:, :1], 1.0))
+        crossed = msgspec.structs.replace(crossed, own=products[:, 1:] / np.maximum(products[:, :1], 1.0))
     return traces.thinned(), crossed
 
 

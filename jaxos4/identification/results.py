@@ -4,8 +4,10 @@ import math
 from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import msgspec
+import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from .._custom_types import NotNegative, Positive
 from ..airframe import Airframe, airframe_table
 from ..analysis.diagnostics import Correlations
 from ..analysis.frequency_response import FrequencyResponse
@@ -15,7 +17,7 @@ from ..estimate import Estimate
 from ..results import result_names
 from ..shooting import ShootingProblem
 from .data import Provenance
-from .tables import dataframe, dataset, series
+from .tables import dataframe, dataset
 from .verdict import Doubt, Verdict
 
 if TYPE_CHECKING:
@@ -51,7 +53,7 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     """
 
     estimate: float | None
-    std: float | None
+    std: NotNegative | None
     bound: float | None
     ci95: tuple[float, float] | None
     unit: str
@@ -72,7 +74,7 @@ class Constant(msgspec.Struct, frozen=True):
     """A physical constant that follows from the parameters. `note`: what of the airframe must be right (vehicle)."""
 
     estimate: float
-    std: float
+    std: NotNegative
     unit: str
     note: str | msgspec.UnsetType = msgspec.UNSET
 
@@ -105,7 +107,7 @@ class ChannelFit(msgspec.Struct, frozen=True):
     rms: float
     unit: str
     percent: float | None
-    level: float
+    level: NotNegative
     level_p: float
     correlation: float
     white_p: float
@@ -148,10 +150,10 @@ class Disturbance(msgspec.Struct, frozen=True):
     - `smoothing`: the time constant of the low-pass filter through which the disturbance of a specific force acts [s].
     """
 
-    strength: float
+    strength: NotNegative
     unit: str
-    time_constant: float
-    sensor: float
+    time_constant: Positive
+    sensor: NotNegative
     correlation: float
     smoothing: float | None = None
 
@@ -167,7 +169,7 @@ class SampleTime(msgspec.Struct, frozen=True):
     - `correlation`: the largest of the innovations of a body rate. `samples`: how many innovations of a rate count.
     """
 
-    sample_time: float
+    sample_time: Positive
     constants: dict[str, Constant]
     correlation: float
     samples: int
@@ -295,9 +297,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         apart = APART | (_OF_OS4 if self.is_vehicle else _OF_VEHICLES)
         fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
         fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
-        arrays = (*ARRAYS[:2], *ARRAYS[2:] * self.is_vehicle)
-        fields |= {name: series(getattr(self, name)) for name in arrays}
-        return msgspec.to_builtins(fields)
+        if self.response is not None:
+            fields["response"] = self.response._asdict()
+        return msgspec.to_builtins(fields, enc_hook=_as_list)
 
     def summary(self, *, verbose: bool = False, width: int = 80) -> str:
         """The text of `jaxos4 estimate` on a terminal of this width [columns]. `verbose`: with all parameters."""
@@ -343,9 +345,15 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return dataset(*parts, sample_time=step, **about)
 
 
-ARRAYS = ("traces", "correlations", "predictions", "trajectories", "response")
-"""Fields that are arrays by name; those after the second of a vehicle only."""
-APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle", *ARRAYS}
+def _as_list(array: np.ndarray) -> list[Any]:
+    """An array as a list; `None` for what is not finite."""
+    values = array.astype(object)
+    values[~np.isfinite(array)] = None
+    return values.tolist()
+
+
+APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle"}
 """Fields that a file holds in another form, or not at all."""
 _OF_OS4 = {"fit", "validation"}  # and those of a vehicle: written of this kind only
 _OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}
+_OF_VEHICLES |= {"predictions", "trajectories", "response"}

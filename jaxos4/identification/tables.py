@@ -1,4 +1,4 @@
-"""A result in other forms: arrays as plain lists, a pandas DataFrame, an xarray Dataset."""
+"""A result as a pandas DataFrame, and as an xarray Dataset."""
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -18,17 +18,6 @@ if TYPE_CHECKING:
 
 _COLUMNS = ("kind", "unit", "estimate", "std", "low", "high", "bound", "note")
 _NONE = (None, None)
-
-
-def series(value: Any) -> Any:
-    """A named tuple of arrays as dictionaries and lists; `None` for what is not finite."""
-    if value is None:
-        return None
-    if hasattr(value, "_asdict"):
-        return {name: series(each) for name, each in value._asdict().items()}
-    found = np.asarray(value).astype(object)
-    found[~np.isfinite(value)] = None
-    return found.tolist()
 
 
 def dataframe(constants: Mapping[str, Any], parameters: Mapping[str, Any], fixed: Mapping[str, Any]) -> "pd.DataFrame":

@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 import msgspec
 import numpy as np
 
-from .._custom_types import RotorSpeeds, as_float
+from .._custom_types import NotNegative, Positive, RotorSpeeds, as_float
 from .._files import read_toml
 from ..airframe import PRESETS, Airframe, airframe_from_table
-from ..errors import InputError, in_words, named
+from ..errors import InputError, in_words, named, of_schema, shortened
 from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
 from ..models import MODELS
@@ -25,8 +25,6 @@ from ..networks import NetworkEstimator
 from ..noise import NOISES
 from ..simulation import METHODS
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Speeds = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
@@ -234,8 +232,8 @@ def load_study(path: Path) -> Study:
         study.check_excitations()
     except (InputError, msgspec.ValidationError, RecursionError) as error:
         in_our_words = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
-        what = in_words(error, 300)
-        raise InputError(f"{path}: {what}" if in_our_words else f"{path}: {_translated(what)}; correct it.") from None
+        what = in_words(error, 300) if in_our_words else f"{shortened(_translated(error), 300)}; correct it."
+        raise InputError(f"{path}: {what}") from None
     return study
 
 
@@ -253,18 +251,16 @@ def _inputs(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     return {"input": files | read}
 
 
-def _translated(message: str) -> str:
-    """A message of msgspec with the key first, types in the words of TOML, and the choices last."""
-    complaint, _, place = message.partition(" - at `$")
-    key = place.strip(".`")
-    words = {"object": "a table", "array": "a list", "int": "a whole number"}
-    for kind, word in (words | {"float": "a number", "str": "a string", "bool": "true or false"}).items():
-        complaint = complaint.replace(f"`{kind}`", word)
+def _translated(error: Exception) -> str:
+    """A message of msgspec, with the choices if a key or a value is unknown."""
+    message = of_schema(error)
+    key = message.partition("`: ")[0].strip("`") if message.startswith("`") else ""
     known = Training if key.startswith("network") else Study
-    if complaint.startswith("Object contains unknown field "):
+    complaint = message.removeprefix(f"`{key}`: ")
+    if complaint.lower().startswith("object contains unknown field "):
         where = f"[{key}]: " if key else ""
         return f"{where}unknown key {complaint.rsplit(' ', 1)[1]}; choose from {', '.join(known.__struct_fields__)}"
-    if complaint.startswith("Invalid enum value "):
+    if complaint.startswith("invalid enum value "):
         choices = get_args(get_type_hints(known)[key.removeprefix("network.")])
-        return f"`{key}`: unknown {complaint.removeprefix('Invalid enum value ')}; choose from {', '.join(choices)}"
-    return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}" if key else complaint
+        return f"`{key}`: unknown {complaint.removeprefix('invalid enum value ')}; choose from {', '.join(choices)}"
+    return message

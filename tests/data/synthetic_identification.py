@@ -134,7 +134,7 @@ def behind_an_estimate() -> dict:
     flown = synthetic_traces(time, np.zeros(400, int), np.sin(time[:, None] * np.arange(1, 13)))
     path = np.stack([np.sin(time), np.cos(time), time], axis=1)
     predicted = flown.measured + 0.01 * rng.normal(size=(400, 12))
-    traces = flown._replace(predicted=predicted, disturbance=flown.measured[:, :0], position=path)
+    traces = msgspec.structs.replace(flown, predicted=predicted, disturbance=flown.measured[:, :0], position=path)
     torques, noise = rng.normal(size=(400, 3)), rng.normal(size=(400, 12))
     noise[5:, 1] = 0.5 * torques[:-5, 2]  # q follows the yaw torque
     rows = {name: msgspec.structs.replace(KNOWN, bracket=(5e4, 6e4)) for name in ("alpha3", "alpha6")}
@@ -148,4 +148,4 @@ def vehicle_traces(start=None) -> Traces:
     time = 0.025 * np.arange(400)
     measured = np.where(time[:, None] < 3.5, np.sin(3 * time[:, None]), np.nan) * np.ones(3)
     found = synthetic_traces(time, np.zeros(400, int), measured)
-    return found._replace(start_time=0.004 * start, start_log=np.zeros(start.size, int)).thinned()
+    return msgspec.structs.replace(found, start_time=0.004 * start, start_log=np.zeros(start.size, int)).thinned()
