@@ -8,9 +8,13 @@ from typing import Any, get_type_hints
 import msgspec
 import numpy as np
 
+from ._custom_types import Arrays
 from ._files import read_json
 from .airframe import airframe_from_table
-from .analysis.frequency_response import FrequencyResponse
+from .analysis.diagnostics import Correlations
+from .analysis.frequency_response import AxisResponse, FrequencyResponse
+from .analysis.prediction import Predictions
+from .analysis.traces import Traces
 from .errors import InputError, named, of_schema, shortened
 from .identification.results import APART, Constant, Identification, RigidBody
 from .models.state import CHANNELS
@@ -22,8 +26,8 @@ _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a nu
 _ALWAYS = {True: ("terms", "fitted_seconds"), False: ("channels", "windows")}  # of a vehicle's provenance, and an OS4's
 _EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
 
+_ARRAYS = {"traces": Traces, "correlations": Correlations, "predictions": Predictions, "trajectories": Predictions}
 _FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
-_Response = msgspec.defstruct("_Response", [*get_type_hints(FrequencyResponse).items()])
 # The fields of a file: those of an `Identification`, with what has another form there.
 _File = msgspec.defstruct(
     "_File",
@@ -31,11 +35,12 @@ _File = msgspec.defstruct(
         *(
             (field.name, field.type, _FIELD(default=field.default, default_factory=field.default_factory))
             for field in msgspec.structs.fields(Identification)
-            if field.name not in APART
+            if field.name not in {*APART, *_ARRAYS, "response"}
         ),
         ("constants", dict[str, Constant | float | bool]),
         ("airframe", dict[str, Any] | None),
-        ("response", _Response | None, None),
+        *((name, dict[str, Any] | None, None) for name in _ARRAYS),
+        ("response", dict[str, dict[str, Any]] | None, None),
     ],
     kw_only=True,
 )
@@ -50,7 +55,7 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
     value = read_json(path, _REMEDY, _LARGEST)
     with named(path):
         try:
-            fields = msgspec.structs.asdict(msgspec.convert(value, _File, dec_hook=_as_array))
+            fields = msgspec.structs.asdict(msgspec.convert(value, _File))
         except msgspec.ValidationError as error:
             raise InputError(f"not a result: {shortened(of_schema(error), 200)}; {_REMEDY}.") from None
         constants, tests = {}, {}
@@ -63,26 +68,34 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
             "rigid_body": RigidBody(constants, tests.pop("consistency_p", None), tests.pop("rigid_body", None)),
             "is_vehicle": fields["model"] == "flight",
         }
-        if fields["response"] is not None:
-            fields["response"] = FrequencyResponse(*msgspec.structs.astuple(fields["response"]))
+        fields |= {
+            name: _arrays(kind, fields[name], name) for name, kind in _ARRAYS.items() if fields[name] is not None
+        }
+        if (axes := fields["response"]) is not None:
+            names = FrequencyResponse._fields
+            own = (_arrays(AxisResponse, axes.get(name, {}), f"response.{name}") for name in names)
+            fields["response"] = FrequencyResponse(*own)
         found = Identification(**fields)
         if problem := next(_problems(found, tests), None):
             raise InputError(f"{problem}; {_AGAIN}")
     return found
 
 
-def _as_array(kind: Any, value: Any) -> np.ndarray:
-    """A list of numbers as an array of this kind; a missing number is NaN, or -1 among whole ones."""
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError("is not an array of numbers") from None
-    if "float64" in kind.dtypes:
-        return array
-    whole = np.nan_to_num(array, nan=-1.0)
-    if (whole % 1).any():
-        raise ValueError("is not an array of whole numbers")
-    return whole.astype(int)
+def _arrays(kind: type[Arrays], table: dict[str, Any], place: str) -> Any:
+    """Arrays from lists of numbers by name. A missing number is NaN; whole numbers may not be missing."""
+    fields = {}
+    for name, hint in get_type_hints(kind).items():
+        try:
+            array = np.array(table[name], dtype=float)
+            fields[name] = array.item() if hint is float else array
+            if "int64" in getattr(hint, "dtypes", ()):
+                fields[name] = np.where(np.abs(array) < 1 << 40, array, -1).astype(int)
+                if (fields[name] != array).any():
+                    raise ValueError
+        except (LookupError, TypeError, ValueError):
+            raise InputError(f"`{place}.{name}`: is not an array of numbers; {_AGAIN}") from None
+    with named(f"`{place}`"):
+        return kind(**fields)
 
 
 def vehicle_result(found: Identification | str | os.PathLike[str]) -> Identification:
@@ -134,7 +147,7 @@ def _problems_of_signals(found: Identification) -> Iterator[str]:
     for name in ("predictions", "trajectories"):
         if (one := getattr(found, name)) is None:
             continue
-        usable = one.start.size and one.horizons.size and one.start[0] >= 0 and one.start[-1] < 1 << 40
+        usable = one.start.size and one.horizons.size and one.start[0] >= 0
         if not (usable and (np.diff(one.start) > 0).all() and (one.horizons > 0).all()):
             yield f"`{name}`: starts must increase, and horizons be positive"
     if (paths := found.trajectories) is not None:

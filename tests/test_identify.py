@@ -13,7 +13,6 @@ from px4_logs import everything
 from sign_flights import flown, turned
 
 import jaxos4
-from jaxos4.cli._shared import in_options
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
@@ -73,19 +72,19 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 VEHICLE = "flight1.csv --airframe airframe.toml"
 BIASED = [name for name, kind in ESTIMATORS.items() if not kind.in_closed_loop]
 REFUSED = {
-    f"{VEHICLE} --terms wings": "--terms: knows no `wings`",
+    f"{VEHICLE} --terms wings": "`terms`: knows no `wings`",
     f"{VEHICLE} --model flight --terms velocity": "did not measure",
-    f"{VEHICLE} --model flight --sample-time 0.001": "--sample-time",
-    f"{VEHICLE} --model flight --from 5 --to 4": "--from",
+    f"{VEHICLE} --model flight --sample-time 0.001": "`sample_time`",
+    f"{VEHICLE} --model flight --begin 5 --end 4": "`begin`",
     f"{VEHICLE} --model flight --from 50": "fewer than two samples",
-    **{f"{VEHICLE} --estimator {name}": f"--estimator {name}: is biased by a controller" for name in BIASED},
-    f"{VEHICLE} --model published --terms offset": "--terms",
-    f"{VEHICLE} --model published --from 1": "--from",
-    f"flight2.csv {VEHICLE} --model corrected": "--model flight for several",
+    **{f"{VEHICLE} --estimator {name}": f"`estimator` {name}: is biased by a controller" for name in BIASED},
+    f"{VEHICLE} --model published --terms offset": "`terms`",
+    f"{VEHICLE} --model published --begin 1": "`begin`",
+    f"flight2.csv {VEHICLE} --model corrected": "several need an airframe and the model flight",
     f"flight1.csv {VEHICLE} --model flight": "given twice",
     f"{VEHICLE} --model flight --validate flight1.csv": "is fitted",
     f"speeds2.csv {VEHICLE} --model flight": "some of these logs hold commands",
-    f"{VEHICLE} --model flight --validate flight2.csv --holdout 0.2": "--holdout: --validate is predicted instead",
+    f"{VEHICLE} --model flight --validate flight2.csv --holdout 0.2": "`holdout`: `validate` is predicted instead",
     f"{VEHICLE} --model flight --validate rare2.csv": "nothing is long enough to be predicted 0.5 s ahead",
     "flight1.csv": "flight1.csv has commands, not rotor speeds: a real vehicle needs --airframe; `jaxos4 inspect",
     "speeds1.csv --model flight": "--model flight: a real vehicle needs --airframe; `jaxos4 inspect",
@@ -282,8 +281,8 @@ def test_wrong_combinations_are_refused_in_one_line(flight, subject, options, sa
 @pytest.mark.parametrize(
     ("subject", "options", "said"),
     [
-        (MODEL, {"terms": ("offset",)}, "`terms`: is for an `Airframe` as `subject`, not for the published model"),
-        (MODEL, {"begin": 1.0, "channels": "rates"}, "`begin`: is for an `Airframe`"),
+        (MODEL, {"terms": ("offset",)}, "`terms`: is for a real vehicle, not for the published model"),
+        (MODEL, {"begin": 1.0, "channels": "rates"}, "`begin`: is for a real vehicle"),
         (OS4, {"channels": "rates"}, "`channels`: a vehicle is identified from its rates"),
         (OS4, {"window": 0.25}, "`window`: a vehicle is identified from its rates"),
         (OS4, {"initial_state": "known"}, "`initial_state` known: a vehicle's filters find their own"),
@@ -294,9 +293,3 @@ def test_options_become_settings_of_their_own_kind(subject, options, said):
         settings_for(subject, options)
     kind = OF_FLIGHT if subject is MODEL else OF_VEHICLE
     assert settings_for(subject, dict.fromkeys(options) | {"initial_state": "free"}) == kind()
-
-
-def test_messages_name_options_on_the_command_line():
-    text = "flight.csv: `begin` 3: `initial_state` free, `bracket`: knows no `alpha9`; an `Airframe` as `subject`."
-    said = "flight.csv: --from 3: --initial-state free, --bracket b.toml: knows no `alpha9`; --model flight."
-    assert in_options(text, bracket=Path("b.toml")) == said

@@ -146,7 +146,7 @@ DAMAGES = [
     (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
     (("response", "roll", "phase"), [1.0], "`response.roll`: `phase` has another shape"),
     (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),
-    (("response", "yaw"), {}, "`response.yaw`: object missing required field `frequency`"),
+    (("response", "yaw"), {}, "`response.yaw.frequency`: is not an array"),
     (("traces", "start_time"), [0.1], "`traces"),
     (("traces", "log", 0), 7, "`traces`: is of a log that has no name"),
     (("traces", "time", 3), None, "`traces`: a time is missing"),

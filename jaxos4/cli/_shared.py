@@ -1,4 +1,4 @@
-"""Shared by the commands: values of options, checks of them, progress, messages in the words of options, and files."""
+"""Shared by the commands: values of options, checks of them, progress, and files."""
 
 import contextlib
 import errno
@@ -23,39 +23,10 @@ from .._files import check_writable, read_json, read_toml, write_file
 from ..errors import InputError, printable
 from ..estimators import ESTIMATORS
 
-_ARGUMENTS = ("angle", "bandwidth", "bracket", "channels", "criterion", "distance", "dt", "duration", "estimator")
-_ARGUMENTS += ("fastest", "gust", "holdout", "horizon", "inertia_z", "initial_state", "network", "rate", "sample_time")
-_ARGUMENTS += ("samples", "seed", "slew", "slowest", "spacing", "terms", "validate", "velocity", "window")
-OPTIONS = {
-    "an `Airframe` as `subject`": "--model flight",
-    "`subject`": "--model",
-    "`begin`": "--from",
-    "`end`": "--to",
-    **{f"`{name}`": f"--{name.replace('_', '-')}" for name in _ARGUMENTS},
-}
-"""Options by the library's arguments, which stand in backticks in its messages."""
-
-
-def in_options(text: str, **files: Path | None) -> str:
-    """A message with options for the library's arguments. `files`: names of files to print behind an option."""
-    for argument, option in OPTIONS.items():
-        path = files.get(argument.strip("`"))
-        text = text.replace(argument, option if path is None else f"{option} {path}")
-    return text
-
 
 def command() -> str:
     """The command line as the user can repeat it."""
     return printable(shlex.join(["jaxos4", *sys.argv[1:]]))
-
-
-@contextlib.contextmanager
-def option_names(**files: Path | None) -> Iterator[None]:
-    """Raises an `InputError` of the library again, in the words of the command line. `files`: see `in_options`."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(in_options(str(error), **files)) from None
 
 
 PERIOD = 10.0  # s; between lines of progress
@@ -220,8 +191,7 @@ def check_sizes(asked: dict[str, Any], *, most: float = 1e9) -> None:
     for name, given in asked.items():
         for value in given if isinstance(given, tuple) else (given,):
             if name != "seed" and isinstance(value, int | float) and not math.isnan(value) and abs(value) > most:
-                option = OPTIONS.get(f"`{name}`", f"--{name.replace('_', '-')}")
-                raise InputError(f"{option}: must lie within +-{most:g}, got {value:.6g}.")
+                raise InputError(f"--{name.replace('_', '-')}: must lie within +-{most:g}, got {value:.6g}.")
 
 
 def check_seed(seed: int) -> int:

@@ -12,7 +12,7 @@ import jaxos4
 
 from ..errors import InputError, named, printable
 from . import _shared as options
-from ._shared import check_outputs, command, end, in_options, option_names, stages, write_json
+from ._shared import check_outputs, command, end, stages, write_json
 
 _OS4, _PUBLISHED = "os4", "published"
 # The defaults of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
@@ -40,8 +40,8 @@ def estimate(
     ] = None,
     validate: Annotated[Path | None, Option(help="Another flight: not fitted, but predicted.")] = None,
     terms: Annotated[str | None, Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")] = None,
-    begin: Annotated[float | None, Option("--from", help="Real vehicle: use the logs from this time on [s].")] = None,
-    end: Annotated[float | None, Option("--to", help="Real vehicle: use the logs up to this time [s].")] = None,
+    begin: Annotated[float | None, Option("--begin", "--from", help="Real vehicle: first time to use [s].")] = None,
+    end: Annotated[float | None, Option("--end", "--to", help="Real vehicle: last time to use [s].")] = None,
     sample_time: Annotated[float | None, Option(help="Real vehicle: the sample time to average to [s].")] = None,
     holdout: Annotated[float | None, Option(help="Real vehicle: the share to predict; default: 0.25.")] = None,
     report: Annotated[Path | None, Option(help="An HTML report to write.")] = None,
@@ -58,7 +58,9 @@ def estimate(
     listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
     asked = {"channels": channels, "initial_state": initial_state, "window": window}
     asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
-    with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
+    with stages("loading the library") as progress:
+        from msgspec.structs import replace
+
         from ..identification import settings_for
         from ..recording import read_recording
 
@@ -80,7 +82,11 @@ def estimate(
             validate=None if validate is None else read_recording(validate, vehicle, columns=columns),
             progress=progress,
         )
-    _publish(_with_command(found, airframe or _OS4, evidence), out, report, verbose=verbose)
+    taken = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
+    notes = [*taken, *found.provenance.notes]
+    asked = {"airframe": printable(airframe or _OS4), "notes": notes, "command": command()}
+    found = replace(found, provenance=replace(found.provenance, **asked))
+    _publish(found, out, report, verbose=verbose)
 
 
 def _subject(
@@ -97,25 +103,6 @@ def _subject(
         begin_one = f"`jaxos4 inspect {shlex.quote(recordings[0].name)} --airframe-out mine.toml` begins one"
         raise InputError(f"{evidence or '--model flight'}: a real vehicle needs --airframe; {begin_one}.")
     return vehicle, evidence
-
-
-def _with_command(found: "jaxos4.Identification", airframe: str, evidence: str) -> "jaxos4.Identification":
-    """The identification with its command; notes, doubts and verdicts in the words of the command line."""
-    import msgspec
-
-    notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
-    provenance = msgspec.structs.replace(
-        found.provenance,
-        airframe=printable(airframe),
-        notes=[*notes, *(in_options(note) for note in found.provenance.notes)],
-        command=command(),
-    )
-    doubts = (msgspec.structs.replace(doubt, remedy=in_options(doubt.remedy)) for doubt in found.doubts)
-    verdicts = {
-        name: msgspec.structs.replace(verdict, reasons=tuple(map(in_options, verdict.reasons)))
-        for name, verdict in found.verdicts.items()
-    }
-    return msgspec.structs.replace(found, doubts=tuple(doubts), verdicts=verdicts, provenance=provenance)
 
 
 def _publish(found: "jaxos4.Identification", out: Path | None, report: Path | None, *, verbose: bool) -> None:
@@ -176,7 +163,7 @@ def train(
         subject = MODELS[model](jaxos4.load_airframe(airframe))
         recording = read_recording(flight, subject.airframe)
     begin = time.perf_counter()
-    with stages("training the network"), option_names(bracket=bracket):
+    with stages("training the network"):
         network = train_network(
             recording,
             subject,

@@ -16,9 +16,7 @@ from ._shared import (
     check_folder,
     check_outputs,
     end,
-    in_options,
     json_text,
-    option_names,
     stages,
     write_folder,
     write_json,
@@ -53,7 +51,7 @@ def export(
     check_outputs(result, out=out if folder is None else None)
     if folder is not None:
         check_folder(folder)
-    with stages("loading the library") as progress, option_names():
+    with stages("loading the library") as progress:
         from ..export import TARGETS, export_vehicle, read_result
 
         target = TARGETS[to]
@@ -99,7 +97,7 @@ def predict(
     Compares the errors with those of constant rates and of a regression.
     """
     check_outputs(result, flight, columns, out=out, json=json, figure=figure)
-    with stages("loading the library") as progress, option_names():
+    with stages("loading the library") as progress:
         from ..recording import read_recording
 
         if out is not None:
@@ -119,7 +117,7 @@ def predict(
     from rich.console import Console
 
     console = Console()
-    jaxos4.report.print_prediction(console, found._replace(notes=tuple(in_options(note) for note in found.notes)))
+    jaxos4.report.print_prediction(console, found)
     for path in filter(None, (out, json, figure)):
         console.print(f"written: {path}", markup=False, highlight=False)
     end(vehicle.result)

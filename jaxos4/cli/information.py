@@ -10,7 +10,7 @@ import jaxos4
 from .._files import write_file
 from ..errors import InputError
 from . import _shared as options
-from ._shared import check_outputs, command, in_options, option_names, stages, write_json
+from ._shared import check_outputs, command, stages, write_json
 
 
 def inspect(
@@ -58,7 +58,7 @@ def inspect(
         write_file(airframe_out, text)
     if report is not None:
         with stages("drawing"):
-            jaxos4.report.write_log_page(report, recording, vehicle, found=found, command=command(), words=in_options)
+            jaxos4.report.write_log_page(report, recording, vehicle, found=found, command=command())
     print_inspection(console, found, recording.facts.format.label if recording.facts.format else "")
     if report is not None:
         console.print(f"report: {report}", soft_wrap=True)
@@ -82,7 +82,7 @@ def identifiability(
     Says for each of the others (alpha_1..8) why not.
     """
     check_outputs(flight, airframe, bracket, out=out)
-    with stages("loading the library") as progress, option_names(bracket=bracket):
+    with stages("loading the library") as progress:
         from rich.console import Console
 
         from ..models import MODELS

@@ -13,7 +13,7 @@ import jaxos4
 
 from ..errors import InputError, named
 from . import _shared as options
-from ._shared import check_outputs, end, option_names, stages
+from ._shared import check_outputs, end, stages
 
 OpenLoopModelOption = Annotated[options.Model | None, Option(help="Equations of motion. Default: published.")]
 DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
@@ -196,7 +196,7 @@ def design(
         asked["gust"] = gust  # that of the result, if none is given
     check_outputs(result, None if result else airframe, bracket, out=out, figure=figure)
     begin = time.perf_counter()
-    with stages("loading the library") as progress, option_names(bracket=bracket):
+    with stages("loading the library") as progress:
         found = _find(asked, progress)
         progress("writing")
         found.task.write(found.designed, out)

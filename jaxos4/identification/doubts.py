@@ -71,7 +71,7 @@ def coloured(fit: Mapping[str, ChannelFit], quantities: Iterable[str]) -> Iterat
         yield reservation(
             f"the residuals of {', '.join(channels)} are not white (neighbours correlate by up to "
             f"{max(channels.values()):.2g}): the model does not explain the flight, or the noise is coloured",
-            "check the scales, the axes and the time stamps of the log, or use another `subject`",
+            "check the scales, the axes and the time stamps of the log, or use another model",
             dict.fromkeys(quantities),
         )
 

@@ -78,7 +78,7 @@ def prepare_os4(
     subject = class_name(model, MODELS)
     if others:
         raise InputError(
-            f"{others[0].name}: `subject` {subject} explains one flight; use an `Airframe` as `subject` for several."
+            f"{others[0].name}: the {subject} model explains one flight; several need an airframe and the model flight."
         )
     name, kind, trained = _method("ibss" if estimator is None else estimator, settings, network)
     if trained is not None and not kind.shoots and bracket is not None:

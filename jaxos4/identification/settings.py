@@ -59,7 +59,7 @@ def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> 
         if name in own or (name, given[name]) == ("initial_state", "free"):
             continue
         if kind is FlightSettings:
-            why = f"is for an `Airframe` as `subject`, not for the {class_name(subject, MODELS)} model"
+            why = f"is for a real vehicle, not for the {class_name(subject, MODELS)} model"
         elif name == "initial_state":
             raise InputError(f"`initial_state` {given[name]}: a vehicle's filters find their own state; leave it out.")
         else:

@@ -1,7 +1,7 @@
 """The page of a log, before anything is fitted: `jaxos4 inspect --report`. It needs no other file."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,14 +62,12 @@ def write_log_page(
     *,
     found: Inspection | None = None,
     command: str = "",
-    words: Callable[[str], str] = str,
     rules: PageRules = RULES,
 ) -> None:
     """Writes the page of a log, completely or not at all.
 
     - `log`: a recording, or the path of a log. `airframe`: of its vehicle; without it, torques are unknown.
     - `found`: of `inspect_log`, if it was computed before. `command`: that makes the page again.
-    - `words`: of messages that name an argument of the library, as the user gives it.
 
     **Raises:** `OSError` if the page cannot be written; `InputError` if the log cannot be read.
     """
@@ -95,7 +93,7 @@ def write_log_page(
         verdict=verdict(found),
         signals=shown,
         block=1e3 * recording.dt * block if block > 1 else None,
-        fitted=words(fitted(recording, airframe)),
+        fitted=fitted(recording, airframe),
         measured=[
             (name, unit_of(name, recording.commanded and full == 1), one) for name, one in found.measured.items()
         ],
