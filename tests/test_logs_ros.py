@@ -31,8 +31,8 @@ from recorded_logs import (
 from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
-from jaxos4.logs import log_format, read_log, read_recording
-from jaxos4.logs.compression import Limits, check_parts, check_sizes
+from jaxos4.logs import compression, log_format, read_log, read_recording
+from jaxos4.logs.compression import check_parts, check_sizes
 
 pytest.importorskip("rosbags", reason="reading a ROS bag needs rosbags")
 import lz4.frame  # noqa: E402
@@ -287,22 +287,25 @@ def test_a_small_file_does_not_fill_the_memory(kind, tmp_path):
     check_parts("bag", [("zstd", zstd.compress(bytes(1 << 20))), ("zstd", b"damaged"), ("", bytes(9)), ("none", b"")])
 
 
-def test_a_file_that_is_compressed_as_a_whole_may_be_larger(tmp_path):
+def test_a_file_that_is_compressed_as_a_whole_may_be_larger(tmp_path, monkeypatch):
     """`ros2 bag record --compression-mode file`: 300 MB, in memory a megabyte at a time."""
     name, content = bomb("folder zstd")
     (tmp_path / name).write_bytes(content)
     tracemalloc.start()
     check_sizes(tmp_path)
+    monkeypatch.setattr(compression, "MAX_FILE", 1 << 20)
     with pytest.raises(InputError, match=r"has more than 1,048,576 bytes when it is decompressed; record it again"):
-        check_sizes(tmp_path, limits=Limits(file=1 << 20))
+        check_sizes(tmp_path)
     assert tracemalloc.get_traced_memory()[1] < 30 << 20
     tracemalloc.stop()
     # Pieces that end anywhere in a frame are joined.
     noise = np.random.default_rng(0).bytes(3 << 20)
     (tmp_path / name).write_bytes(2 * zstd.compress(noise))
-    check_sizes(tmp_path, limits=Limits(file=6 << 20))
+    monkeypatch.setattr(compression, "MAX_FILE", 6 << 20)
+    check_sizes(tmp_path)
+    monkeypatch.setattr(compression, "MAX_FILE", (6 << 20) - 1)
     with pytest.raises(InputError, match="6,291,455"):
-        check_sizes(tmp_path, limits=Limits(file=(6 << 20) - 1))
+        check_sizes(tmp_path)
 
 
 def record(kind, content):
@@ -315,23 +318,24 @@ def test_an_mcap_that_is_compressed_as_a_whole_is_decompressed_once(tmp_path, mo
     for name in ("ZstdFile", "ZstdDecompressor"):
         usual = getattr(zstd, name)
         monkeypatch.setattr(zstd, name, lambda *given, usual=usual: made.append(usual) or usual(*given))
-    limits = Limits(part=1 << 20, file=8 << 20)
+    monkeypatch.setattr(compression, "MAX_PART", 1 << 20)
+    monkeypatch.setattr(compression, "MAX_FILE", 8 << 20)
     chunk = struct.pack("<QQQIIQ", 0, 1, 1 << 19, 0, 0, 1 << 19) + bytes(1 << 19)
     parts = {"chunks": 3 * record(6, chunk), "a large attachment": record(9, bytes(4 << 20)) + record(6, chunk)}
     for name, content in parts.items():
         (tmp_path / "flight.mcap.zstd").write_bytes(zstd.compress(b"\x89MCAP0\r\n" + content))
         made.clear()
-        check_sizes(tmp_path, limits=limits)
+        check_sizes(tmp_path)
         assert len(made) == 1, name
     large = {"chunk": record(6, chunk[:40] + bytes(2 << 20)), "message": record(6, chunk) + record(5, bytes(2 << 20))}
     for content in large.values():
         (tmp_path / "flight.mcap.zstd").write_bytes(zstd.compress(b"\x89MCAP0\r\n" + content))
         with pytest.raises(InputError, match="holds a part of more than 1,048,576 bytes"):
-            check_sizes(tmp_path, limits=limits)
+            check_sizes(tmp_path)
     for content in (record(9, bytes(9 << 20)), struct.pack("<BQ", 9, (1 << 64) - 1) + bytes(9 << 20)):
         (tmp_path / "flight.mcap.zstd").write_bytes(zstd.compress(b"\x89MCAP0\r\n" + content))
         with pytest.raises(InputError, match="has more than 8,388,608 bytes when it is decompressed"):
-            check_sizes(tmp_path, limits=limits)
+            check_sizes(tmp_path)
 
 
 @pytest.mark.slow

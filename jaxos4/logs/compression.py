@@ -6,35 +6,21 @@ import struct
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path as FilePath
-from typing import IO, Any, NamedTuple, NoReturn
+from typing import IO, Any, NoReturn
 
 from ..errors import InputError
 from .table import Path, opened, refuse
 
-
-class Limits(NamedTuple):
-    """The largest sizes after decompression [bytes].
-
-    - `part`: of a chunk or a message, in memory. Recorders write about a megabyte; a bomb has gigabytes.
-    - `file`: of a file that is compressed as a whole, on the disk. A bag of an hour has a few gigabytes.
-    - `times`, `small`: such a file may be so many times as large as it was, or `small`. Bags shrink 2 to 20 times.
-    - `metadata`: of metadata.yaml, whose parser takes 14 s for a megabyte. A topic has about a kilobyte in it.
-    """
-
-    part: int = 1 << 28
-    file: int = 1 << 34
-    times: int = 100
-    small: int = 1 << 29
-    metadata: int = 1 << 19
-
-
-LIMITS = Limits()
+MAX_PART = 1 << 28  # bytes of a chunk or a message, in memory; recorders write about a megabyte, a bomb has gigabytes
+MAX_FILE = 1 << 34  # bytes, on the disk, of a file compressed as a whole; a bag of an hour has a few gigabytes
+MAX_TIMES, SMALL = 100, 1 << 29  # such a file may grow so many times, or to so many bytes; bags shrink 2 to 20 times
+MAX_METADATA = 1 << 19  # bytes of metadata.yaml, whose parser takes 14 s for a megabyte; a topic has about a kilobyte
 _STEP = 1 << 20  # bytes that are decompressed at a time
 _MCAP, _CHUNK_OF_MCAP, _ATTACHMENT_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, 9, b"\x05"
 
 
-def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
-    """Raises `InputError` for a bag, file or folder, that decompresses to more than `limits`. Readers report damage.
+def check_sizes(path: Path) -> None:
+    """Raises `InputError` for a bag, file or folder, that is too large when it is decompressed. Readers report damage.
 
     What is in a folder must be files: a pipe or a device has no end.
     """
@@ -45,37 +31,37 @@ def check_sizes(path: Path, *, limits: Limits = LIMITS) -> None:
         if each.parent == place and not each.is_file():
             refuse(each, "is a pipe or a device in the folder of a bag; remove it")
         if each.name == "metadata.yaml":
-            _check_metadata(each, limits)
+            _check_metadata(each)
         with opened(each, "rb") as file:
             begin = file.read(8)
             if begin.startswith(_MCAP):
-                check_parts(path, _mcap_parts(path, file, limits, end=1 << 62), limits=limits)
+                check_parts(path, _mcap_parts(path, file, end=1 << 62))
             elif begin == b"#ROSBAG ":
                 file.readline()
-                check_parts(path, _ros1_parts(path, file, limits), limits=limits)
+                check_parts(path, _ros1_parts(path, file))
             else:
                 file.seek(0)
-                _check_whole(each, file, limits)
+                _check_whole(each, file)
 
 
-def _check_metadata(path: FilePath, limits: Limits) -> None:
+def _check_metadata(path: FilePath) -> None:
     """The same for a text in YAML, which may not refer to itself either: lists of lists of it could have any length."""
     with opened(path, "rb") as file:
-        content = file.read(limits.metadata + 1)
-    if len(content) > limits.metadata:
-        refuse(path, f"has more than {limits.metadata:,} bytes; make it anew by `ros2 bag reindex`")
+        content = file.read(MAX_METADATA + 1)
+    if len(content) > MAX_METADATA:
+        refuse(path, f"has more than {MAX_METADATA:,} bytes; make it anew by `ros2 bag reindex`")
     if re.search(rb"[:,[{-]\s*[*&]\w", content):
         refuse(path, "names parts of itself (& and *), which no recorder does; make it anew by `ros2 bag reindex`")
 
 
-def _check_whole(path: FilePath, packed: IO[bytes], limits: Limits) -> None:
+def _check_whole(path: FilePath, packed: IO[bytes]) -> None:
     """The same for a file that may be compressed as a whole. It is decompressed once, a part at a time."""
-    most = min(limits.file, max(limits.small, limits.times * path.stat().st_size))
+    most = min(MAX_FILE, max(SMALL, MAX_TIMES * path.stat().st_size))
     end = most + 1
     try:
         with _zstd().ZstdFile(packed) as file:
             if file.read(8).startswith(_MCAP):
-                check_parts(path, _mcap_parts(path, file, limits, end=end), limits=limits)
+                check_parts(path, _mcap_parts(path, file, end=end))
             too_large = file.seek(end) == end
     except InputError:
         raise
@@ -86,25 +72,25 @@ def _check_whole(path: FilePath, packed: IO[bytes], limits: Limits) -> None:
         refuse(path, f"{what}; record it again in several files (--max-bag-size)")
 
 
-def check_parts(path: Path, parts: Iterable[tuple[str, bytes]], *, limits: Limits = LIMITS) -> None:
+def check_parts(path: Path, parts: Iterable[tuple[str, bytes]]) -> None:
     """The same for parts, each the name of its compression and its content."""
-    if any(_exceeds(kind, content, limits.part) for kind, content in parts):
-        _refuse_part(path, limits)
+    if any(_exceeds(kind, content) for kind, content in parts):
+        _refuse_part(path)
 
 
-def _refuse_part(path: Path, limits: Limits) -> NoReturn:
-    refuse(path, f"holds a part of more than {limits.part:,} bytes; record it again in parts of a few megabytes")
+def _refuse_part(path: Path) -> NoReturn:
+    refuse(path, f"holds a part of more than {MAX_PART:,} bytes; record it again in parts of a few megabytes")
 
 
-def _mcap_parts(path: Path, file: IO[bytes], limits: Limits, *, end: int) -> Iterator[tuple[str, bytes]]:
+def _mcap_parts(path: Path, file: IO[bytes], *, end: int) -> Iterator[tuple[str, bytes]]:
     """The compression and the content of each chunk of a file that is open behind its first eight bytes.
 
     A reader holds each record in memory, except attachments. `end`: nothing is looked at from this byte on.
     """
     while file.tell() < end and len(head := file.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
-        if kind != _ATTACHMENT_OF_MCAP and length > limits.part:
-            _refuse_part(path, limits)
+        if kind != _ATTACHMENT_OF_MCAP and length > MAX_PART:
+            _refuse_part(path)
         if kind != _CHUNK_OF_MCAP:
             file.seek(min(file.tell() + length, end))
             continue
@@ -113,7 +99,7 @@ def _mcap_parts(path: Path, file: IO[bytes], limits: Limits, *, end: int) -> Ite
         yield chunk[32 : 32 + size].decode(errors="replace"), chunk[40 + size :]
 
 
-def _ros1_parts(path: Path, file: IO[bytes], limits: Limits) -> Iterator[tuple[str, bytes]]:
+def _ros1_parts(path: Path, file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
     """The same of a bag of ROS 1, behind its first line."""
     while len(head := file.read(4)) == 4:
         header = file.read(struct.unpack("<I", head)[0])
@@ -121,14 +107,14 @@ def _ros1_parts(path: Path, file: IO[bytes], limits: Limits) -> Iterator[tuple[s
         if b"op=" + _CHUNK_OF_ROS1 not in header:
             file.seek(length, 1)
             continue
-        if length > limits.part:
-            _refuse_part(path, limits)
+        if length > MAX_PART:
+            _refuse_part(path)
         kind = re.search(rb"compression=(none|bz2|lz4)", header)
         yield "" if kind is None else kind[1].decode(), file.read(length)
 
 
-def _exceeds(kind: str, content: bytes, largest: int) -> bool:
-    """Whether a compressed content makes more than this many bytes."""
+def _exceeds(kind: str, content: bytes) -> bool:
+    """Whether a compressed content makes more than `MAX_PART` bytes."""
     made = _decompressor(kind)
     if made is None:
         return False
@@ -137,7 +123,7 @@ def _exceeds(kind: str, content: bytes, largest: int) -> bool:
         while content or not decompressor.needs_input:
             length += len(decompressor.decompress(content, _STEP))
             content = b""
-            if length > largest:
+            if length > MAX_PART:
                 return True
             if decompressor.eof:
                 content, decompressor = decompressor.unused_data or b"", made()
