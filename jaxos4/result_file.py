@@ -66,7 +66,6 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
         fields |= {
             "airframe": airframe_from_table(fields["airframe"]),
             "rigid_body": RigidBody(constants, tests.pop("consistency_p", None), tests.pop("rigid_body", None)),
-            "is_vehicle": fields["model"] == "flight",
         }
         fields |= {
             name: _arrays(kind, fields[name], name) for name, kind in _ARRAYS.items() if fields[name] is not None

@@ -266,7 +266,7 @@ OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
         (OS4, {"settings": OF_VEHICLE(holdout=0.9)}, "`holdout`: must be a share from 0 to 0.5"),
         (OS4, {"settings": OF_VEHICLE(terms=("drag",))}, "`terms`: drag needs lateral specific force"),
         (jaxos4.PublishedOS4(TURNED), {}, "`sensor_rotation`: the rates of an OS4 flight are along the body's axes"),
-        (MODEL, {"flights": 2}, "flight 2: `subject` published explains one flight"),
+        (MODEL, {"flights": 2}, "flight 2: the published model explains one flight"),
         (OS4, {"flights": 0}, "holds no flight"),
     ],
 )

@@ -266,7 +266,10 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
     assert not lost.optimum.is_lowest
     assert stages.count("fitting again where the cost is lower") <= 2
     assert lost.optimum.cost <= answer.optimum.cost
-    assert check_vehicle(data, lost, [sample_time_of(lost)], stages.append).doubts[0].result == "max_sweeps"
+    assert (
+        check_vehicle(data, lost, [sample_time_of(lost)], "filter-error", stages.append).doubts[0].result
+        == "max_sweeps"
+    )
     # A search that did not converge has no profile.
     failed = eqx.tree_at(lambda e: e.result, found, jaxos4.RESULTS.at_bound)
     assert at_lowest(answer.optimum._replace(estimate=failed), data, solver).profiled == {}

@@ -18,7 +18,6 @@ from jaxos4.identification import verdict
 from jaxos4.identification.answers import Solution, vehicle_constants
 from jaxos4.identification.doubts import doubts_of_log, few_parts, stronger_or_weaker
 from jaxos4.identification.doubts_of_values import consequences, doubts_of_values
-from jaxos4.identification.identify import describe
 from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.identification.search import search
@@ -264,7 +263,7 @@ def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
 
 def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
     case, solution = fitted
-    vehicle = describe(case, solution, case.check(solution, lambda stage: None))
+    vehicle = case.check(solution, lambda stage: None)
     assert vehicle.successful
     for name, truth in zip(("Ix", "Iy"), np.asarray(OS4.inertia).tolist(), strict=False):
         row = vehicle.rigid_body.constants[name]

@@ -1,20 +1,21 @@
 """The checks of an answer: the estimate of each quantity, the doubts about it, and its verdict."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from .._custom_types import as_float
 from ..airframe import AXES, PITCH, ROLL, YAW
-from ..analysis.diagnostics import Correlations, residual_correlations, residual_diagnostics
-from ..analysis.frequency_response import FrequencyResponse, frequency_response
+from ..analysis.diagnostics import residual_correlations, residual_diagnostics
+from ..analysis.frequency_response import frequency_response
 from ..analysis.identifiability import identifiability
 from ..analysis.prediction import Predictions
-from ..analysis.traces import Traces, os4_traces
+from ..analysis.traces import os4_traces
 from ..bracket import GAUSSIAN_PRIOR
 from ..estimate import AbstractEstimator
+from ..flight import CHANNEL_NAMES
 from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
 from ..shooting import with_room
@@ -23,45 +24,40 @@ from .data import Data, Progress
 from .doubts import doubts_of_log, doubts_of_os4, doubts_of_vehicle
 from .held_out import predict_held_out, validate_on, vehicle_traces
 from .quantities import os4_quantities, vehicle_quantities
-from .results import (
-    ChannelFit,
-    ParameterEstimate,
-    PredictionSkill,
-    RigidBody,
-    SampleTime,
-    Validation,
-    finite_or_none,
-)
-from .verdict import CONTRADICTED, Doubt, Verdict, judge
+from .results import Identification, RigidBody, SampleTime, finite_or_none
+from .verdict import CONTRADICTED, judge
 
 # Predictions that a result keeps: those of four minutes, 200 kB of a page.
 _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
 
 
-class Checked(NamedTuple):
-    """An answer in physical quantities, with what speaks for and against each: the fields of an `Identification`.
+def _identified(
+    data: Data, answer: Answer, estimator: str, model: str, notes: Sequence[str] = (), **checked: Any
+) -> Identification:
+    """The fields of a result that need no check, and those that were `checked`. `notes`: what could not be checked."""
+    free, sigma = answer.free, np.asarray(answer.problem.sigma)
+    covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
+    return Identification(
+        estimator=estimator,
+        model=model,
+        rollouts=answer.rollouts,
+        cost=finite_or_none(answer.estimate.cost),
+        provenance=msgspec.structs.replace(data.provenance, notes=[*data.provenance.notes, *notes]),
+        covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
+        airframe=answer.problem.model.airframe,
+        estimate=answer.estimate,
+        problem=answer.problem,
+        held=answer.fixed,
+        noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in answer.problem.columns},
+        disturbances=answer.disturbances,
+        widened=answer.widened,
+        **checked,
+    )
 
-    `notes`: what could not be checked.
-    """
 
-    parameters: dict[str, ParameterEstimate]
-    result: str
-    rigid_body: RigidBody = RigidBody()
-    verdicts: dict[str, Verdict] = {}
-    doubts: tuple[Doubt, ...] = ()
-    notes: tuple[str, ...] = ()
-    fit: dict[str, ChannelFit] = {}
-    validation: Validation | None = None
-    skill: PredictionSkill | None = None
-    predictions: Predictions | None = None
-    trajectories: Predictions | None = None
-    response: FrequencyResponse | None = None
-    traces: Traces | None = None
-    correlations: Correlations | None = None
-
-
-def check_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> Checked:
-    """The checks of a flight of an OS4, which this estimator searched."""
+def check_os4(data: Data, answer: Answer, estimator: AbstractEstimator, name: str, model: str) -> Identification:
+    """The checked result of a flight of an OS4, which the estimator of this `name` searched."""
+    own = data, answer, name, model
     names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
     missing, limits, fit, traces, correlations = {}, dict.fromkeys(names), {}, None, None
     if (found := answer.evaluation) is not None:
@@ -78,14 +74,15 @@ def check_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> Check
         for name, row in parameter_table(answer, estimator.prior, missing).items()
     }
     if not answer.answered:
-        return Checked(table, search, doubts=tuple(doubts_of_log(data.findings)))
+        return _identified(*own, parameters=table, result=search, doubts=tuple(doubts_of_log(data.findings)))
     body = rigid_body(answer)
     # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
     doubts = doubts_of_os4(data, search, table, body, fit if estimator.shoots else {})
     judged = judge(os4_quantities(table, body), doubts)
     # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
     wrong = [name for name in table if judged.verdicts[name].status == CONTRADICTED]
-    return Checked(
+    return _identified(
+        *own,
         parameters=table,
         rigid_body=body,
         verdicts=judged.verdicts,
@@ -98,14 +95,20 @@ def check_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> Check
     )
 
 
-def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime], progress: Progress) -> Checked:
-    """The checks of a vehicle: against the airframe, other sample times, and measurements that were not fitted.
+def check_vehicle(
+    data: Data, answer: Answer, sample_times: Sequence[SampleTime], name: str, progress: Progress
+) -> Identification:
+    """The result of a vehicle, checked against the airframe, other sample times, and measurements that were not fitted.
 
-    `sample_times`: that of the answer is among them.
+    `sample_times`: that of the answer is among them. `name`: of the estimator.
     """
     search, optimum = str(result_names(answer.estimate.result)), answer.optimum
+    own = data, answer, name, "flight"
+    several = tuple(sample_times) if len(sample_times) > 1 else ()
     if not answer.answered or optimum is None:
-        return Checked({}, search, doubts=tuple(doubts_of_log(data.findings)))
+        return _identified(
+            *own, parameters={}, result=search, doubts=tuple(doubts_of_log(data.findings)), sample_times=several
+        )
     table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
     predicted = paths = skill = None
     if data.held_out is not None:
@@ -131,13 +134,15 @@ def check_vehicle(data: Data, answer: Answer, sample_times: Sequence[SampleTime]
     judged = judge(quantities, doubts)
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(data, answer, optimum, predicted)
-    return Checked(
+    return _identified(
+        *own,
+        notes,
         parameters=table,
         rigid_body=body,
         verdicts=judged.verdicts,
         doubts=tuple(doubts),
         result=judged.result(search, (ROLL.inertia, PITCH.inertia)),
-        notes=notes,
+        sample_times=several,
         skill=skill,
         predictions=predicted,
         trajectories=None if paths is None else paths.thinned(_MOST_TRAJECTORIES),

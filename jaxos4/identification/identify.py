@@ -3,8 +3,7 @@
 - recordings -> `Data`, with a likelihood: `prepare_os4` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
   case, which knows the other steps.
 - `Data` -> `Solution`, the data with their `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
-- `Solution` -> `Checked`: `case.check`, by checks.py with quantities.py, doubts.py and verdict.py.
-- `Checked` -> `Identification`: `describe`.
+- `Solution` -> `Identification`: `case.check`, by checks.py with quantities.py, doubts.py and verdict.py.
 """
 
 import os
@@ -12,23 +11,19 @@ import time
 from collections.abc import Callable, Sequence
 
 import msgspec
-import numpy as np
 
 from ..airframe import Airframe
 from ..errors import InputError
 from ..estimate import AbstractEstimator
-from ..flight import CHANNEL_NAMES
 from ..logs import Source, as_recording, as_recordings
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..networks import TrainedNetwork
-from .answers import Solution
-from .checks import Checked
 from .data import silent
-from .os4 import OS4Case, prepare_os4
+from .os4 import prepare_os4
 from .problem import Intervals
-from .results import Identification, finite_or_none
+from .results import Identification
 from .settings import FlightSettings, VehicleSettings, own_settings
-from .vehicle import VehicleCase, prepare_vehicle
+from .vehicle import prepare_vehicle
 
 
 def identify(
@@ -84,33 +79,5 @@ def identify(
     else:
         os4_settings = own_settings(FlightSettings, settings)
         case = prepare_os4(recordings, subject, os4_settings, progress=progress, **options)
-    solution = case.solve(progress)
-    checked = case.check(solution, progress)
-    return describe(case, solution, checked, time.perf_counter() - begin)
-
-
-def describe(case: OS4Case | VehicleCase, solution: Solution, checked: Checked, seconds: float = 0.0) -> Identification:
-    """Everything about an answer, in the fields that pages and files show. `seconds`: the time that it took [s]."""
-    (data, answer, sample_times), free = solution, solution.answer.free
-    covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
-    sigma, fields = np.asarray(answer.problem.sigma), checked._asdict()
-    notes = fields.pop("notes")
-    return Identification(
-        estimator=case.name,
-        model=case.model,
-        rollouts=answer.rollouts,
-        cost=finite_or_none(answer.estimate.cost),
-        seconds=seconds,
-        provenance=msgspec.structs.replace(data.provenance, notes=[*data.provenance.notes, *notes]),
-        covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
-        airframe=answer.problem.model.airframe,
-        estimate=answer.estimate,
-        problem=answer.problem,
-        is_vehicle=case.is_vehicle,
-        held=answer.fixed,
-        noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in answer.problem.columns},
-        disturbances=answer.disturbances,
-        widened=answer.widened,
-        sample_times=sample_times if len(sample_times) > 1 else (),
-        **fields,
-    )
+    found = case.check(case.solve(progress), progress)
+    return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -26,10 +25,10 @@ from ..recording.checks import KINEMATIC, self_checks
 from ..results import RESULTS
 from ..shooting import ShootingProblem, padded
 from .answers import Answer, Solution
-from .checks import Checked, check_os4
+from .checks import check_os4
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, silent, versions
 from .problem import Intervals, bracket_of, os4_problem
-from .results import COLOURED, has_answer
+from .results import COLOURED, Identification, has_answer
 from .settings import FlightSettings, class_name, name_and_class
 
 MAX_PASSES = 3  # in which noise levels are found from residuals, before the last estimate
@@ -44,8 +43,6 @@ class OS4Case:
     - `estimator`, `name`: what searches it. `model`: the name of the equations.
     """
 
-    is_vehicle: ClassVar[bool] = False
-
     data: Data[ShootingProblem]
     estimator: AbstractEstimator
     name: str
@@ -55,10 +52,10 @@ class OS4Case:
         """The parameters and the noise levels."""
         return Solution(self.data, fit_os4(self.estimator, self.data.likelihood, progress=progress))
 
-    def check(self, solution: Solution, progress: Progress) -> Checked:
+    def check(self, solution: Solution, progress: Progress) -> Identification:
         """The estimate of each quantity, and the doubts about it."""
         del progress
-        return check_os4(solution.data, solution.answer, self.estimator)
+        return check_os4(solution.data, solution.answer, self.estimator, self.name, self.model)
 
 
 def prepare_os4(

@@ -239,7 +239,6 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     airframe: Airframe
     estimate: Estimate | None = None
     problem: ShootingProblem | None = None
-    is_vehicle: bool
     fit: dict[str, ChannelFit] = {}
     validation: Validation | None = None
     held: dict[str, FixedParameter] = {}
@@ -258,6 +257,11 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def successful(self) -> bool:
         """Whether the requested quantities can be trusted: Ix and Iy of a vehicle; all identified ones of an OS4."""
         return self.result == "successful"
+
+    @property
+    def is_vehicle(self) -> bool:
+        """Whether it is of a real vehicle, and not of an OS4."""
+        return self.model == "flight"
 
     @property
     def has_answer(self) -> bool:
@@ -352,7 +356,7 @@ def _as_list(array: np.ndarray) -> list[Any]:
     return values.tolist()
 
 
-APART = {"rigid_body", "airframe", "estimate", "problem", "is_vehicle"}
+APART = {"rigid_body", "airframe", "estimate", "problem"}
 """Fields that a file holds in another form, or not at all."""
 _OF_OS4 = {"fit", "validation"}  # and those of a vehicle: written of this kind only
 _OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}

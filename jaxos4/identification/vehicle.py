@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,9 +25,10 @@ from ..recording.voltage import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, input_innovations, lagged
 from .answers import Solution
-from .checks import Checked, check_vehicle
+from .checks import check_vehicle
 from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
 from .problem import Intervals, bracket_of
+from .results import Identification
 from .sample_time import chosen_place, fit_sample_times, sample_time_of
 from .search import search
 from .settings import VehicleSettings, name_and_class
@@ -57,9 +58,6 @@ class VehicleCase:
     - `choose`: whether the sample time is chosen; otherwise it is the first.
     """
 
-    is_vehicle: ClassVar[bool] = True
-    model: ClassVar[str] = "flight"
-
     data: tuple[Data[InnovationsProblem], ...]
     estimator: str | AbstractEstimator
     name: str
@@ -88,10 +86,10 @@ class VehicleCase:
         # After a restart, the other sample times have the minimum that was left.
         return Solution(data, answer, (rows[place],) if answer.restarts else tuple(rows))
 
-    def check(self, solution: Solution, progress: Progress) -> Checked:
+    def check(self, solution: Solution, progress: Progress) -> Identification:
         """The estimate of each quantity, and the doubts about it."""
         progress("checking the answer")
-        return check_vehicle(*solution, progress)
+        return check_vehicle(*solution, self.name, progress)
 
 
 def prepare_vehicle(

@@ -49,7 +49,6 @@ def identified_flight(*, provenance=None, **changes) -> Identification:
     settings = {"flight": "flight.csv", "channels": "rates", "windows": 1, "sample_time": 0.01}
     given = {
         "model": "published",
-        "is_vehicle": False,
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN, "alpha2": SMALL},
         "rigid_body": RigidBody(CONSTANTS, 0.21, True),
         "fit": {"p": WHITE, "q": COLOURED},
@@ -75,7 +74,6 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         changes = {"trajectories": None} | changes
     given = {
         "model": "flight",
-        "is_vehicle": True,
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN},
         "rigid_body": RigidBody(NOTED, 0.21, True),
         "verdicts": VERDICTS,
