@@ -45,18 +45,12 @@ class Search(NamedTuple):
     """Settings of the search for the coefficients of a task.
 
     - `starts`: the number of searches. `first`: the length of their first coefficients, which are random.
-    - `steps`: the most steps of BFGS in a stage. `tolerance`: of its unknowns and of its cost.
-    - `penalties`: of each stage.
-    - `unit`: the usual size of a coefficient. BFGS starts with a unit matrix as second derivative, so its unknowns are
-      coefficients over this size.
+    - `steps`: the most steps of BFGS in a stage.
     """
 
     starts: int
     first: float
     steps: int
-    tolerance: float = 1e-6
-    penalties: tuple[float, ...] = (10.0, 50.0, 250.0, 1250.0, 6000.0)
-    unit: float = 0.1
 
 
 class Designed(NamedTuple):
@@ -163,14 +157,21 @@ class Design(NamedTuple):
         return mean, int(excited.sum())
 
 
+PENALTIES = 10.0, 50.0, 250.0, 1250.0, 6000.0  # of each stage
+TOLERANCE = 1e-6  # of BFGS, in its unknowns and in its cost
+# The usual size of a coefficient. BFGS starts with a unit matrix as second derivative, so its unknowns are coefficients
+# over this size.
+UNIT = 0.1
+
+
 def solve(task: AbstractTask, search: Search, *, compare: bool, key: Key, progress: Progress) -> Design:
     """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`."""
     progress("compiling the search")
     directions = jax.random.normal(jax.random.fold_in(key, 2), (search.starts, task.size), dtype=float)
     starts, costs = search.first / math.sqrt(task.size) * directions, np.zeros(search.starts)
-    for number, penalty in enumerate(search.penalties, start=1):
+    for number, penalty in enumerate(PENALTIES, start=1):
         starts, costs = jax.block_until_ready(_minimise(task, starts, as_float(penalty), search))
-        progress(f"search, stage {number} of {len(search.penalties)}")
+        progress(f"search, stage {number} of {len(PENALTIES)}")
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     progress(f"flying {task.vehicles} vehicles")
     flown = {"designed": task.flown(np.asarray(starts)[best])}
@@ -186,15 +187,15 @@ def _minimise(
     """One stage of all searches: their last coefficients and costs. A trial whose simulation fails is rejected."""
 
     def cost(scaled: Coefficients, penalty: Scalar) -> Scalar:
-        uses = jax.tree.leaves(task.uses(search.unit * scaled))
+        uses = jax.tree.leaves(task.uses(UNIT * scaled))
         excess = sum(jnp.square(jnp.maximum(jnp.square(use) - 1, 0)).sum() / use.shape[-2] for use in uses)
-        return task.objective(search.unit * scaled) + penalty / 2 * excess
+        return task.objective(UNIT * scaled) + penalty / 2 * excess
 
     def one(start: Coefficients) -> tuple[Coefficients, Scalar]:
-        solver = optimistix.BFGS(search.tolerance, search.tolerance)
-        first = start / search.unit
+        solver = optimistix.BFGS(TOLERANCE, TOLERANCE)
+        first = start / UNIT
         found = optimistix.minimise(cost, solver, first, penalty, max_steps=search.steps, throw=False)
-        return search.unit * found.value, found.state.f_info.f
+        return UNIT * found.value, found.state.f_info.f
 
     return jax.vmap(one)(starts)
 

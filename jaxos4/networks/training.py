@@ -14,40 +14,31 @@ from ..errors import TrainingError
 from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
 from .features import CHUNK, Features, Flights, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
 
+WARM_UP = 200  # steps in which the learning rate rises, at most half of all
+LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
+CHECK = 250  # steps between two evaluations of the validation loss
+VALIDATION = 2 * CHUNK  # simulated flights
+USES = 4  # of a simulated flight in training, with new noise each time; a flight costs more than its noise
+IMPROVEMENT = 1e-4  # share by which a loss must be lower
+DIVERGED = 1e15  # a loss beyond this ends training; the worst answer inside a bracket has a far lower one
+FLYABLE = 0.01  # the smallest share of simulated flights that must not diverge
+
 
 class Schedule(NamedTuple):
-    """Settings of a training. `NetworkEstimator` explains the first five, which its user sets.
-
-    - `check`: steps between two evaluations of the validation loss.
-    - `validation`: simulated flights of the validation.
-    - `uses`: how often training uses a simulated flight, each time with new noise; a flight costs more than its noise.
-    - `improvement`: a loss is an improvement if it is lower by this share.
-    - `diverged`: a loss beyond this ends training; the worst answer inside a bracket has a far lower one.
-    - `flyable`: the smallest share of simulated flights that must not diverge.
-    - `warm_up`: steps in which the learning rate rises, at most half of all.
-    - `last_rate`: the learning rate at the end of training, relative to the largest.
-    """
+    """What the user of a `NetworkEstimator` sets of a training; explained there."""
 
     noise: tuple[float, float]
     steps: int
     batch: int
     learning_rate: float
     patience: int
-    check: int = 250
-    validation: int = 2 * CHUNK
-    uses: int = 4
-    improvement: float = 1e-4
-    diverged: float = 1e15
-    flyable: float = 0.01
-    warm_up: int = 200
-    last_rate: float = 1e-3
 
     @property
     def rates(self) -> Float[np.ndarray, " steps"]:
         """The learning rate of each step: a linear rise, then half a cosine."""
-        step, warm_up = np.arange(self.steps), min(self.warm_up, self.steps // 2)
+        step, warm_up = np.arange(self.steps), min(WARM_UP, self.steps // 2)
         wave = (1 + np.cos(np.pi * (step - warm_up) / (self.steps - warm_up))) / 2
-        share = np.where(step < warm_up, step / max(warm_up, 1), self.last_rate + (1 - self.last_rate) * wave)
+        share = np.where(step < warm_up, step / max(warm_up, 1), LAST_RATE + (1 - LAST_RATE) * wave)
         return (self.learning_rate * share).astype(np.float32)
 
 
@@ -105,36 +96,36 @@ def train(
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
-    scales, batch, steps, check = np.asarray(schedule.noise, float), schedule.batch, schedule.steps, schedule.check
-    held_out = draw_chunks(features, schedule.validation, key=key, purpose=Purpose.VALIDATION)
+    scales, batch, steps = np.asarray(schedule.noise, float), schedule.batch, schedule.steps
+    held_out = draw_chunks(features, VALIDATION, key=key, purpose=Purpose.VALIDATION)
     held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
     flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
-    if not flyable > schedule.flyable:
+    if not flyable > FLYABLE:
         what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
     state, rates = _first_state(regressor), schedule.rates
-    flown = batch * check // schedule.uses
+    flown = batch * CHECK // USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
-    for number, first in enumerate(range(0, steps, check)):
+    for number, first in enumerate(range(0, steps, CHECK)):
         place = number * math.ceil(flown / CHUNK)
         flights = draw_chunks(features, flown, key=key, purpose=Purpose.FLIGHTS, first=place)
-        count = min(check, steps - first)
-        places = place_of(Purpose.STEPS, first + np.arange(check))
-        rate = np.resize(rates[first : first + count], check)  # of one shape: the last steps need no other program
+        count = min(CHECK, steps - first)
+        places = place_of(Purpose.STEPS, first + np.arange(CHECK))
+        rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
         regressor, state, *losses = _advance(
             regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
         )
         history.append([float(value) for value in losses])
         value, current = history[-1]
-        if not np.less(history[-1], schedule.diverged).all():
-            loss = next(each for each in (current, value) if not each < schedule.diverged)
+        if not np.less(history[-1], DIVERGED).all():
+            loss = next(each for each in (current, value) if not each < DIVERGED)
             raise TrainingError(
                 f"training diverged within {first + count} steps (loss {loss:g}): lower `learning_rate`."
             )
         without_improvement += 1
-        if current < lowest - schedule.improvement * abs(current):
+        if current < lowest - IMPROVEMENT * abs(current):
             best, lowest, without_improvement = regressor, current, 0
         if without_improvement >= schedule.patience:
             break

@@ -9,15 +9,15 @@ from jaxtyping import Float
 from ..logs import Recording
 from .motion import Ups
 
+KEEPS = 0.2  # m/s^2; standard deviation of the change of an error at rest in flight, where sensors warm up and vibrate
+AGREE = 3.0  # standard deviations; if flight and rest differ by more, drag or manoeuvres have misled the flight
+
 
 def force_level(
     fitted: Recording,
     ups: Sequence[Ups],
     rests: Sequence[Float[np.ndarray, "3"]],
     gravity: float,
-    *,
-    keeps: float = 0.2,
-    agree: float = 3.0,
 ) -> tuple[float, float] | None:
     """The constant error of the accelerometer along z, and its standard deviation [m/s^2]. `None`: unknown.
 
@@ -25,32 +25,30 @@ def force_level(
 
     - `fitted`, `ups`: a flight, and the upright direction in its stretches, see `velocity_of`.
     - `rests`: the specific force before take-off, where it is known [m/s^2].
-    - `keeps`: an error at rest keeps its size in flight, where sensors warm up and vibrate, to this standard deviation.
-    - `agree`: if flight and rest differ by more standard deviations, drag or manoeuvres have misled the flight.
     """
     flown = _by_flight(fitted, ups, gravity)
     if not rests:
         return flown
     rest = float(np.mean([np.linalg.norm(force) for force in rests])) - gravity
-    if flown is None or abs(flown[0] - rest) > agree * math.hypot(flown[1], keeps):
-        return rest, keeps
-    weights = np.array([flown[1], keeps]) ** -2.0
+    if flown is None or abs(flown[0] - rest) > AGREE * math.hypot(flown[1], KEEPS):
+        return rest, KEEPS
+    weights = np.array([flown[1], KEEPS]) ** -2.0
     return float(weights @ [flown[0], rest] / weights.sum()), float(weights.sum() ** -0.5)
+
+
+GAINED = 1.0  # m/s over a stretch, at the most
+CARRIED = 0.003  # share of the weight that forces do not carry together
+UPRIGHT = 0.5  # the least mean cosine of the tilt
 
 
 def _by_flight(
     fitted: Recording,
     every: Sequence[Ups],
     gravity: float,
-    *,
-    gained: float = 1.0,
-    carried: float = 0.003,
-    upright: float = 0.5,
 ) -> tuple[float, float] | None:
     """The mean upright part of the specific force, less gravity.
 
-    A vehicle gains little velocity over a stretch, at most `gained` [m/s], so all forces together carry its weight, but
-    for the share `carried`. `upright`: the least mean cosine of the tilt.
+    A vehicle gains little velocity over a stretch, so all forces together carry its weight.
     """
     force = fitted.specific_force
     if not every or force is None or not (known := np.isfinite(force).all(axis=1)).any():
@@ -58,7 +56,7 @@ def _by_flight(
     ups = [np.concatenate(each)[known] for each in zip(*every, strict=True)]
     other, along = ((force[known] * up).sum(axis=1).mean() for up in ups)
     cosine = ups[-1][:, 2].mean()
-    if cosine < upright or force[known, 2].mean() < 0:  # the second: the z axis points down
+    if cosine < UPRIGHT or force[known, 2].mean() < 0:  # the second: the z axis points down
         return None
-    drift = gained * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
-    return (along - gravity) / cosine, math.hypot(drift, carried * gravity, along - other) / cosine
+    drift = GAINED * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
+    return (along - gravity) / cosine, math.hypot(drift, CARRIED * gravity, along - other) / cosine

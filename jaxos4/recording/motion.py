@@ -199,9 +199,12 @@ def _response(flown: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndar
     return between((omega**2 @ mixer.T)[:-1]), between(acceleration)
 
 
-def velocity_of(
-    recording: Recording, *, forgets: float = 2.0, levels: tuple[float, float] = (2.0, 8.0)
-) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
+# s; time constants with which the upright direction is drawn to the specific force. The first forgets errors of the
+# gyro sooner, the second holds in longer turns.
+LEVELS = 2.0, 8.0
+
+
+def velocity_of(recording: Recording, *, forgets: float = 2.0) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
     """The motion of a vehicle through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
@@ -211,8 +214,6 @@ def velocity_of(
 
     - `recording`: of one stretch.
     - `forgets`: dead reckoning forgets its velocity with this time constant [s].
-    - `levels`: the upright direction is drawn to the specific force with these time constants [s]. The first forgets
-      errors of the gyro sooner, the second holds in longer turns.
 
     **Returns:** the velocity along the body's axes [m/s], and the upright direction in these axes by each time
     constant. Both are the same if the attitude was measured.
@@ -226,7 +227,7 @@ def velocity_of(
         return None
     force = filled(force)
     if to_body is None:
-        up, slow = (_upright(rates, force, recording.dt, level) for level in levels)
+        up, slow = (_upright(rates, force, recording.dt, level) for level in LEVELS)
     else:
         up = slow = to_body[:, :, 2]
     return _dead_reckoned(rates, force, up, recording.dt, forgets), (up, slow)

@@ -31,18 +31,20 @@ def white_noise(values: Float[np.ndarray, " samples"], order: int) -> float:
     return float(np.median(size)) / 0.6745 / math.sqrt(math.comb(2 * order, order)) if size.size else math.nan
 
 
-def force_noise(recording: Recording, *, share: float = 0.5) -> Float[np.ndarray, "3"]:
+LEAST_NOISE = 0.5  # share of the noise by second differences
+
+
+def force_noise(recording: Recording) -> Float[np.ndarray, "3"]:
     """The least white noise of means over a second [m/s^2]: by second differences, and by one count of the sensor.
 
     Vibration is not smooth from row to row, and so no disturbance. Without this limit, a fit may take it for one.
-    `share`: the least noise as a share of that by second differences.
     """
     least, force = np.zeros(3), recording.specific_force
     for axis, values in enumerate([] if force is None else force.T):
         size = np.abs(np.diff(values))
         rounding = 1e-6 * np.nanmax(np.abs(values), initial=1.0)
         count = np.min(size[size > rounding], initial=np.inf)
-        noise = max(share * white_noise(values, 2), count if np.isfinite(count) else 0.0)
+        noise = max(LEAST_NOISE * white_noise(values, 2), count if np.isfinite(count) else 0.0)
         least[axis] = np.nan_to_num(noise) * math.sqrt(recording.dt)
     return least
 

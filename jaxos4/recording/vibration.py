@@ -8,32 +8,24 @@ from ..airframe import AXES
 from ..flight import RATES
 from ..logs import Recording
 
+ABOVE = 25.0  # Hz; a rigid body that rotors turn moves below this frequency
+TIMES = 5.0  # a line has this many times the power of its surroundings: the median within an octave to both sides
+OCTAVE = 2.0
+SPECTRUM, MIN_SPECTRA = 1.0, 5  # s that the samples of one spectrum last; how many are averaged at least
 
-def vibrating_rates(
-    stretches: Sequence[Recording],
-    *,
-    above: float = 25.0,
-    times: float = 5.0,
-    seconds: float = 1.0,
-    fewest: int = 5,
-    octave: float = 2.0,
-) -> dict[str, float]:
+
+def vibrating_rates(stretches: Sequence[Recording]) -> dict[str, float]:
     """The body rates (`p`, `q`, `r`) whose spectrum shows a line, with its frequency [Hz].
 
     Rotors that turn at nearly one speed shake a gyro at this frequency, or at one that the log's rate folds it to.
     White noise, its filter and the motion of a rigid body have no line.
 
-    **Arguments:**
-
-    - `stretches`: as logged, not averaged, of one vehicle.
-    - `above`: a rigid body that rotors turn moves below this frequency [Hz].
-    - `times`: a line has this many times the power of its surroundings: the median within an `octave` to both sides.
-    - `seconds`, `fewest`: how long the samples of one spectrum last [s], and how many of them are averaged at least.
+    **Arguments:** `stretches`: as logged, not averaged, of one vehicle.
     """
     step = max((each.dt for each in stretches), default=np.inf)
-    length = round(seconds / step) if np.isfinite(step) else 0
+    length = round(SPECTRUM / step) if np.isfinite(step) else 0
     frequency = np.fft.rfftfreq(length, step) if length > 1 else np.zeros(1)
-    high = np.flatnonzero((frequency >= above) & (frequency < 0.98 * frequency[-1]))
+    high = np.flatnonzero((frequency >= ABOVE) & (frequency < 0.98 * frequency[-1]))
     found = {}
     for axis, column in zip(AXES, RATES, strict=True):
         spectra = []
@@ -43,13 +35,13 @@ def vibrating_rates(
                 own = rate[begin : begin + length]
                 if np.isfinite(own).all():
                     spectra.append(np.square(np.abs(np.fft.rfft(np.hanning(length) * (own - own.mean())))))
-        if len(spectra) < fewest or not high.size:
+        if len(spectra) < MIN_SPECTRA or not high.size:
             continue
         power = np.convolve(np.mean(spectra, axis=0), np.full(3, 1 / 3), "same")  # speeds vary a little
         around = [
-            np.median(power[(frequency > frequency[i] / octave) & (frequency < frequency[i] * octave)]) for i in high
+            np.median(power[(frequency > frequency[i] / OCTAVE) & (frequency < frequency[i] * OCTAVE)]) for i in high
         ]
         ratio = power[high] / np.maximum(around, np.finfo(float).tiny)
-        if ratio.max() > times:
+        if ratio.max() > TIMES:
             found[axis.rate] = float(frequency[high[np.argmax(ratio)]])
     return found

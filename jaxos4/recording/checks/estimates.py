@@ -56,18 +56,17 @@ class Turns(msgspec.Struct, frozen=True):
     explained: Float[np.ndarray, "3"]
 
 
-def attitude_turns(stretches: Sequence[Recording], *, fewest: int = 4, shortest: float = 0.5) -> Turns | None:
-    """Compare attitude and gyro in stretches of a flight.
+MIN_BATCHES, MIN_BATCH = 4, 0.5  # of a flight; s
+TILTS = 2.0  # s; about as long are batches in which rotations about several axes are compared
 
-    **Arguments:** `fewest`, `shortest`: the fewest batches, and the shortest [s].
 
-    **Returns:** `None` if one of them was not measured, or the flight is short.
-    """
+def attitude_turns(stretches: Sequence[Recording]) -> Turns | None:
+    """Compare attitude and gyro in stretches of a flight. `None`: one was not measured, or the flight is short."""
     pairs = _turned(stretches)
     samples = sum(len(angle) for angle, _ in pairs)
-    length = max(samples // BATCHES, round(shortest / _STEP))
+    length = max(samples // BATCHES, round(MIN_BATCH / _STEP))
     sums = np.array([batch for angle, gyro in pairs for batch in _sums(angle, gyro, length)])
-    if len(sums) < fewest:
+    if len(sums) < MIN_BATCHES:
         return None
 
     def fit(products: np.ndarray) -> np.ndarray:
@@ -79,12 +78,10 @@ def attitude_turns(stretches: Sequence[Recording], *, fewest: int = 4, shortest:
     return Turns(matrix, found[9], _fit(sums.sum(axis=0))[2])
 
 
-def scaled_angles(stretches: Sequence[Recording], turns: Turns, *, fewest: int = 4, seconds: float = 2.0) -> float:
+def scaled_angles(stretches: Sequence[Recording], turns: Turns) -> float:
     """Whether the angles are too large, and not the rates too small, by how rotations about several axes add up.
 
     The rates of a tilted vehicle follow from its angles by a formula that holds for the true angles only.
-
-    **Arguments:** `fewest`, `seconds`: the fewest batches, and about how long each is [s].
 
     **Returns:** how much better the gyro agrees with the scaled angles than with the scaled rates, in standard errors;
     negative: worse. 0: unknown.
@@ -99,8 +96,8 @@ def scaled_angles(stretches: Sequence[Recording], turns: Turns, *, fewest: int =
         errors = [np.square(x[first:last] - gyro).sum(axis=1) for x in (as_logged / scale, scaled)]
         gain = errors[0] - errors[1]
         gain = gain[np.isfinite(gain)]
-        better += [batch.sum() for batch in np.array_split(gain, max(gain.size * _STEP // seconds, 1))]
-    if len(better) < fewest or not np.std(better):
+        better += [batch.sum() for batch in np.array_split(gain, max(gain.size * _STEP // TILTS, 1))]
+    if len(better) < MIN_BATCHES or not np.std(better):
         return 0.0
     return float(np.mean(better) / np.std(better, ddof=1) * np.sqrt(len(better)))
 

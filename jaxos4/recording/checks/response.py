@@ -27,42 +27,16 @@ from .estimates import BATCHES, Measured, interpolated, peak
 Signals = Float[np.ndarray, "samples _signals"]
 
 
-class Prediction(NamedTuple):
-    """Settings with which the response of the gyro is measured.
-
-    - `step`: of the samples [s]; shorter ones would see the start of a filter's answer only.
-    - `longest`: the longest step [s].
-    - `memory`: of the noise model, in samples.
-    - `lags`: of rotors that follow commands, of which one is chosen [s].
-    - `delays`: first and last [s].
-    - `rows`: as many predictions are enough.
-    - `passes`: of the fit of gains and of the noise model in turn.
-    """
-
-    step: float = 0.012
-    longest: float = 0.034
-    memory: int = 5
-    lags: tuple[float, ...] = (0.01, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1)
-    delays: tuple[float, float] = (-0.12, 0.12)
-    rows: int = 20_000
-    passes: int = 4
-
-
-class Spectra(NamedTuple):
-    """Settings with which the response of the accelerometer is measured.
-
-    - `step`, `seconds`: of the samples, and how long those of one spectrum last [s].
-    - `band`: [Hz]; wind and the height's control are slower; rotors, and noise of the gyro, leave little above.
-    - `delays`: first and last, in steps of 1 ms [s].
-    """
-
-    step: float = 0.004
-    seconds: float = 2.0
-    band: tuple[float, float] = (2.0, 15.0)
-    delays: tuple[float, float] = (-0.12, 0.12)
-
-
-PREDICTION, SPECTRA = Prediction(), Spectra()
+STEP = 0.012  # s; samples of the gyro; shorter ones would see the start of a filter's answer only
+LONGEST = 0.034  # s; the longest step
+ORDER = 5  # samples; the memory of the noise model
+LAGS = 0.01, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1  # s; of rotors that follow commands, of which one is chosen
+DELAYS = -0.12, 0.12  # s; the first and the last of gyro and accelerometer
+PREDICTIONS = 20_000  # that are enough
+PASSES = 4  # of the fit of gains and of the noise model in turn
+FORCE_STEP = 0.004  # s; samples of the accelerometer
+SPECTRUM = 2.0  # s; how long the samples of one spectrum last
+BAND = 2.0, 15.0  # Hz; wind and the height's control are slower; rotors, and noise of the gyro, leave little above
 FORGETS = 2.0
 """Angle and velocity, on which damping and inflow act, are forgotten with this time constant [s]."""
 GAP = 0.05
@@ -90,26 +64,24 @@ class Response(msgspec.Struct, frozen=True):
 def rotor_response(
     stretches: Sequence[Recording],
     airframe: Airframe,
-    prediction: Prediction = PREDICTION,
-    spectra: Spectra = SPECTRA,
 ) -> Response | None:
     """Compare gyro and accelerometer with the rotors. `None`: the flight is too short, too slow, or has no gyro."""
     if sum(float(np.ptp(each.time)) for each in stretches) < SECONDS:
         return None
     step = max(each.dt for each in stretches)
-    if step > prediction.longest:
+    if step > LONGEST:
         return None
-    lags = prediction.lags if stretches[0].commanded else (0.0,)
-    flown = [averaged(each, [max(prediction.step, step)])[0] for each in stretches]
-    model = _Turning.of(flown[0].dt, prediction)
-    turns = {lag: model.products([_turns(each, airframe, lag) for each in flown], prediction.rows) for lag in lags}
+    lags = LAGS if stretches[0].commanded else (0.0,)
+    flown = [averaged(each, [max(STEP, step)])[0] for each in stretches]
+    model = _Turning.of(flown[0].dt)
+    turns = {lag: model.products([_turns(each, airframe, lag) for each in flown]) for lag in lags}
     answers = {lag: model.answer(products.sum(axis=0)) for lag, products in turns.items()}
     lag = max(lags, key=lambda lag: float(-np.log1p(-np.nan_to_num(answers[lag][2])).sum()))
     if np.isnan(answers[lag][1]):
         return None
     found = Measured.of(turns[lag], lambda products: np.append(*model.answer(products)[:2]))
     turning, late = Measured(found.value[:4].reshape(2, 2), found.error[:4].reshape(2, 2)), found[4:]
-    felt, share = _felt([averaged(each, [max(spectra.step, step)])[0] for each in stretches], airframe, lag, spectra)
+    felt, share = _felt([averaged(each, [max(FORCE_STEP, step)])[0] for each in stretches], airframe, lag)
     between = Measured(late.value - felt.value, np.hypot(late.error, felt.error))
     value, error = (
         np.concatenate([getattr(one, name) for one in (late, felt, between)]) for name in ("value", "error")
@@ -129,13 +101,13 @@ class _Turning(NamedTuple):
     last: int
 
     @classmethod
-    def of(cls, step: float, settings: Prediction) -> "_Turning":
+    def of(cls, step: float) -> "_Turning":
         """That of samples of this step [s]."""
-        return cls(step, settings.memory, *(round(delay / step) for delay in settings.delays))
+        return cls(step, ORDER, *(round(delay / step) for delay in DELAYS))
 
-    def products(self, every: Sequence[np.ndarray], rows: int) -> Float[np.ndarray, "batches columns columns"]:
-        """Sums of products of `_lagged` signals in batches. `rows`: about as many predictions are used."""
-        thin = max(sum(len(each) for each in every) // rows, 1)
+    def products(self, every: Sequence[np.ndarray]) -> Float[np.ndarray, "batches columns columns"]:
+        """Sums of products of `_lagged` signals in batches."""
+        thin = max(sum(len(each) for each in every) // PREDICTIONS, 1)
         table = np.concatenate([self._lagged(each)[::thin] for each in every])
         return np.array([batch.T @ batch for batch in np.array_split(table, BATCHES)])
 
@@ -159,7 +131,7 @@ class _Turning(NamedTuple):
         return np.array(every)
 
     def answer(
-        self, products: Float[np.ndarray, "columns columns"], passes: int = PREDICTION.passes
+        self, products: Float[np.ndarray, "columns columns"]
     ) -> tuple[Float[np.ndarray, "4"], float, Float[np.ndarray, "2"]]:
         """The gains from torques to rates, their delay [s], and the explained shares; NaN: not measured.
 
@@ -175,7 +147,7 @@ class _Turning(NamedTuple):
         noise[..., 0], noise[..., 1] = 1.0, -1.0  # torques that are not known add up in rates
         alone, _ = _predicted(np.eye(size.shape[2])[0] + np.zeros(size.shape), sums)
         weights, squares = np.zeros(size.shape), alone
-        for _ in range(passes):
+        for _ in range(PASSES):
             weights = _least(np.einsum("koi,koabi->koab", noise, np.einsum("koj,koabij->koabi", noise, sums)))
             squares, noise = _predicted(weights, sums)
         shares = np.where(alone > 0, 1 - squares / np.maximum(alone, 1e-300), 0.0)
@@ -228,11 +200,11 @@ def _forgetting(values: Signals, share: float) -> Signals:
     return np.fft.irfft(spectrum, size, axis=0)[: len(values)]
 
 
-def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float, settings: Spectra) -> tuple[Measured, float]:
+def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float) -> tuple[Measured, float]:
     """The delay of the accelerometer after the rotors [s], and the share of the vertical force that they explain."""
     unknown = Measured(np.full(1, np.nan), np.full(1, np.nan)), math.nan
-    step, (low, high) = flown[0].dt, settings.band
-    spectra = [each for one in flown for each in _spectra(one, airframe, lag, settings)]
+    step, (low, high) = flown[0].dt, BAND
+    spectra = [each for one in flown for each in _spectra(one, airframe, lag)]
     if len(spectra) < 2:
         return unknown
     frequency = np.fft.rfftfreq(2 * len(spectra[0][0]) - 2, step)
@@ -242,7 +214,7 @@ def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float, settings: 
     power = np.real(sums.sum(axis=0)[:, 2, 2])
     if not (power > 0).all():
         return unknown
-    delays = 1e-3 * np.arange(round(1e3 * settings.delays[0]), round(1e3 * settings.delays[1]) + 1)
+    delays = 1e-3 * np.arange(round(1e3 * DELAYS[0]), round(1e3 * DELAYS[1]) + 1)
     late = np.exp(-2j * np.pi * frequency[inside] * delays[:, None])
 
     def shares(products: Complex[np.ndarray, "frequencies 3 3"]) -> Float[np.ndarray, " delays"]:
@@ -262,16 +234,14 @@ def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float, settings: 
     return Measured.of(sums, fit), float(shares(sums.sum(axis=0)).max())
 
 
-def _spectra(
-    flown: Recording, airframe: Airframe, lag: float, settings: Spectra
-) -> list[Complex[np.ndarray, "3 frequencies"]]:
+def _spectra(flown: Recording, airframe: Airframe, lag: float) -> list[Complex[np.ndarray, "3 frequencies"]]:
     """Spectra of thrust per mass, vertical velocity and vertical force, where all were measured."""
     moved = velocity_of(flown, forgets=FORGETS)
     if moved is None or flown.specific_force is None:
         return []
     thrust = _forced(flown, airframe, lag)[:, 2].reshape(len(flown.time), -1).mean(axis=1)
     force = interpolated(flown.time, flown.time, flown.specific_force[:, 2], gap=GAP)
-    signals, length = np.stack([thrust, moved[0][:, 2], force]), round(settings.seconds / flown.dt)
+    signals, length = np.stack([thrust, moved[0][:, 2], force]), round(SPECTRUM / flown.dt)
     weight = np.hanning(length)
     windows = [signals[:, i : i + length] for i in range(0, len(thrust) - length, length // 2)]
     spectra = [np.fft.rfft(weight * (one - one.mean(axis=1, keepdims=True))) for one in windows]
