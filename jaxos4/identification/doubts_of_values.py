@@ -10,6 +10,7 @@ from ..estimators import FilterError
 from ..models.abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..models.terms import DAMPED
+from ..recording.checks.evidence import HELD
 from ..results import result_names
 from .answers import Answer
 from .results import Constant, ParameterEstimate, RigidBody
@@ -26,7 +27,6 @@ Consequences = Callable[[str, float], Mapping[str, Move | None]]
 HEAVIEST, LIGHTEST = 1.5, 0.01
 COUPLING = 0.25  # of alpha1, alpha4 and alpha7: aerodynamic moments may look like a gyroscopic coupling of this size
 MAX_DELAY = 0.04  # s; a longer delay of rotors is an error of clocks
-_RARE = 0.015  # s; motors that were logged less often look like damping
 ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
 
 
@@ -128,7 +128,7 @@ def contradicted(
         if why is not None:
             own: Moves = dict.fromkeys([owner[parameter.name]] if parameter.name in owner else [])
             others = dict.fromkeys((*INERTIAS, "thrust")) if parameter.scales_torque else follow(parameter.name, usual)
-            rare = ": motors were logged too rarely" * (why[0] == DAMPED and motor_step > _RARE)
+            rare = ": motors were logged too rarely" * (why[0] == DAMPED and motor_step > HELD)
             cause = f"{parameter.name} = {value:.2g} {why[0]}{rare}"
             yield parameter, contradiction(cause, why[1], {**others, **own})
 
