@@ -25,8 +25,8 @@ from .results import Constant, SampleTime
 from .search import Optimum, search
 from .uncertainty import corrected
 
-WHITE = 0.06  # correlation of innovations that counts as none, and that is expected of chance in standard errors:
-CHANCE = 3.0  # the largest of 24 correlations (3 rates, 8 lags) is compared
+WHITE = 0.06  # largest correlation of innovations that count as white, besides chance
+CHANCE = 3.0  # standard errors of a correlation, of which the largest of 24 (3 rates, 8 lags) is compared
 AGREE = 2.0  # standard deviations between two answers that agree
 DISCRETE = 0.03  # share of a value that errors of discretisation add to it
 WIDER = 1.5  # intervals longer by this factor than those of samples twice as long agree with anything
