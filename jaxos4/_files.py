@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, shortened
+from .errors import InputError, in_words, shortened
 
 # Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
 BROKEN = (
@@ -33,6 +33,18 @@ BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
 )
+
+
+@contextlib.contextmanager
+def reading(place: object, fault: str, remedy: str, *errors: type[Exception]) -> Iterator[None]:
+    """Raises what a reader raises for a damaged file as an `InputError`. `errors`: those besides `BROKEN`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (*BROKEN, *errors) as error:
+        raise InputError(f"{place}: {fault} ({in_words(error)}); {remedy}.") from None
+
 
 _LARGEST_TEXT = 1 << 27  # bytes of a JSON or TOML file: a study with inputs of a million samples
 _MOST_VALUES = {

@@ -10,11 +10,12 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, in_words, shortened
+from .._files import reading
+from ..errors import shortened
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
 from .compression import check_parts, check_sizes
 from .messages import ANGLES, RATES, Fields, Messages, Names
@@ -57,17 +58,13 @@ def read_ros(path: Path, columns: ColumnMap | None = None) -> tuple[Table, tuple
         import rosbags  # noqa: F401
     except ImportError:
         refuse(path, "reading a ROS bag needs rosbags; install jaxos4[ros]")
-    try:
+    with _damage(path):
         reader = _reader(path)
         with _only_tables(path):
             reader.open()
         if getattr(getattr(reader, "metadata", None), "compression_mode", "") == "message":
             every = (message for store in reader.storages for *_, message in store.messages(store.connections))
             check_parts(path, (("zstd", message) for message in every))
-    except InputError:
-        raise
-    except Exception as error:  # noqa: BLE001 - of a damaged file, rosbags raises any
-        _refuse_damage(path, error)
     try:
         return _read(path, reader, columns)
     finally:
@@ -127,8 +124,8 @@ def _only_tables(path: Path) -> Iterator[None]:
         apsw.connection_hooks.remove(check)
 
 
-def _refuse_damage(path: Path, error: Exception) -> NoReturn:
-    refuse(path, f"cannot be decoded ({in_words(error)}); {_REPAIR}")
+def _damage(path: Path) -> contextlib.AbstractContextManager[None]:
+    return reading(path, "cannot be decoded", _REPAIR, Exception)  # of a damaged file, rosbags raises any
 
 
 def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
@@ -166,7 +163,7 @@ def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
         topic: [(values.append, _getter(path, topic, f)) for f, values in t.fields.items()]
         for topic, t in found.items()
     }
-    try:
+    with _damage(path):
         decode = _decoder(path, wanted, ros1=type(reader).__module__.startswith("rosbags.rosbag1"))
         for number, (connection, recorded, content) in enumerate(reader.messages(connections=wanted)):
             if number > MAX_ROWS:
@@ -176,10 +173,6 @@ def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
             topic.stamps.append(_stamp(message))
             for append, get in getters[connection.topic]:
                 append(get(message))
-    except InputError:
-        raise
-    except Exception as error:  # noqa: BLE001 - of a damaged file, rosbags raises any
-        _refuse_damage(path, error)
     return found
 
 

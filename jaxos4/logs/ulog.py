@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._files import BROKEN
-from ..errors import in_words
+from .._files import reading
 from .messages import ANGLES, FORCES, RATES, Fields, Messages, Names, motor_order
 from .sampling import HALF_TURN, Series, euler_angles, logged_rate
 from .table import LogFormat, Path, Table, fast_enough, needed, order_note, read_bytes, refuse
@@ -275,12 +274,10 @@ def _decoded(path: Path) -> Messages:
     content = read_bytes(path, 1 << 31)
     if content.endswith(bytes(64)):  # a loss of power leaves zeros at the end
         content = content.rstrip(b"\0")
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
-            log = ULog(_Content(content), sorted({*_TOPICS}))
-    except (*BROKEN, ULogException) as error:
-        refuse(path, f"cannot be decoded ({in_words(error)}); copy the log again from the vehicle")
+    damage = reading(path, "cannot be decoded", "copy the log again from the vehicle", ULogException)
+    with damage, contextlib.redirect_stdout(io.StringIO()):
+        _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
+        log = ULog(_Content(content), sorted({*_TOPICS}))
     if log.file_corruption:
         refuse(path, "is corrupt; copy the log again from the vehicle, or repair it")
     found: dict[str, dict[int, Fields]] = {}

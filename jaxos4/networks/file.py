@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._custom_types import as_float
-from .._files import BROKEN, check_plain, write_file
+from .._files import check_plain, reading, write_file
 from .._version import __version__
 from ..airframe import airframe_from_table, airframe_table
 from ..bracket import Bracket
-from ..errors import InputError, in_words, named
+from ..errors import InputError, named
 from ..flight import Flight
 from ..models import MODELS
 from ..shooting import ShootingProblem
@@ -26,6 +26,7 @@ from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_sca
 from .estimator import NetworkEstimator, TrainedNetwork
 from .features import Coordinates, Features
 
+_REMEDY = "train it again with `jaxos4 train`"
 _FORMAT = 5
 _BEFORE = 4  # without architectures: all networks are perceptrons
 
@@ -70,17 +71,12 @@ def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
     """Reads a file of `save_network`, by its path or open. Raises `InputError` for any other file, or `OSError`."""
     content = path if isinstance(path, io.BytesIO) else io.BytesIO(Path(path).read_bytes())
     place = "the network" if isinstance(path, io.BytesIO) else path
-    try:
+    with reading(place, "not a whole network file", _REMEDY, OSError):
         with zipfile.ZipFile(content) as archive:
             if sum(each.file_size for each in archive.infolist()) > content.getbuffer().nbytes:
                 raise ValueError("it announces more than it holds")
         with np.load(content, allow_pickle=False) as file:
             return _restore(place, {name: file[name] for name in file.files})
-    except InputError:
-        raise
-    except (*BROKEN, OSError) as error:
-        what = in_words(error)
-        raise InputError(f"{place}: not a whole network file ({what}); train it again with `jaxos4 train`.") from None
 
 
 def _restore(place: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
@@ -88,8 +84,8 @@ def _restore(place: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     if header["format"] == _BEFORE:
         arrays = {name.replace(".perceptron", ".correction"): array for name, array in arrays.items()}
     elif header["format"] != _FORMAT:
-        raise InputError(f"{place}: trained by another version of jaxos4; train it again with `jaxos4 train`.")
-    check_plain(place, header, "train it again with `jaxos4 train`")
+        raise InputError(f"{place}: trained by another version of jaxos4; {_REMEDY}.")
+    check_plain(place, header, _REMEDY)
     settings = NetworkEstimator(**header["settings"] | {"noise": tuple(header["settings"]["noise"])})
     if any(array.dtype.kind not in "fiu" for name, array in arrays.items() if name != "header"):
         raise ValueError("an array holds no numbers")

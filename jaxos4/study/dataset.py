@@ -20,9 +20,9 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
-from .._files import BROKEN, read_json, write_file
+from .._files import read_json, reading, write_file
 from .._version import __version__
-from ..errors import InputError, in_words, shortened
+from ..errors import InputError, shortened
 from ..models import MODELS
 from ..networks import TrainedNetwork, load_network
 from .cell import LEVELS, OUTCOMES, fly, setup_of
@@ -61,6 +61,7 @@ WIDE = ("model", "airframe", "width", "parameter")
 
 RESULTS_FILE = "results.nc"
 _SPECIFICATION, _LOCK = "study.json", "lock"
+_RUN_AGAIN = "delete it, and run the study again"
 _UNFINISHED = ".*.part*"  # files that were being written when a run was killed
 
 
@@ -88,14 +89,11 @@ class Store:
     def read(self, index: int) -> dict[str, np.ndarray] | None:
         """The results of a cell, or `None` if it is not finished. Raises `InputError` if its file is damaged."""
         path = self.cell_file(index)
-        try:
+        if not path.exists():
+            return None
+        with reading(path, "not a whole cell", _RUN_AGAIN):
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
                 return {name: file[name] for name in file.files}
-        except FileNotFoundError:
-            return None
-        except BROKEN as error:
-            what = f"not a whole cell ({in_words(error)}); delete it, and run the study again"
-            raise InputError(f"{path}: {what}.") from None
 
     def read_network(self, number: int) -> TrainedNetwork | None:
         """A network, or `None` if it is not trained. Raises `InputError` if its file is damaged."""
@@ -106,7 +104,7 @@ class Store:
         except FileNotFoundError:
             return None
         except InputError:
-            raise InputError(f"{path}: not a whole network; delete it, and run the study again.") from None
+            raise InputError(f"{path}: not a whole network; {_RUN_AGAIN}.") from None
 
 
 @contextlib.contextmanager
@@ -138,17 +136,12 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
 def read_store(directory: Path) -> Store:
     """Opens the folder of a study to read. Raises `InputError` if it holds no study, or one of another version."""
     path = directory / _SPECIFICATION
-    try:
+    if not path.exists():
+        raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.")
+    with reading(path, "not the specification of a study", "give another folder"):
         header = read_json(path, "give another folder")
         if (version := header["version"]) == __version__:
             return Store(directory, msgspec.convert(header["study"], Study), header["device"])
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.") from None
-    except InputError:
-        raise
-    except (*BROKEN, msgspec.MsgspecError) as error:
-        what = f"not the specification of a study ({in_words(error, 200)}); give another folder"
-        raise InputError(f"{path}: {what}.") from None
     raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {__version__}; give another folder.")
 
 
@@ -198,15 +191,12 @@ def assemble(store: Store) -> xr.Dataset:
             where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
-        try:
+        with reading(store.cell_file(cell.number), "not a cell of this study", _RUN_AGAIN):
             for name, (_, kind, *_) in VARIABLES.items():
                 found = results[name].astype(kind, casting="same_kind")
                 arrays[name][shared if name == "truth" else own] = found
             if not np.isin(results["result"], np.arange(len(OUTCOMES))).all():
                 raise ValueError("unknown result")
-        except BROKEN:
-            path = store.cell_file(cell.number)
-            raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
     variables = {name: (dims(name), arrays[name], _named(*about[2:])) for name, about in VARIABLES.items()}
     command = {"command": "jaxos4 study specification.toml --out .", "failures": json.dumps(failures)}
     dataset = xr.Dataset(variables | _brackets(study), coordinates, provenance(study, store.device) | command)

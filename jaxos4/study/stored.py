@@ -10,7 +10,7 @@ from typing import Any, get_type_hints
 import numpy as np
 import xarray as xr
 
-from .._files import BROKEN, check_plain
+from .._files import BROKEN, check_plain, reading
 from ..errors import InputError, shortened
 from .dataset import RESULTS_FILE, VARIABLES, WIDE, dims
 from .metrics import SCENARIO
@@ -51,13 +51,10 @@ def read_results(directory: Path) -> xr.Dataset:
         raise InputError(f"{directory}: no such folder; {_REMEDY}.")
     if not path.is_file():
         raise InputError(f"{directory}: holds no {RESULTS_FILE}; {_REMEDY}.")
-    try:
+    with reading(path, "not a netCDF file that can be read", "run the study again", OSError):
         _probe(path)
         with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
             dataset = opened.load()
-    except (OSError, *BROKEN) as error:
-        what = shortened(" ".join(str(error).split()), 120)
-        raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
     if fault := _fault(dataset):
         raise InputError(f"{path}: not the results of a study: {shortened(fault, 200)}; {_REMEDY}.")
     _check_texts(path, dataset)
@@ -109,7 +106,7 @@ def _check_texts(path: Path, dataset: xr.Dataset) -> None:
     try:
         failures = json.loads(dataset.attrs.get("failures", "[]"))
         wrong = [each for each in failures if not {"cell", "message", *SCENARIO} <= each.keys()]
-    except (*BROKEN, RecursionError):
+    except BROKEN:
         failures, wrong = [], [None]
     if wrong:
         raise InputError(f"{path}: `failures` is not a list of cells that failed; {_REMEDY}.")
