@@ -11,7 +11,7 @@ from jaxtyping import Float
 from .._files import write_atomically, write_netcdf
 from .._version import __version__
 from ..errors import InputError
-from ..identification.results import finite_or_none
+from ..identification.tables import finite_or_none
 from .motion import PARTS, departures
 
 if TYPE_CHECKING:

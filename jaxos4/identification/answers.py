@@ -30,10 +30,10 @@ from .results import (
     ParameterEstimate,
     RigidBody,
     SampleTime,
-    finite_or_none,
     has_answer,
 )
 from .search import Optimum
+from .tables import finite_or_none
 
 UNIT = "kg m^2"
 NEGATIVE_NOTE = "negative, which is impossible; set to 0"

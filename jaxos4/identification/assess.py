@@ -14,7 +14,7 @@ from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
 from .os4 import fit_os4
 from .problem import Intervals, bracket_of, os4_problem
-from .results import finite_or_none
+from .tables import finite_or_none
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):

@@ -24,7 +24,8 @@ from .data import Data, Progress
 from .doubts import doubts_of_log, doubts_of_os4, doubts_of_vehicle
 from .held_out import predict_held_out, validate_on, vehicle_traces
 from .quantities import os4_quantities, vehicle_quantities
-from .results import Identification, RigidBody, SampleTime, finite_or_none
+from .results import Identification, RigidBody, SampleTime
+from .tables import finite_or_none
 from .verdict import CONTRADICTED, judge
 
 # Predictions that a result keeps: those of four minutes, 200 kB of a page.

@@ -22,8 +22,9 @@ from ..shooting import ShootingProblem, padded, with_room
 from ..shooting.gains import LogNoise
 from .answers import Answer, channel_fits
 from .data import Data, HeldOut
-from .results import PredictionSkill, RateSkill, Validation, finite_or_none
+from .results import PredictionSkill, RateSkill, Validation
 from .search import Optimum
+from .tables import finite_or_none
 
 REGRESSION = EquationError(memory=0.9)
 """For comparison. This memory is the best on real flights."""

@@ -1,10 +1,8 @@
 """The result of an identification: typed, and as JSON."""
 
-import math
-from typing import TYPE_CHECKING, Any, SupportsFloat
+from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from .._custom_types import NotNegative, Positive
@@ -17,7 +15,7 @@ from ..estimate import Estimate
 from ..results import result_names
 from ..shooting import ShootingProblem
 from .data import Provenance
-from .tables import dataframe, dataset
+from .tables import as_list, dataframe, dataset
 from .verdict import Doubt, Verdict
 
 if TYPE_CHECKING:
@@ -33,11 +31,6 @@ LATE = 0.005  # s; motors that act earlier than they are recorded by more are re
 def has_answer(estimate: Estimate) -> bool:
     """Whether there is an estimate at all, trustworthy or not."""
     return str(result_names(estimate.result)) not in NO_ANSWER
-
-
-def finite_or_none(value: SupportsFloat) -> float | None:
-    """A number, or `None` if it is not finite."""
-    return float(value) if math.isfinite(float(value)) else None
 
 
 class ParameterEstimate(msgspec.Struct, frozen=True):
@@ -303,7 +296,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
         if self.response is not None:
             fields["response"] = self.response._asdict()
-        return msgspec.to_builtins(fields, enc_hook=_as_list)
+        return msgspec.to_builtins(fields, enc_hook=as_list)
 
     def summary(self, *, verbose: bool = False, width: int = 80) -> str:
         """The text of `jaxos4 estimate` on a terminal of this width [columns]. `verbose`: with all parameters."""
@@ -347,13 +340,6 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         about = {"estimator": self.estimator, "model": self.model, "result": self.result}
         parts, step = (self.parameters, self.covariance, self.predictions, self.response), self.provenance.sample_time
         return dataset(*parts, sample_time=step, **about)
-
-
-def _as_list(array: np.ndarray) -> list[Any]:
-    """An array as a list; `None` for what is not finite."""
-    values = array.astype(object)
-    values[~np.isfinite(array)] = None
-    return values.tolist()
 
 
 APART = {"rigid_body", "airframe", "estimate", "problem"}

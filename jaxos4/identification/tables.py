@@ -1,8 +1,9 @@
-"""A result as a pandas DataFrame, and as an xarray Dataset."""
+"""A result in other forms: arrays as lists, a pandas DataFrame, an xarray Dataset."""
 
+import math
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import numpy as np
 
@@ -18,6 +19,18 @@ if TYPE_CHECKING:
 
 _COLUMNS = ("kind", "unit", "estimate", "std", "low", "high", "bound", "note")
 _NONE = (None, None)
+
+
+def finite_or_none(value: SupportsFloat) -> float | None:
+    """A number, or `None` if it is not finite."""
+    return float(value) if math.isfinite(float(value)) else None
+
+
+def as_list(array: np.ndarray) -> list[Any]:
+    """An array as a list; `None` for what is not finite."""
+    values = array.astype(object)
+    values[~np.isfinite(array)] = None
+    return values.tolist()
 
 
 def dataframe(constants: Mapping[str, Any], parameters: Mapping[str, Any], fixed: Mapping[str, Any]) -> "pd.DataFrame":
