@@ -61,11 +61,18 @@ def test_the_picture_of_the_floors_is_up_to_date():
     assert drawn == floors_picture(ROOT / "pyproject.toml")
 
 
-def test_the_links_of_the_readme_lead_somewhere_and_are_absolute_in_a_release(tmp_path):
+PROSE = [*ROOT.glob("*.md"), *ROOT.glob(".github/*.md"), *ROOT.glob("experiments/*.md")]
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_the_links_of_pages_outside_of_the_site_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not link.startswith("https:") and not (page.parent / link).exists()] == []
+
+
+def test_the_links_of_the_readme_are_absolute_in_a_release(tmp_path):
     for name in ("README.md", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path)
-    links = re.findall(r"\]\(([^)#]+)", (ROOT / "README.md").read_text(encoding="utf-8"))
-    assert [link for link in links if not link.startswith("https:") and not (ROOT / link).exists()] == []
     there = ("https://example.org/jaxos4", "https://example.org/docs", "v1.0.0")
     subprocess.run([sys.executable, ROOT / ".ci" / "addresses.py", *there], cwd=tmp_path, check=True)
     links = re.findall(r"\]\(([^)#]+)", (tmp_path / "README.md").read_text(encoding="utf-8"))
@@ -80,6 +87,8 @@ def test_the_last_release_of_the_changelog_is_the_version_of_the_package():
     heads = re.findall(r"^## \[(.+?)\](.*)$", text, flags=re.MULTILINE)
     assert heads[0] == ("Unreleased", "")
     assert all(re.fullmatch(r" - \d{4}-\d\d-\d\d", date) for _, date in heads[1:])
+    releases = re.split(r"^## ", text, flags=re.MULTILINE)[1:]
+    assert all(len(re.findall(r"^- ", release, flags=re.MULTILINE)) <= 15 for release in releases)
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     assert heads[1][0] == version
     cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ COMMANDS = get_command(app).commands
 COMMAND = rf"(?:^|`)(jaxos4 (?:{'|'.join(COMMANDS)})\b[^`\n]*|python -m experiments \w[^`\n]*)"
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
-    for pattern in ("[!C]*.md", "CONTRIBUTING.md", "experiments/*.md", "docs/**/*.md")
+    for pattern in ("README.md", ".github/*.md", "experiments/*.md", "docs/**/*.md")
     for path in sorted(ROOT.glob(pattern))
 }
 EXAMPLES = {r"NAME(?=.*study\.toml|\.plot)": "frontier", "NAME": "coverage"}  # of an experiment
