@@ -1,4 +1,4 @@
-"""Verdicts of moments of inertia on real flights, each identified alone by the defaults; and whether repeated flights agree.
+"""Verdicts of moments of inertia on real flights, each identified alone; and whether repeated flights agree.
 
 The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.
 """
