@@ -1,5 +1,6 @@
 """The pictures of the documentation, drawn from real results: `python -m experiments pictures.run docs/pictures`."""
 
+import shutil
 import tomllib
 from html import escape
 from pathlib import Path
@@ -20,7 +21,7 @@ from jaxos4.identification.verdict import ADVICE
 from jaxos4.results import NINETY_FIVE
 
 BLUE, ORANGE, INK, GREY = "#0072b2", "#d55e00", "#1b1e23", "#b9bec6"
-PICTURES = ("estimate", "halving", "sweeps", "floors", "real")
+PICTURES = ("estimate", "halving", "sweeps", "floors", "real", "page")
 PENDULUM = {"Ix": 7.21e-4, "Iy": 7.76e-4, "Iz": 8.86e-4}  # of the CineRat, by its authors [kg m^2], to 7 %
 ROOMS = {
     "cli": "reads the arguments, calls the library, prints",
@@ -229,21 +230,36 @@ def draw_from_above(axes, airframe: jaxos4.Airframe) -> None:
     axes.axis("off")
 
 
+def page_picture(page: Path, picture: Path) -> None:
+    """The top of a page of `jaxos4 estimate --report` as a browser shows it, as PNG."""
+    from playwright.sync_api import sync_playwright  # brings no browser, and only this picture needs it
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        sight = browser.new_page(viewport={"width": 1280, "height": 640})
+        sight.goto(page.resolve().as_uri())
+        sight.screenshot(path=picture)
+
+
 def main(
     out: Annotated[Path, typer.Argument(help="The folder to write to.")],
     only: Annotated[list[str] | None, typer.Option(help=f"Some of {', '.join(PICTURES)}; all by default.")] = None,
     pyproject: Annotated[Path, typer.Option(help="Where the floors are written.")] = Path("pyproject.toml"),
-    result: Annotated[Path | None, typer.Option(help="For `real`: what README's `estimate` wrote.")] = None,
+    result: Annotated[Path | None, typer.Option(help="For `real`: README's result of the CineRat.")] = None,
+    page: Annotated[Path | None, typer.Option(help="For `page`: README's page of the simulated flight.")] = None,
 ) -> None:
-    """Draws the pictures of the documentation as SVG."""
+    """Draws the pictures of the documentation."""
     chosen = only or list(PICTURES)
+    for name, needed, given in (("real", "--result", result), ("page", "--page", page)):
+        if name in chosen and given is None:
+            raise SystemExit(f"{needed}: give the file for the picture `{name}`, or choose other pictures by --only.")
     out.mkdir(parents=True, exist_ok=True)
     if "floors" in chosen:
         (out / "floors.svg").write_text(floors_picture(pyproject))
     drawings = {}
-    if "real" in chosen:
-        if result is None:
-            raise SystemExit("--result: give the result file of the CineRat, or other pictures by --only.")
+    if page is not None and "page" in chosen:
+        page_picture(page, out / "page.png")
+    if result is not None and "real" in chosen:
         drawings["real"] = lambda: real_picture(jaxos4.read_result(result))
     if {"estimate", "halving", "sweeps"} & set(chosen):
         model, problem, bracket, estimate = simulated()
