@@ -16,10 +16,10 @@ from .mounting import earth_axes, tilted_force
 
 _ATTITUDE = (*INERTIAS, "attitude")
 _CLOCKS = {  # how to say that it is wrong, and what it concerns
-    "gyro": ("is", INERTIAS),
-    "accelerometer": ("is", (*INERTIAS, "thrust", "motors")),
-    "attitude": ("is", ("attitude",)),
-    "motors": ("are", ("motors",)),
+    "gyro": ("is", "lags", INERTIAS),
+    "accelerometer": ("is", "lags", (*INERTIAS, "thrust", "motors")),
+    "attitude": ("is", "lags", ("attitude",)),
+    "motors": ("are", "lag", ("motors",)),
 }
 _UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
 # Clipped thrust seems weaker, and moments of inertia are proportional to it.
@@ -265,16 +265,20 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
     best = np.argsort(misfit)
     names, likely = [*_CLOCKS], misfit[best[0]] + evidence.limits.likelier
     named = {names[i]: i for i in best if misfit[i] < likely}
+    off = wrong[best[0]]
     causes = [
         f"the {name} {_CLOCKS[name][0]} recorded {1e3 * abs(wrong[i]):.0f} ms {'late' if wrong[i] > 0 else 'early'}"
         for name, i in named.items()
     ]
+    if len(named) == 2 and wrong[[*named.values()]].prod() < 0:  # one difference of two clocks, seen from either
+        early, behind = sorted(named, key=lambda name: wrong[named[name]])
+        causes, off = [f"the {behind} {_CLOCKS[behind][1]} the {early}"], abs(off)
     return Finding(
         "_or_".join(named) + "_clock",
         ", or ".join(causes),
-        f"{1e3 * wrong[best[0]]:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
+        f"{1e3 * off:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
         "shift the time stamps, or log without a filter",
-        tuple(dict.fromkeys(quantity for name in named for quantity in _CLOCKS[name][1])),
+        tuple(dict.fromkeys(quantity for name in named for quantity in _CLOCKS[name][2])),
         # The delay of the motors is estimated with the other parameters.
         bool(abs(wrong[best[0]]) > evidence.limits.late and "motors" not in named),
     )
