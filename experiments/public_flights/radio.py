@@ -34,7 +34,7 @@ def main(
     settings, report = jaxos4.VehicleSettings(sample_time=STEP, end=end), {}
     for n in every:
         found = jaxos4.identify([thinned(recording, float(n))], AIRFRAME, settings=settings).to_dict()
-        report[n] = {name: found[name] for name in ("result", "verdicts", "parameters", "constants")}
+        report[n] = {name: found[name] for name in ("result", "doubts", "verdicts", "parameters", "constants")}
         write_report(out, report)
     rows = []
     for n, found in report.items():
