@@ -49,12 +49,13 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yields a temporary path beside `path`, with its suffix, and renames it to `path` when the block ends.
 
     If the block raises, an older `path` does not change. Links are followed, and the mode of an older file is kept. A
-    pipe or a device is yielded itself. Raises `OSError` that names `path`.
+    pipe or a device is yielded itself. Raises `OSError` that names `path`, and `InputError` if nobody reads a pipe.
     """
     target = check_writable(path)
     if target.exists() and not target.is_file():
         try:
-            yield target
+            with _with_a_reader(target):
+                yield target
         except OSError as error:
             raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
@@ -70,6 +71,24 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _with_a_reader(target: Path) -> Iterator[None]:
+    """Keeps a pipe open for the block. To open one that nobody reads would wait for ever."""
+    if not target.is_fifo():
+        yield
+        return
+    try:
+        descriptor = os.open(target, os.O_WRONLY | os.O_NONBLOCK)
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        raise InputError(f"{target}: nobody reads this pipe; start its reader first.") from None
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def write_file(path: str | os.PathLike[str], content: str | bytes | memoryview) -> None:

@@ -28,7 +28,7 @@ from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
 
 import jaxos4
-from jaxos4._files import read_toml
+from jaxos4._files import read_toml, write_file
 from jaxos4.airframe import load_airframe
 from jaxos4.errors import InputError
 from jaxos4.export import TARGETS, export_vehicle, read_result
@@ -247,6 +247,18 @@ def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, ca
     with pytest.raises(InputError, match="no |more than it holds"):
         read_results(tmp_path)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
+def test_a_pipe_is_written_if_somebody_reads_it_and_else_refused(tmp_path):
+    """To open a pipe without a reader would wait for ever."""
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe: nobody reads this pipe; start its reader first"):
+        write_file(pipe, "x")
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_file(pipe, "x")
+    assert os.read(reader, 9) == b"x"
+    os.close(reader)
 
 
 # Texts in exported files and drafts
