@@ -104,6 +104,14 @@ def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None
     write_file(path, dataset.to_netcdf(engine="h5netcdf", encoding=packed))  # in memory: HDF5 can crash on a full disk
 
 
+def at_once(path: str, flags: int) -> int:
+    """For `open(path, opener=at_once)`: a pipe that nobody writes is empty, where `open` would wait for ever."""
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if hasattr(os, "O_NONBLOCK"):
+        os.set_blocking(descriptor, True)
+    return descriptor
+
+
 def check_writable(path: str | os.PathLike[str]) -> Path:
     """`path` with links resolved. Raises `OSError` if it is a folder, or its folder is missing or not writable."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
@@ -141,7 +149,7 @@ def read_json(path: str | os.PathLike[str], remedy: str, largest: float = _LARGE
 def _read_text(
     path: str | os.PathLike[str], decode: Callable[[bytes], Any], kind: str, remedy: str, largest: float
 ) -> Any:
-    with open(path, "rb") as file:
+    with open(path, "rb", opener=at_once) as file:
         content = file.read(_LARGEST_TEXT + 1)
     if len(content) > _LARGEST_TEXT:
         raise InputError(f"{path}: has more than {_LARGEST_TEXT:,} bytes; {remedy}.")
