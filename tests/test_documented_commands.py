@@ -136,4 +136,4 @@ def test_the_commands_of_pages_run(story, run, tmp_path, request):
         )
         assert " ".join(verdicts.split()) in said
         (whole,) = (block for block in blocks(ROOT / "docs/drone.md") if block.startswith(verdicts))
-        assert in_words(whole[whole.index("predictions:") : whole.index("note:")]) in in_words(said)
+        assert in_words(whole[whole.index("predictions: better") : whole.index("note:")]) in in_words(said)
