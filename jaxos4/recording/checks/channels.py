@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...airframe import AXES, INERTIAS, MOTIONS
+from ...errors import percent
 from ...flight import FORCE_NAMES, RATES
 from ...logs.table import counted
 from ..motion import excitation
@@ -15,10 +16,10 @@ from .mounting import earth_axes, tilted_force
 
 _ATTITUDE = (*INERTIAS, "attitude")
 _CLOCKS = {  # how to say that it is wrong, and what it concerns
-    "gyro": ("is", INERTIAS),
-    "accelerometer": ("is", (*INERTIAS, "thrust", "motors")),
-    "attitude": ("is", ("attitude",)),
-    "motors": ("are", ("motors",)),
+    "gyro": ("is", "lags", INERTIAS),
+    "accelerometer": ("is", "lags", (*INERTIAS, "thrust", "motors")),
+    "attitude": ("is", "lags", ("attitude",)),
+    "motors": ("are", "lag", ("motors",)),
 }
 _UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
 # Clipped thrust seems weaker, and moments of inertia are proportional to it.
@@ -34,7 +35,7 @@ def uneven_time(evidence: Evidence) -> Finding | None:
         return None
     missing = 1 - (steps.size + 1) / (np.sum(steps) / step + 1)
     if missing > 0:
-        size = f"{100 * missing:.2g} % of the samples are missing, in gaps of up to {1e3 * steps.max():.3g} ms"
+        size = f"{percent(missing)} of the samples are missing, in gaps of up to {1e3 * steps.max():.3g} ms"
     else:
         size = f"steps of {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms"
     return Finding(
@@ -67,7 +68,7 @@ def clipped_values(evidence: Evidence) -> Finding | None:
     found = evidence.plausible.clipped
     if not found:
         return None
-    each = [f"{n}: {count} ({100 * share:.2g} %) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
+    each = [f"{n}: {count} ({percent(share)}) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
     many = bool(max(share for _, share, _ in found.values()) > evidence.limits.clipped)
     return Finding(
         "clipped_values",
@@ -264,16 +265,20 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
     best = np.argsort(misfit)
     names, likely = [*_CLOCKS], misfit[best[0]] + evidence.limits.likelier
     named = {names[i]: i for i in best if misfit[i] < likely}
+    off = wrong[best[0]]
     causes = [
         f"the {name} {_CLOCKS[name][0]} recorded {1e3 * abs(wrong[i]):.0f} ms {'late' if wrong[i] > 0 else 'early'}"
         for name, i in named.items()
     ]
+    if len(named) == 2 and wrong[[*named.values()]].prod() < 0:  # one difference of two clocks, seen from either
+        early, behind = sorted(named, key=lambda name: wrong[named[name]])
+        causes, off = [f"the {behind} {_CLOCKS[behind][1]} the {early}"], abs(off)
     return Finding(
         "_or_".join(named) + "_clock",
         ", or ".join(causes),
-        f"{1e3 * wrong[best[0]]:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
+        f"{1e3 * off:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
         "shift the time stamps, or log without a filter",
-        tuple(dict.fromkeys(quantity for name in named for quantity in _CLOCKS[name][1])),
+        tuple(dict.fromkeys(quantity for name in named for quantity in _CLOCKS[name][2])),
         # The delay of the motors is estimated with the other parameters.
         bool(abs(wrong[best[0]]) > evidence.limits.late and "motors" not in named),
     )
