@@ -12,6 +12,7 @@ from typer import Argument, Option
 import jaxos4
 
 from .._files import write_file
+from .._xla import add_flags
 from ..errors import InputError, in_words, printable
 from ._shared import ESTIMATORS, check_outputs, stages
 
@@ -169,6 +170,7 @@ def _compare_results(results: list[Path], page: Path | None) -> None:
 
 def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
+    add_flags(brief=quick)
     with stages("loading the library"):
         from rich.console import Console
 
