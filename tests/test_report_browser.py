@@ -209,6 +209,7 @@ def test_signals_zoom_together_and_stay_so(opened):
     page = opened("vehicle")
     values = page.locator("#timeline .u-value")
     page.locator("#timeline").scroll_into_view_if_needed()
+    assert {*values.all_text_contents()} == {""}  # no mark of a missing number beside a name
     assert page.locator("#view option:checked").text_content() == "0.248 s ahead"
     drawn = "() => [...document.querySelectorAll('#timeline canvas')].map(canvas => canvas.toDataURL())"
     changed = "before => document.querySelector('#timeline canvas').toDataURL() !== before"

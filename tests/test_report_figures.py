@@ -116,7 +116,7 @@ def of_pages():
     yield made.inertias_by_sample_time(SAMPLE_TIMES, 0.008, LOOK)
     yield made.priors(os4, LOOK)
     yield made.residual_figure(os4.correlations)
-    yield made.path_in_space(os4.traces, LOOK)
+    yield made.path(os4.traces, LOOK)
     yield made.correlation_matrix(os4, LOOK)
     yield forest(compare_results([vehicle, vehicle]), LOOK)
     log = flown(CRAZYFLIE, 0)

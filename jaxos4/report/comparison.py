@@ -167,8 +167,7 @@ def _forest(found: Comparison) -> list[Part]:
         return []
     of = enumerate(zip(found.names, found.flights, strict=True), start=1)
     caption = f"{'; '.join(f'{place}: {name}, of {flights}' for place, (name, flights) in of)}."
-    about = "Each quantity in each result, with 95 % intervals"
-    return [Picture(forest(found, style(0)), about, caption)]
+    return [Picture(forest(found, style(0)), f"Each quantity in each result, with 95 % intervals. {caption}")]
 
 
 def _pooled(found: Comparison) -> Part:

@@ -1,9 +1,7 @@
 """The figures of an identification's page."""
 
-import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -47,7 +45,7 @@ def priors(found: Identification, look: Style) -> Figure | None:
     label = "from the bracket's centre, in half-widths"
     x = Scale("symlog" if is_far else "linear", (-reach, reach), {at: f"{at:g}" for at in ticks}, label)
     y = Scale(ends=(len(rows) - 0.4, -0.6), ticks=dict(enumerate(rows)), lines=False)
-    return Figure("priors", [Panel("", [*marks, lines, points, names], x, y, height=60 + 20 * len(rows))])
+    return Figure("priors", [Panel("", [*marks, lines, points, names], x, y, 340, 60 + 20 * len(rows))])
 
 
 def residual_figure(found: Correlations) -> Figure:
@@ -72,35 +70,18 @@ def residual_figure(found: Correlations) -> Figure:
     return Figure("residuals", panels, columns=2)
 
 
-def path_in_space(traces: Traces, look: Style, *, turn: float = -60.0, height: float = 28.0) -> Figure:
-    """The measured path in its box, with its shadow; an OS4's prediction. `turn`, `height`: of the view [degrees]."""
-    turned, up = np.radians([turn, height])
-    right = np.array([-np.sin(turned), np.cos(turned), 0.0])
-    above = np.array([-np.cos(turned) * np.sin(up), -np.sin(turned) * np.sin(up), np.cos(up)])
-    paths = [traces.position]
+def path(traces: Traces, look: Style) -> Figure:
+    """The measured path from above and from two sides, and an OS4's prediction."""
+    paths, panels = [traces.position], []
     if traces.predicted.shape[1] == len(CASCADE_ORDER):
         paths.append(traces.predicted[:, [6, 8, 10]])
-    every = np.concatenate(paths)
-    low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
-    room = np.maximum(0.05 * np.max(high - low) - (high - low) / 2, 0.0) + 1e-3
-    low, high = low - room, high + room
-    corners = np.where(list(np.ndindex(2, 2, 2)), high, low)
-
-    def line(points: Float[np.ndarray, "_points 3"], **how: Any) -> Line:
-        return Line(points @ right, points @ above, **how)
-
-    edges = [each for each in itertools.combinations(range(8), 2) if np.sum(corners[each[0]] != corners[each[1]]) == 1]
-    shadow = np.column_stack([traces.position[:, :2], np.full(len(traces.position), low[2])])
-    marks: list[Mark] = [line(corners[list(each)], color=FAINT, width=0.8) for each in edges]
-    marks += [line(shadow, color=FAINT, width=1.0, name="shadow")]
-    marks += [line(paths[0], width=1.2, dash=BOUND_DASHES[1], name="measured, from the dot on")]
-    marks += [line(path, color=look.color, name="predicted") for path in paths[1:]]
-    marks += [line(paths[0][:1], width=0, marker="o", size=6)]
-    for axis, ends in enumerate(([0, 4], [4, 6], [0, 1])):  # the edges in front, and the left one
-        middle = corners[ends].mean(axis=0)
-        text = f"{'xyz'[axis]} {low[axis]:.3g} to {high[axis]:.3g} m"
-        marks.append(Words(float(middle @ right), float(middle @ above), text, "start" if axis == 1 else "end"))
-    return Figure("path", [Panel("", marks, width=430, height=340, equal=True, bare=True)])
+    for title, i, j in (("from above", 0, 1), ("from the side", 0, 2), ("from the front", 1, 2)):
+        marks = [Line(*paths[0].T[[i, j]], width=1.2, dash=BOUND_DASHES[1], name="measured, from the dot on")]
+        marks += [Line(*each.T[[i, j]], color=look.color, name="predicted") for each in paths[1:]]
+        marks += [Line(*paths[0][:1].T[[i, j]], width=0, marker="o", size=6)]
+        x, y = Scale(label=f"{'xyz'[i]} [m]"), Scale()
+        panels.append(Panel(f"{title}: {'xyz'[j]} [m]", marks, x, y, height=300, equal=True))
+    return Figure("path", panels)
 
 
 def correlations(found: Identification) -> Float[np.ndarray, "parameters parameters"]:

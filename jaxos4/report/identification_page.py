@@ -107,7 +107,6 @@ def _vehicle(found: Identification, look: Style) -> Part:
     known = f"{', '.join(where)} (95 %), if all rotors are alike" if center else "not estimated"
     return Picture(
         figures.vehicle(found.airframe, found.rigid_body.constants, center, look),
-        "The vehicle from above, and its moments of inertia",
         "Left: rotors with their number and the direction in which they turn; the cross: centre of mass, "
         f"{known}. Right: moments of inertia.",
     )
@@ -121,7 +120,7 @@ def _sample_times(found: Identification, look: Style) -> list[Part]:
         "The same flight, fitted with several sample times. Short samples contain the vibration of the sensors, long "
         "samples hide motion. A moment of inertia that depends on the sample time is not to be trusted."
     )
-    return [Picture(figure, "Moments of inertia against the sample time", caption)]
+    return [Picture(figure, caption)]
 
 
 def _parameters(found: Identification) -> Part:
@@ -152,7 +151,7 @@ def _posteriors(found: Identification, look: Style) -> list[Part]:
             "An interval as long as its bracket means that the flight adds nothing; one at an end or outside, that the "
             f"bracket may be wrong.{prior}"
         )
-        parts.append(Picture(figure, "Brackets and intervals of the parameters", caption))
+        parts.append(Picture(figure, caption))
     if found.covariance is not None and len(found.covariance) > 1:
         pairs = ", ".join(f"{one} and {other} ({value:.2f})" for one, other, value in figures.strongest(found))
         most = f" Strongest: {pairs}. This flight cannot separate such parameters." if pairs else ""
@@ -160,7 +159,7 @@ def _posteriors(found: Identification, look: Style) -> list[Part]:
             "Correlations of the estimates: marks as large as the correlation. A name stands at the end of its row, "
             f"and where its column begins.{most}"
         )
-        parts.append(Picture(figures.correlation_matrix(found, look), "Correlations of the estimates", caption))
+        parts.append(Picture(figures.correlation_matrix(found, look), caption))
     return parts
 
 
@@ -193,15 +192,14 @@ def _residuals(found: Identification) -> list[Part]:
             "roll, pitch and yaw, at a positive lag before the residual. "
         )
         figure = figures.residual_figure(found.correlations)
-        parts.append(Picture(figure, "Correlations of the residuals", caption + what))
+        parts.append(Picture(figure, caption + what))
     return parts
 
 
 def _path(found: Identification, look: Style) -> list[Part]:
     if found.traces is None or not np.isfinite(found.traces.position).any():
         return []
-    caption = "The measured path, with its shadow on the floor."
-    return [Picture(figures.path_in_space(found.traces, look), "The path of the vehicle in space", caption)]
+    return [Picture(figures.path(found.traces, look), "The path of the vehicle, with one scale on both axes.")]
 
 
 def _disturbances(found: Identification) -> list[Part]:
@@ -259,7 +257,7 @@ def _response(found: Identification, look: Style) -> list[Part]:
         "than 1 shows that the model is wrong; a gain of 1 does not prove it right, because the same flight was fitted."
     )
     figure = figures.frequency_responses(found.response, look)
-    picture = Picture(figure, "Frequency response of roll, pitch and yaw", caption)
+    picture = Picture(figure, caption)
     return [Text(f"{'; '.join(gains)}."), picture]
 
 

@@ -147,7 +147,7 @@ def _motors(flown: Sequence[Recording], full: float) -> list[Part]:
         f"The share of the usable time that each motor spends at each {kind}. Motors at a limit cannot answer the "
         "controller, and their parts are not used."
     )
-    return [Picture(motors(flown, full), "How often each motor has which speed", caption)]
+    return [Picture(motors(flown, full), caption)]
 
 
 def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> list[Part]:
@@ -161,7 +161,7 @@ def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> li
         "above is vibration; vibration above half the sampling rate folds down into the motion, and no setting removes "
         "it."
     )
-    return [Picture(figure, "Spectra of gyro and accelerometer", caption)]
+    return [Picture(figure, caption)]
 
 
 def verdict(found: Inspection) -> str:

@@ -12,32 +12,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .panels import Band, Figure, Line, Panel, Words
-from .style import GRID, INK, PAPER
+from .style import GRID, INK
 
 _POINT = 0.75  # of a pixel
-_INKED = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color", "xtick.color", "ytick.color")
 _RC: dict[Any, Any] = {
-    **dict.fromkeys(_INKED, INK),
-    **dict.fromkeys(("axes.labelsize", "font.size", "legend.fontsize"), 8.5),
-    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), 8),
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.linewidth": 0.7,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 9,
-    "figure.facecolor": PAPER,
-    "axes.facecolor": "none",
-    "font.family": "DejaVu Sans",
-    "grid.color": GRID,
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "lines.linewidth": 1.4,
-    "lines.markersize": 5,
-    "pdf.fonttype": 42,  # letters stay letters
-    "svg.fonttype": "path",
-    "svg.hashsalt": "jaxos4",
+    **dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), INK),
+    **dict.fromkeys(("axes.spines.right", "axes.spines.top", "legend.frameon"), False),
+    **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
+    **{"axes.titlelocation": "left", "axes.titlesize": 9, "axes.linewidth": 0.7, "axes.facecolor": "none"},
+    **{"font.size": 8.5, "grid.color": GRID, "grid.linewidth": 0.6, "lines.linewidth": 1.4, "lines.markersize": 5},
+    **{"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "jaxos4"},  # in a PDF, letters stay letters
     "text.parse_math": False,  # names come from files: a dollar sign in one is a dollar sign
 }
 

@@ -55,10 +55,9 @@ class Table(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A figure with its caption. `description`: what a screen reader says."""
+    """A figure with its caption, whose first sentence is what a screen reader says."""
 
     figure: Figure
-    description: str
     caption: str
     title: str = ""
     kind = "picture"
@@ -66,7 +65,7 @@ class Picture(NamedTuple):
     @property
     def drawn(self) -> Markup:
         """The figure as SVG."""
-        return inline(self.figure, self.description)
+        return inline(self.figure, self.title or self.caption.split(". ")[0])
 
 
 class Signals(NamedTuple):

@@ -139,8 +139,8 @@ class Panel(NamedTuple):
     marks: Sequence[Mark]
     x: Scale = Scale()
     y: Scale = Scale()
-    width: float = 340.0
-    height: float = 210.0
+    width: float = 290.0
+    height: float = 185.0
     subtitle: str = ""
     equal: bool = False
     bare: bool = False

@@ -76,5 +76,5 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
         lines = np.concatenate([y, seen])
         low, high = float(np.nanmin(lines)), float(np.nanmax(lines))
         room = 0.4 * (high - low) + 1e-3
-        panels.append(Panel(title, marks, Scale(label="time [s]"), Scale(ends=(low - room, high + room)), height=190))
+        panels.append(Panel(title, marks, Scale(label="time [s]"), Scale(ends=(low - room, high + room))))
     write_file(path, as_file(Figure("prediction", panels)))

@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from .._files import check_writable, write_file
+from ..logs.table import counted
 from ..study import metrics
 from . import one_flight, study_tables
 from .page import Folded, Part, Picture, Section, Text, page
@@ -26,37 +27,33 @@ _AGAIN = f"jaxos4 study {_SPECIFICATION} --out .  # in the folder of this page"
 _WIDEST, _NARROWEST = 4.0, 1.4  # line widths [px] of the first and the last estimator, so that none hides another
 _EVERYWHERE = (-np.inf, np.inf)
 _BEST = "1 is the best that an unbiased estimator can do."
-# Of each figure: its title, its caption, and the variables that it shows.
+# Of each figure: its title and its caption.
 _WORDS = {
     "intervals": (
         "Estimates and their intervals",
-        "Estimate - truth of each parameter, in multiples of the smallest Cramer-Rao bound of any estimator, with the "
-        "intervals of {level}. The line at 0 is the truth.",
-        "estimate, truth, half_width, bound",
+        "Estimate - truth of each parameter, in multiples of the smallest Cramer-Rao bound of any estimator, with "
+        "intervals. The line at 0 is the truth. From estimate, truth, half_width, bound.",
     ),
     "overview": (
         "Which method, at which noise?",
         "RMSE / least bound of any estimator (geometric mean over the parameters), with the 95 % Monte-Carlo interval "
         f"of one parameter; left against noise, right against simulated flights. {_BEST} An estimator that looks at "
-        "the body rates alone cannot reach 1 if others see more channels.",
-        "estimate, truth, bound, rollouts, result (metrics.accuracy, mean_rollouts)",
+        "the body rates alone cannot reach 1 if others see more channels. From metrics.accuracy, mean_rollouts.",
     ),
     "error": (
         "Error against noise",
-        "Root-mean-square error over the converged flights. Lines without marks: the Cramer-Rao bound of the channels "
-        "used.",
-        "estimate, truth, bound, seen, result",
+        "Root-mean-square error over the converged flights, and the Cramer-Rao bounds of the channels used. From "
+        "metrics.estimator_error, bound_error.",
     ),
     "efficiency": (
         "Efficiency against noise",
-        f"RMSE / bound, each estimator relative to its own bound, with 95 % Monte-Carlo intervals. {_BEST}",
-        "estimate, truth, bound, result",
+        f"RMSE / bound, each estimator relative to its own bound, with 95 % Monte-Carlo intervals. {_BEST} From "
+        "metrics.efficiency.",
     ),
     "coverage": (
         "Coverage by level",
         "Share of intervals that contain the truth, averaged over the parameters, with 95 % Monte-Carlo intervals. "
-        "Long lines: the level that the intervals claim.",
-        "estimate, truth, half_width, result",
+        "Long lines: the level that the intervals claim. From metrics.mean_coverage.",
     ),
 }
 
@@ -68,7 +65,7 @@ def write_report(dataset: xr.Dataset, directory: Path, *, pdf: bool = False) -> 
     """
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
-    sections, drawn, several = [], [], sum(1 for _ in scenarios(dataset)) > 1
+    sections, drawn, several = [], [], len(list(scenarios(dataset))) > 1
     for scenario in scenarios(dataset):
         figures = draw(scenario, several=several) if scenario.number <= MOST_DRAWN else {}
         sections += _scenario(scenario, figures, bool((dataset["scale"] == 0).any()))
@@ -78,7 +75,7 @@ def write_report(dataset: xr.Dataset, directory: Path, *, pdf: bool = False) -> 
     text = page(
         title=attributes.get("title", "") or "A study",
         about=_about(dataset),
-        top=_trouble(dataset, _AGAIN if specification else ""),
+        top=_trouble(dataset),
         sections=sections,
         command=_AGAIN if specification else "",
         provenance=[(shown, attributes[name]) for name, shown in _PROVENANCE.items() if name in attributes],
@@ -100,39 +97,34 @@ def write_report(dataset: xr.Dataset, directory: Path, *, pdf: bool = False) -> 
 
 
 def _about(dataset: xr.Dataset) -> str:
-    counts = (
-        len(names(dataset, "estimator")),
-        sum(1 for _ in scenarios(dataset)),
-        study_tables.cells_not_run(dataset)[1],
-    )
-    kinds = ("estimator", "scenario", "cell")
-    sizes = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for count, kind in zip(counts, kinds, strict=True))
+    counts = names(dataset, "estimator"), list(scenarios(dataset)), range(study_tables.cells_not_run(dataset)[1])
+    sizes = (counted(len(each), kind) for each, kind in zip(counts, ("estimator", "scenario", "cell"), strict=True))
     of_one = (
         " Each scenario has one flight: there are answers, but no statistics. The file of a study holds no signals; "
         "jaxos4 estimate FLIGHT --report shows those of a flight."
     )
-    about = f"Identification of a quadrotor's parameters from simulated, noisy flights: {sizes}."
+    about = f"Identification of a quadrotor's parameters from simulated, noisy flights: {', '.join(sizes)}."
     return about + of_one * one_flight.is_of_one(dataset)
 
 
-def _trouble(dataset: xr.Dataset, again: str) -> list[Part]:
+def _trouble(dataset: xr.Dataset) -> list[Part]:
     """Cells that were not run, and those that failed; scenarios without figures."""
-    (missing, cells), failed, parts = study_tables.cells_not_run(dataset), study_tables.failed_cells(dataset), []
+    (missing, cells), (failed, listed) = study_tables.cells_not_run(dataset), study_tables.failed_cells(dataset)
+    parts: list[Part] = []
     if missing:
-        runs = f"; {again} runs them" if again else ""
+        runs = "; the command at the end of the page runs them" * ("specification" in dataset.attrs)
         parts.append(Text(f"Incomplete: {missing} of {cells} cells have not been run yet{runs}.", "warning"))
-    if failed["total"]:
-        parts += [Text(f"{failed['total']} of {cells} cells failed:", "warning"), Text(failed["listed"])]
-    if (count := sum(1 for _ in scenarios(dataset))) > MOST_DRAWN:
-        said = f"The first {MOST_DRAWN} scenarios have figures; all {count} have tables."
-        parts.append(Text(said, "note"))
+    if failed:
+        parts += [Text(f"{failed} of {cells} cells failed:", "warning"), Text(listed)]
+    if (count := len(list(scenarios(dataset)))) > MOST_DRAWN:
+        parts.append(Text(f"The first {MOST_DRAWN} scenarios have figures; all {count} have tables.", "note"))
     return parts
 
 
 def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: bool) -> list[Section]:
     """The sections of one scenario."""
     number, label, data = scenario
-    of_one, level = one_flight.is_of_one(data), f"{100 * study_tables.shown_level(data):g} %"
+    of_one = one_flight.is_of_one(data)
     tables = {"estimates": one_flight.estimates(data)} if of_one else {}
     tables |= study_tables.scenario_tables(data)
     differ = "; ".join(f"{', '.join(who)} see {seen}" for seen, who in study_tables.channels_by_estimator(data).items())
@@ -141,10 +133,9 @@ def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: b
     def picture(name: str) -> list[Part]:
         if name not in figures:
             return []
-        (title, caption, source), figure = _WORDS[name], figures[name]
-        title, caption = title + differ * (name == "overview"), caption.format(level=level)
-        source = f"From {source}; drawn in figures/{figure.stem}.svg."
-        return [Picture(figure, f"{title}: {caption}", f"{caption} {source}", title)]
+        (title, caption), figure = _WORDS[name], figures[name]
+        title += differ * (name == "overview")
+        return [Picture(figure, f"{caption} Drawn in figures/{figure.stem}.svg.", title)]
 
     def table(name: str) -> Part:
         one = tables[name]
@@ -176,14 +167,11 @@ def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: b
 
 
 def _troubled(data: xr.Dataset) -> list[Part]:
-    found = study_tables.troubled_flights(data)
-    total, listed = found["total"], found["listed"]
-    if not total:
-        return []
+    total, listed = study_tables.troubled_flights(data)
     first = f"; the first {len(listed)}" if len(listed) < total else ""
     note = "These flights are counted in the table above, but not in errors, efficiency and coverage."
-    summary = f"{total} flight{'s' if total != 1 else ''} without a successful result{first}"
-    return [Folded(summary, [Text(listed), Text(note, "note")], is_open=True)]
+    summary = f"{counted(total, 'flight')} without a successful result{first}"
+    return [Folded(summary, [Text(listed), Text(note, "note")], is_open=True)] if total else []
 
 
 def _after(specification: str) -> list[Part]:

@@ -5,7 +5,7 @@ import io
 import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -179,8 +179,8 @@ def best_estimators(data: xr.Dataset) -> dict[str, str]:
     return {", ".join(scales) if len(best) > 1 else "every noise": names for names, scales in best.items()}
 
 
-def troubled_flights(data: xr.Dataset) -> dict[str, Any]:
-    """The flights that were run and did not converge: the first 20 `listed`, and the `total`."""
+def troubled_flights(data: xr.Dataset) -> tuple[int, list[str]]:
+    """The number of flights that were run and did not converge, and the first 20."""
     order = ("scale", "estimator", "flight")
     bad = (metrics.was_run(data) & ~metrics.converged(data)).transpose(*order).values
     results, places = data["result"].transpose(*order).values[bad], np.argwhere(bad)
@@ -190,18 +190,18 @@ def troubled_flights(data: xr.Dataset) -> dict[str, Any]:
         f"{scales[i]}, {estimators[j]}, flight {flights[k]}: {known.get(int(result), 'unknown result')}"
         for (i, j, k), result in zip(places[:_MOST_LISTED], results[:_MOST_LISTED], strict=True)
     ]
-    return {"listed": listed, "total": len(places)}
+    return len(places), listed
 
 
-def failed_cells(dataset: xr.Dataset) -> dict[str, Any]:
-    """The cells of a study that raised an error, with its message: the first 20 `listed`, and the `total`."""
+def failed_cells(dataset: xr.Dataset) -> tuple[int, list[str]]:
+    """The number of cells of a study that raised an error, and the first 20 with the message."""
     failures = json.loads(dataset.attrs.get("failures", "[]"))
     shown = [name for name in metrics.SCENARIO if dataset.sizes[name] > 1] or ["estimator"]
     listed = [
         f"cell {failure['cell']}, {', '.join(f'{name} {failure[name]}' for name in shown)}: {failure['message']}"
         for failure in failures[:_MOST_LISTED]
     ]
-    return {"listed": listed, "total": len(failures)}
+    return len(failures), listed
 
 
 def channels_by_estimator(data: xr.Dataset) -> dict[str, list[str]]:
