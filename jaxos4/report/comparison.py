@@ -183,8 +183,7 @@ def _pooled(found: Comparison) -> Part:
         "is widened to fit. All quantities are tested together: one of them is said to differ by chance in "
         f"{100 * found.level:g} % of comparisons. {SHARED}"
     )
-    names = ("quantity", "unit", "results", "pooled", "95 % interval", "chi²", "p", "results", "pooled value")
-    headings = [(name, "") for name in names]
+    headings = ("quantity", "unit", "results", "pooled", "95 % interval", "chi²", "p", "results", "pooled value")
     return Table("pooled-table", "Pooled value of each quantity", headings, [("", rows)], [note], wide=True)
 
 
@@ -196,5 +195,5 @@ def _each(found: Comparison) -> Part:
         )
         for each in found.quantities
     ]
-    headings = [(name, "") for name in ("result", "estimate", "95 % interval", "note")]
+    headings = ("result", "estimate", "95 % interval", "note")
     return Table("each-table", "Each quantity in each result", headings, groups)

@@ -26,7 +26,7 @@ from .text import DASH, plain
 
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
-_ESTIMATE = (("unit", ""), ("estimate", ""), ("95 % interval", ""))
+_ESTIMATE = ("unit", "estimate", "95 % interval")
 
 
 def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str = "") -> None:
@@ -75,7 +75,7 @@ def _quantities(found: Identification) -> list[Part]:
     p = found.rigid_body.consistency_p
     tested = [] if p is None else [f"Test whether the alphas are those of one rigid body: p = {plain(p, 2)}."]
     rows = [Row.of(name, unit, value, ends, note) for (name, value, ends, unit), note in quantities(found)]
-    headings = [("quantity", ""), *_ESTIMATE, ("note", "")]
+    headings = ("quantity", *_ESTIMATE, "note")
     caption = "Estimates with their 95 % intervals"
     return [Table("quantities-table", caption, headings, [("", rows)], tested)] if rows else []
 
@@ -97,8 +97,7 @@ def _signals(found: Identification, look: Style) -> list[Part]:
         )
     elif found.fit:
         words += "The flight is simulated from its first sample with the estimated parameters, so that errors add up."
-    about = "Measured and predicted signals, their difference, inputs and disturbances over time"
-    return [Signals(signals, about, words, choice="Show")]
+    return [Signals(signals, words, choice="Show")]
 
 
 def _vehicle(found: Identification, look: Style) -> Part:
@@ -139,7 +138,7 @@ def _parameters(found: Identification) -> Part:
     if found.widened:
         factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
         note += f" Parts of the flights disagree, so that these intervals were widened by the factor: {factors}."
-    headings = [("parameter", ""), *_ESTIMATE, ("bound", ""), ("note", "")]
+    headings = ("parameter", *_ESTIMATE, "bound", "note")
     return Table("parameters", "Estimated parameters, then fixed parameters", headings, [("", rows)], [note])
 
 
@@ -166,7 +165,7 @@ def _posteriors(found: Identification, look: Style) -> list[Part]:
 def _residuals(found: Identification) -> list[Part]:
     parts: list[Part] = []
     if found.fit:
-        headings = [("channel", ""), ("unit", ""), ("fit", "%"), ("RMS", ""), ("level", ""), ("neighbours", "")]
+        headings = ("channel", "unit", "fit [%]", "RMS", "level", "neighbours", "p, white", "p, inputs")
         rows = [
             Row.of(
                 *(name, x.unit, number(x.percent, 3), number(x.rms, 3), number(x.level, 3)),
@@ -178,7 +177,6 @@ def _residuals(found: Identification) -> list[Part]:
             "Fit: 100 is a perfect prediction, 0 as good as the mean. Level: mean square of the residuals over that of "
             "the noise. p: the probability of such residuals if the model is right."
         )
-        headings += [("p, white", ""), ("p, inputs", "")]
         parts.append(Table("fit", "Fit of each channel", headings, [("", rows)], [note]))
     if found.correlations is not None:
         what = (
@@ -207,8 +205,7 @@ def _disturbances(found: Identification) -> list[Part]:
         Row.of(name, x.unit, *(number(each, 2) for each in (x.strength, x.correlation_time, x.sensor)))
         for name, x in found.disturbances.items()
     ]
-    headings = [("channel", ""), ("unit", ""), ("strength", ""), ("correlation time", "s")]
-    headings += [("sensor noise", "rad/s, m/s²")]
+    headings = ("channel", "unit", "strength", "correlation time [s]", "sensor noise [rad/s, m/s²]")
     note = (
         "Strength: standard deviation of gusts and of effects that the model lacks. It is estimated with the "
         "parameters, because the controller reacts to it."
@@ -235,7 +232,7 @@ def _skill(found: Identification) -> list[Part]:
         "(persistence), and below 0 is worse. ±: one standard error, estimated by leaving out a tenth of the flight at "
         "a time. Equation error: the skill of a regression with the same terms."
     )
-    headings = [("ahead", "s"), ("skill", ""), ("equation error", ""), ("RMSE", "rad/s"), ("persistence", "rad/s")]
+    headings = ("ahead [s]", "skill", "equation error", "RMSE [rad/s]", "persistence [rad/s]")
     starts = f", {skill.starts} starts" if skill.starts else ""
     return [Table("skill", f"Skill by rate and horizon{starts}", headings, groups, [note])]
 

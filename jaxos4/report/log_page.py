@@ -22,7 +22,7 @@ from . import timeline
 from .page import Part, Picture, Row, Section, Signals, Table, Text, number, page
 from .panels import Band, Figure, Line, Panel, Scale
 from .style import BOUND_DASHES, style
-from .terminal import unit_of
+from .terminal import part_rows, unit_of
 from .text import plain
 
 _SAMPLES = 5000  # of each signal at most; a page then has less than 600 kB
@@ -64,7 +64,11 @@ def write_log_page(
     full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     plausible = Evidence(recording, airframe).plausible.recording
     flown = [cut(plausible, Stretch(part.begin, part.end)) for part in found.parts if part.usable]
-    band = None if is_share(recording) or not flown else rotor_band(flown)
+    band = None
+    if flown and not is_share(recording):
+        speeds, rare = np.concatenate([each.omega for each in flown]), (1 - _USUAL) / 2
+        low, high = np.quantile(speeds, [rare, 1 - rare]) / (2 * np.pi)
+        band = float(low), float(high)
     shown, block = logged(recording, found)
     label = recording.facts.format.label if recording.facts.format else "recording"
     sampled = f"{found.samples} samples, one every {plain(1e3 * found.sample_time)} ms"
@@ -77,7 +81,7 @@ def write_log_page(
     if block > 1:
         blocks = f"{plain(1e3 * recording.dt * block)} ms"
         caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
-    seen = Signals(shown, "Logged signals over time", caption, range=True)
+    seen = Signals(shown, caption, range=True)
     commands = recording.commanded and full == 1
     sections = [
         Section("signals", "Logged signals", [seen, Text(words(fitted(recording, airframe)), id="fitted")], "Signals"),
@@ -107,23 +111,18 @@ def _checks(found: Inspection) -> list[Part]:
         )
         for each in found.findings
     ]
-    headings = [("quantity", ""), ("", ""), ("cause", ""), ("size", ""), ("what to do", "")]
+    headings = ("quantity", "", "cause", "size", "what to do")
     return [Table("checks-table", "Checks that found something", headings, [("", rows)], wide=True)] if rows else []
 
 
 def _parts(found: Inspection) -> Part:
-    longest = sorted(found.parts, key=lambda part: part.begin - part.end)[:_LONGEST]
-    rows = []
-    for part in sorted(longest, key=lambda part: part.begin):
-        axes = (part.excitation.get(motion) for motion in MOTIONS)
-        texts = ("" if one is None else one.verdict + (f" ({plain(one.rate, 2)})" if one.rate else "") for one in axes)
-        rows.append(Row.of(f"{part.begin:.2f}", f"{part.end:.2f}", "usable" if part.usable else part.reason, *texts))
-    shorter = len(found.parts) - len(longest)
+    rows = [Row.of(*cells) for cells in part_rows(found, _LONGEST)]
+    shorter = len(found.parts) - len(rows)
     note = (
         "Roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s]. An axis that is weak "
         f"or none is not identified by this part.{f' {shorter} shorter parts are not listed.' if shorter else ''}"
     )
-    headings = [("from", "s"), ("to", "s"), ("use", ""), *((motion, "") for motion in MOTIONS)]
+    headings = ("from [s]", "to [s]", "use", *MOTIONS)
     return Table("parts-table", "Parts of the log in order of time", headings, [("", rows)], [note])
 
 
@@ -135,7 +134,7 @@ def _measured(found: Inspection, commands: bool) -> Part:
         )
         for name, one in found.measured.items()
     ]
-    headings = [("channel", ""), ("unit", ""), ("rate", "Hz"), ("longest gap", "ms"), ("least", ""), ("largest", "")]
+    headings = ("channel", "unit", "rate [Hz]", "longest gap [ms]", "least", "largest")
     return Table("measured-table", "What was measured, and how often", headings, [("", rows)])
 
 
@@ -246,13 +245,6 @@ def fitted(recording: Recording, airframe: Airframe | None) -> str:
     held = timeline.spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
     parts = ", ".join(f"{begin:.1f} to {end:.1f}" for begin, end in held[:8]) + ", ..." * (len(held) > 8)
     return f"{used}; {ready.seconds[1]:.1f} s would be held out and predicted: {parts} s."
-
-
-def rotor_band(flown: Sequence[Recording]) -> tuple[float, float]:
-    """The usual frequencies of the rotors [Hz]: the ends of the band of most speeds."""
-    speeds, beyond = np.concatenate([each.omega for each in flown]), (1 - _USUAL) / 2
-    low, high = np.quantile(speeds, [beyond, 1 - beyond]) / (2 * np.pi)
-    return float(low), float(high)
 
 
 def motors(flown: Sequence[Recording], full: float) -> Figure:

@@ -35,7 +35,7 @@ def estimates(data: xr.Dataset) -> Table:
             groups.append((f"{scale}, {estimator}", rows))
     caption = f"Each estimate, its interval of {100 * shown_level(data):g} %, and the truth"
     source = "From estimate, truth, half_width, bound, result."
-    return Table("estimates", caption, [(heading, "") for heading in _HEADINGS], groups, [source])
+    return Table("estimates", caption, _HEADINGS, groups, [source])
 
 
 def outcomes(data: xr.Dataset) -> list[str]:

@@ -40,14 +40,14 @@ class Row(NamedTuple):
 class Table(NamedTuple):
     """A table. On a narrow screen each row is a card, in which headings stand above cells; if `wide`, on a tablet too.
 
-    - `headings`: of all columns, each with its unit or an empty string.
+    - `headings`: of all columns, some with a unit: `"rate [Hz]"`.
     - `groups`: rows below a name; an empty one: no group.
     - `notes`: paragraphs below the table.
     """
 
     id: str
     caption: str
-    headings: Sequence[tuple[str, str]]
+    headings: Sequence[str]
     groups: Sequence[tuple[str, Sequence[Row]]]
     notes: Sequence[str] = ()
     wide: bool = False
@@ -75,7 +75,6 @@ class Signals(NamedTuple):
     """
 
     signals: str
-    description: str
     caption: str
     choice: str = ""
     range: bool = False

@@ -4,7 +4,7 @@ import csv
 import io
 import itertools
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -93,7 +93,7 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     ) -> Table:
         source = f"From estimate, truth, {'bound' if name == 'efficiency' else 'half_width'}, result (metrics.{name})."
         rows = _by_estimator(data, lambda at: _with_intervals(found.isel(at), measure, text))
-        return Table(name, caption, _headings(headings), rows, [source])
+        return Table(name, caption, ("estimator", *headings), rows, [source])
 
     ratio = "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do"
     held = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
@@ -106,10 +106,6 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
         "levels": table("mean_coverage", "coverage", metrics.mean_coverage(data), percent, levels, means),
         "results": _result_table(data),
     }
-
-
-def _headings(columns: Sequence[str]) -> list[tuple[str, str]]:
-    return [(name, "") for name in ("estimator", *columns)]
 
 
 def shown_level(data: xr.Dataset) -> float:
@@ -142,11 +138,11 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         for mark, reason in zip(_MARKS, metrics.NO_PERCENTAGE, strict=True)
         if mark and mark in used
     )
-    headings = [("estimator", "")]
+    headings = ["estimator"]
     for place, (name, unit) in enumerate(zip(names(data, "parameter"), names(data, "unit"), strict=True)):
         column = [row.cells[place] for _, rows in groups for row in rows if row.cells[place].text != DASH]
         marked = [bool(cell.mark) for cell in column]
-        headings.append((name, "%" if not any(marked) else unit if all(marked) else f"%; marked: {unit}"))
+        headings.append(f"{name} [{'%' if not any(marked) else unit if all(marked) else f'%; marked: {unit}'}]")
     caption = "RMS error [% of the truth; where marked, in the parameter's unit]"
     source = "From estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)."
     return Table("error", caption, headings, groups, [*notes, source])
@@ -165,7 +161,7 @@ def _result_table(data: xr.Dataset) -> Table:
     headings = [names(counts, "code")[place].replace("_", " ") for place in occurs]
     caption = "Flights by result, mean rollouts, and the hybrid's seed brackets that contain the truth [%]"
     source = "From result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)."
-    headings = _headings([*headings, "rollouts", "seed hits"])
+    headings = ("estimator", *headings, "rollouts", "seed hits")
     return Table("results", caption, headings, _by_estimator(data, cells), [source])
 
 
@@ -274,7 +270,7 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
     notes: dict[str, None] = {}
     for scenario in scenarios(dataset):
         table, rows = _error_table(scenario.data, digits=2), []
-        headings = [heading for heading, _ in table.headings[1:]]
+        headings = [heading.partition(" [")[0] for heading in table.headings[1:]]
         blank = [""] * len(headings)
         for label, group in table.groups:
             rows += [["", *blank]] * bool(rows) + [[label, *blank]]
