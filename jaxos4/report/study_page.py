@@ -139,7 +139,7 @@ def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: b
 
     def table(name: str) -> Part:
         one = tables[name]
-        return one._replace(id=f"{name}-{number}", wide=len(one.headings) > 6)
+        return one._replace(id=f"{name}-{number}", wide=len(one.headings) > 7)
 
     def section(title: str, parts: list[Part]) -> Section:
         return Section(f"{title.split()[0].lower()}-of-{number}", title, parts, level=3)
