@@ -196,48 +196,39 @@ def errors(data: xr.Dataset) -> Figure | None:
     """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
     data = positive_scales(data)
     found, best, x, panels = metrics.estimator_error(data), metrics.bound_error(data), data["scale"].values, []
+    seen_by, dots = bounds(data), {"marker": "" if len(x) > 1 else "s", "size": 4}
     for place, name in enumerate(names(data, "parameter")):
         kind, unit, why = error_unit(data, place)
-        values = found[kind].isel(parameter=place)
-        limits = [
-            Line(
-                x,
-                best[kind].isel(parameter=place, estimator=estimator).values,
-                width=1.5,
-                dash=dash,
-                marker="" if len(x) > 1 else "s",
-                size=4,
-                name=f"bound, {seen}",
-            )
-            for dash, (seen, estimator) in zip(BOUND_DASHES, bounds(data).items(), strict=False)
+        values, least = (_by(each[kind].isel(parameter=place), "estimator", "scale") for each in (found, best))
+        marks = [_line(data, i, look, x, values[i]) for i, look in _looks(data)]
+        marks += [
+            Line(x, least[estimator], width=1.5, dash=dash, name=f"bound, {seen}", **dots)
+            for dash, (seen, estimator) in zip(BOUND_DASHES, seen_by.items(), strict=False)
         ]
-        marks = [_line(data, i, look, x, values.isel(estimator=i).values) for i, look in _looks(data)]
         title, subtitle = f"{name} [{unit}]", f"absolute: {why}" if why else ""
-        panels.append(Panel(title, [*marks, *limits], _scales(x), Scale("log"), 270, 220, subtitle))
+        panels.append(Panel(title, marks, _scales(x), Scale("log"), 270, 220, subtitle))
     return _if_known("error", panels, found["absolute"])
 
 
 def efficiency(data: xr.Dataset) -> Figure | None:
     """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
     data = positive_scales(data)
-    found, scales, panels, one = (
-        metrics.efficiency(data),
-        data["scale"].values,
-        [],
-        Line(_EVERYWHERE, (1, 1), width=1.5),
-    )
+    found, scales, panels = metrics.efficiency(data), data["scale"].values, []
+    values, low, high = (_by(found[each], "parameter", "estimator", "scale") for each in ("efficiency", "low", "high"))
     for place, name in enumerate(names(data, "parameter")):
-        marks = [one]
+        marks = [Line(_EVERYWHERE, (1, 1), width=1.5)]
         for i, look in _looks(data):
-            values, low, high = (
-                found[each].isel(parameter=place, estimator=i).values for each in ("efficiency", "low", "high")
-            )
-            x = dodged(scales, i, data.sizes["estimator"])
-            marks += [_line(data, i, look, x, values), spread(x, low, high, color=look.color, width=1.3, group=i)]
+            x, at = dodged(scales, i, data.sizes["estimator"]), (place, i)
+            marks += [_line(data, i, look, x, values[at])]
+            marks += [spread(x, low[at], high[at], color=look.color, width=1.3, group=i)]
         panels.append(Panel(name, marks, _scales(scales), Scale("log"), 270, 220))
     ends = [end for panel in panels for end in panel.fitted().y.ends or ()]
     panels = [panel._replace(y=Scale("log", (min(ends), max(ends)))) for panel in panels]
     return _if_known("efficiency", panels, found["efficiency"])
+
+
+def _by(values: xr.DataArray, *axes: str) -> np.ndarray:
+    return values.transpose(*axes).values
 
 
 def _if_known(stem: str, panels: list[Panel], values: xr.DataArray) -> Figure | None:
@@ -248,24 +239,17 @@ def coverage(data: xr.Dataset) -> Figure | None:
     """Share of intervals that contain the truth against the level that they claim, at each noise scale."""
     found, panels = metrics.mean_coverage(data), []
     estimators, levels = names(data, "estimator"), data["level"].values
-    lowest = min(float(found["low"].min()), float(levels.min())) - 0.04
+    share, low, high = (_by(found[each], "scale", "estimator", "level") for each in ("coverage", "low", "high"))
+    lowest, places = min(float(np.nanmin(low)), float(levels.min())) - 0.04, np.arange(len(levels))
     y = Scale(ends=(lowest, 1.02), ticks={x / 10: f"{10 * x} %" for x in range(11)})
-    x = Scale(
-        "linear",
-        (-0.6, len(levels) - 0.4),
-        {k: f"{100 * x:g} %" for k, x in enumerate(levels)},
-        "level claimed",
-        lines=False,
-    )
+    ticks: dict[float, str] = {k: f"{100 * x:g} %" for k, x in enumerate(levels.tolist())}
+    x = Scale("linear", (-0.6, len(levels) - 0.4), ticks, "level claimed", lines=False)
     for place, scale in enumerate(data["scale"].values):
-        marks = [across(levels, np.arange(len(levels)) - 0.45, np.arange(len(levels)) + 0.45, width=1.8)]
+        marks = [across(levels, places - 0.45, places + 0.45, width=1.8)]
         for i, look in _looks(data):
-            at = np.arange(len(levels)) + 0.7 * (i / max(len(estimators) - 1, 1) - 0.5)
-            share, low, high = (
-                found[each].isel(scale=place, estimator=i).values for each in ("coverage", "low", "high")
-            )
-            marks += [spread(at, low, high, color=look.color, width=1.3, group=i)]
-            marks += [Line(at, share, look.color, 0, marker=look.marker, size=6, group=i, name=estimators[i])]
+            x_of, at = places + 0.7 * (i / max(len(estimators) - 1, 1) - 0.5), (place, i)
+            marks += [spread(x_of, low[at], high[at], color=look.color, width=1.3, group=i)]
+            marks += [Line(x_of, share[at], look.color, 0, marker=look.marker, size=6, group=i, name=estimators[i])]
         panels.append(Panel(f"noise scale {scale:g}", marks, x, y, 270, 240))
     return _if_known("coverage", panels, found["coverage"])
 
