@@ -1,5 +1,6 @@
 """Figures as SVG: the numbers that they show, nothing outside of the axes, and no plotting library on the way."""
 
+import itertools
 import re
 from xml.etree import ElementTree
 
@@ -74,6 +75,18 @@ def test_what_is_outside_of_an_axis_is_cut_off_and_does_not_grow_without_bound()
     assert np.abs(path).max() < 20 * max(size)
     text = as_file(Figure("one", [panel]))
     assert re.search(r'<clipPath id="(\S+)">.*clip-path="url\(#\1\)"', text)
+
+
+EXTREME = (0.0, -1e30, 1e30, 1e-320, 5e-324, 1.0, np.nan, np.inf, -np.inf, 3e15, 3e15 + 1)  # a result has up to 1e30
+
+
+@pytest.mark.parametrize("kind", ["linear", "log", "symlog"])
+def test_no_number_of_a_result_spoils_a_figure(kind):
+    scale = Scale(kind, (-5.0, 5.0) if kind == "symlog" else None)
+    for a, b in itertools.product(EXTREME, EXTREME):
+        marks = [Line([a, b], [b, a], marker="o"), Band([a, b], [a, a], [b, b])]
+        text = as_file(Figure("one", [Panel("", marks, scale, scale)]))
+        assert not re.search("nan|inf", text), (a, b)
 
 
 @pytest.mark.parametrize("low", [0.04, 0.62, 0.84, 0.99])

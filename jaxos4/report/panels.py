@@ -10,6 +10,7 @@ from jaxtyping import Float, Num
 from .style import FAINT, INK, Dash
 
 _LINEAR = 2.0  # a "symlog" scale is linear from -2 to 2
+_LEAST = 1e-290  # smaller numbers are 0 in a figure
 Values = Sequence[float] | Num[np.ndarray, " _points"]
 
 
@@ -72,7 +73,7 @@ class Scale(NamedTuple):
         """Values in a unit in which the axis is linear; NaN for those that a logarithmic axis cannot show."""
         values = np.asarray(values, dtype=float)
         if self.kind == "log":
-            return np.asarray(np.log10(np.where(values > 0, values, np.nan)))
+            return np.asarray(np.log10(np.where(values > _LEAST, values, np.nan)))
         if self.kind == "linear":
             return values
         far = np.sign(values) * (1 + np.log10(np.maximum(np.abs(values), _LINEAR) / _LINEAR))
@@ -95,7 +96,9 @@ class Scale(NamedTuple):
         if self.ends is not None or not known.size:
             return self._replace(ends=self.ends or ((1.0, 10.0) if self.kind == "log" else (0.0, 1.0)))
         low, high = float(known.min()), float(known.max())
-        room = 0.05 * (high - low) or 0.1 * (1.0 if self.kind == "log" else abs(high) or 1.0)
+        size = max(abs(low), abs(high))
+        alone = 0.1 if self.kind == "log" else 0.1 * size if size > _LEAST else 1.0
+        room = 0.05 * (high - low) if high - low > 1e-9 * size + _LEAST else alone
         low, high = low - room, high + room
         return self._replace(ends=(10**low, 10**high) if self.kind == "log" else (low, high))
 
