@@ -84,6 +84,7 @@ def report(
     csv: Annotated[
         Path | None, Option(help="Of a study: errors, bounds, efficiency and coverage as a table (CSV).")
     ] = None,
+    pdf: Annotated[bool, Option("--pdf", help="Of a study: the figures as PDF too.")] = False,
 ) -> None:
     """Make the page of a result, or the report of a study.
 
@@ -98,6 +99,8 @@ def report(
             f"--csv: {source} is a result; `found.to_dataframe()` in Python makes its table. Leave it out."
         )
     if not source.is_dir():
+        if pdf:
+            raise InputError(f"--pdf: {source} is a result, which has a page alone; leave it out.")
         out = source.with_suffix(".html") if out is None else out
         check_outputs(source, out=out)
     elif out is not None:
@@ -110,7 +113,7 @@ def report(
             if csv is not None:
                 check_outputs(source / "results.nc", csv=csv)
                 write_file(csv, jaxos4.report.error_csv(dataset))
-            page, *figures = jaxos4.report.write_report(dataset, source)
+            page, *figures = jaxos4.report.write_report(dataset, source, pdf=pdf)
         else:
             found = jaxos4.read_result(source)
             progress("drawing")
@@ -118,7 +121,7 @@ def report(
             jaxos4.report.write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
-        typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")
+        typer.echo(f"{figures[0].parent}: {len(figures) // (1 + pdf)} figures, as SVG{' and PDF' if pdf else ''}")
     if csv is not None:
         typer.echo(f"{csv}: errors, bounds, efficiency and coverage")
 
