@@ -1,6 +1,7 @@
 """Checks a built site as a reader opens it from a folder: `python .ci/site.py SITE`.
 
-It follows links and anchors, and searches in a browser; without a browser, only the links are checked.
+It follows links and anchors, and in a browser it searches, and looks whether pictures are dark on dark paper; without a
+browser, only the links are checked.
 """
 
 import shutil
@@ -40,23 +41,26 @@ def broken(site: Path) -> list[str]:
     return sorted(found)
 
 
-def search(site: Path, browser: str) -> list[str]:
-    """What is wrong with the search, and what the page wants from the network."""
+def seen(site: Path, browser: str) -> list[str]:
+    """What is wrong with the search and with dark pictures, and what the pages want from the network."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        page = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"]).new_page()
+        page = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"]).new_page(color_scheme="dark")
         wrong = []
         page.on("request", lambda request: request.url.startswith("http") and wrong.append(request.url))
         page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
         page.goto((site / "method" / "index.html").as_uri())
         page.locator("input.md-search__input").press_sequentially("feedthrough")
         page.wait_for_selector(".md-search-result__item")
+        page.goto((site / "index.html").as_uri())
+        if page.locator("article img").first.evaluate("img => getComputedStyle(img).filter") == "none":
+            wrong.append("index.html: a white picture on dark paper")
         return wrong
 
 
 if __name__ == "__main__":
     site = Path(sys.argv[1]).resolve()
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if wrong := broken(site) + (search(site, browser) if browser else []):
+    if wrong := broken(site) + (seen(site, browser) if browser else []):
         sys.exit("\n".join(["the site is wrong:", *wrong]))

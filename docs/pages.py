@@ -3,6 +3,7 @@
 import contextlib
 import io
 import pathlib
+import posixpath
 import re
 
 from math_core import LatexToMathML
@@ -14,9 +15,9 @@ from jaxos4.cli._app import app
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = {
     "changelog.md": "CHANGELOG.md",
-    "contributing.md": "CONTRIBUTING.md",
-    "conduct.md": "CODE_OF_CONDUCT.md",
-    "security.md": "SECURITY.md",
+    "contributing.md": ".github/CONTRIBUTING.md",
+    "conduct.md": ".github/CODE_OF_CONDUCT.md",
+    "security.md": ".github/SECURITY.md",
     "experiments.md": "experiments/README.md",
 }
 PLACES = {}
@@ -30,9 +31,9 @@ def on_files(files, config):
     """Adds the pages, with links that lead to pages of the site."""
     for page, source in PAGES.items():
         text = (ROOT / source).read_text(encoding="utf-8")
-        text = re.sub(r"\]\((?:\.\./)?docs/", "](", text)
-        for other, path in PAGES.items():
-            text = text.replace(f"]({path}", f"]({other}").replace(f"](../{path}", f"]({other}")
+        for place, path in {"": "docs/", **PAGES}.items():
+            link = posixpath.relpath(path, posixpath.dirname(source)) + "/" * path.endswith("/")
+            text = text.replace(f"]({link}", f"]({place}")
         files.append(File.generated(config, page, content=text))
     files.append(File.generated(config, "reference/commands.md", content=commands()))
     return files

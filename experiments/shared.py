@@ -1,7 +1,6 @@
 """Functions that the experiments share: batched identification, tables, Datasets and figure files."""
 
 import functools
-import io
 import itertools
 import json
 import os
@@ -14,16 +13,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 import xarray as xr
 from jaxtyping import Array, Float, Key as Keys
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.drawing import rendered
 from experiments.monte_carlo import count_results, in_words, print_table
 from jaxos4._custom_types import Key, States
-from jaxos4._files import write_atomically, write_netcdf
+from jaxos4._files import write_file, write_netcdf
 from jaxos4.analysis.evaluation import cramer_rao_bound
 from jaxos4.bracket import Bracket
 from jaxos4.cli.studies import run_with_bar
@@ -32,8 +31,9 @@ from jaxos4.excitation import multisine
 from jaxos4.flight import Flight
 from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import SENSOR_SIGMA, AbstractNoise, WhiteNoise
+from jaxos4.report.matplotlib_figures import as_matplotlib, drawing
 from jaxos4.report.study_tables import scenarios
-from jaxos4.report.style import Style, drawing, svg
+from jaxos4.report.style import Style
 from jaxos4.report.text import plain
 from jaxos4.results import result_names
 from jaxos4.shooting import ShootingProblem
@@ -202,14 +202,6 @@ def scores(problem: ShootingProblem, found: Estimate) -> dict[str, Any]:
     }
 
 
-def pdf(figure: Figure) -> bytes:
-    """The figure as PDF. The same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    with mpl.rc_context({"pdf.fonttype": 42}):
-        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
-    return buffer.getvalue()
-
-
 def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) -> None:
     """Draws a figure in the style of this library and writes it as SVG and PDF; nothing if `draw` returns `None`."""
     directory.mkdir(parents=True, exist_ok=True)
@@ -217,9 +209,18 @@ def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) 
         figure = draw()
         if figure is None:
             return
-        for suffix, render in ((".svg", svg), (".pdf", pdf)):
-            with write_atomically(directory / f"{name}{suffix}") as beside:
-                beside.write_bytes(render(figure))
+        for kind in ("svg", "pdf"):
+            write_file(directory / f"{name}.{kind}", rendered(figure, kind))
+
+
+def of_study(draw: Callable[[xr.Dataset], Any]) -> Callable[[xr.Dataset], Figure | None]:
+    """A figure of a study's page, drawn by Matplotlib."""
+
+    def drawn(data: xr.Dataset) -> Figure | None:
+        figure = draw(data)
+        return None if figure is None else as_matplotlib(figure)
+
+    return drawn
 
 
 def plotter(read: Callable[[Path], Any], drawn: dict[str, Callable[[Any], Figure | None]]) -> Callable[..., None]:

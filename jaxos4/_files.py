@@ -61,12 +61,13 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yields a temporary path beside `path`, with its suffix, and renames it to `path` when the block ends.
 
     If the block raises, an older `path` does not change. Links are followed, and the mode of an older file is kept. A
-    pipe or a device is yielded itself. Raises `OSError` that names `path`.
+    pipe or a device is yielded itself. Raises `OSError` that names `path`, and `InputError` if nobody reads a pipe.
     """
     target = check_writable(path)
     if target.exists() and not target.is_file():
         try:
-            yield target
+            with _with_a_reader(target):
+                yield target
         except OSError as error:
             raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
@@ -84,6 +85,24 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def _with_a_reader(target: Path) -> Iterator[None]:
+    """Keeps a pipe open for the block. To open one that nobody reads would wait for ever."""
+    if not target.is_fifo():
+        yield
+        return
+    try:
+        descriptor = os.open(target, os.O_WRONLY | os.O_NONBLOCK)
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        raise InputError(f"{target}: nobody reads this pipe; start its reader first.") from None
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def write_file(path: str | os.PathLike[str], content: str | bytes | memoryview) -> None:
     """Write a file completely or not at all. Text is written as UTF-8."""
     with write_atomically(path) as beside:
@@ -95,6 +114,14 @@ def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None
     numbers = [name for name, data in dataset.data_vars.items() if data.dtype.kind in "fi" and data.ndim]
     packed = dict.fromkeys(numbers, {"zlib": True, "complevel": level})
     write_file(path, dataset.to_netcdf(engine="h5netcdf", encoding=packed))  # in memory: HDF5 can crash on a full disk
+
+
+def at_once(path: str, flags: int) -> int:
+    """For `open(path, opener=at_once)`: a pipe that nobody writes is empty, where `open` would wait for ever."""
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if hasattr(os, "O_NONBLOCK"):
+        os.set_blocking(descriptor, True)
+    return descriptor
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
@@ -134,7 +161,7 @@ def read_json(path: str | os.PathLike[str], remedy: str, largest: float = _LARGE
 def _read_text(
     path: str | os.PathLike[str], decode: Callable[[bytes], Any], kind: str, remedy: str, largest: float
 ) -> Any:
-    with open(path, "rb") as file:
+    with open(path, "rb", opener=at_once) as file:
         content = file.read(_LARGEST_TEXT + 1)
     if len(content) > _LARGEST_TEXT:
         raise InputError(f"{path}: has more than {_LARGEST_TEXT:,} bytes; {remedy}.")

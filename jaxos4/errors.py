@@ -28,6 +28,11 @@ def shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
+def percent(share: float, digits: int = 2) -> str:
+    """A share in percent with `digits` significant digits, and never as a power of ten above 1: "0.36 %", "110 %"."""
+    return f"{float(f'{100 * share:.{digits}g}'):g} %"
+
+
 def in_words(error: Exception, most: int = 120) -> str:
     """The message of an error on one line, at most this many characters; the name of its type if it has none."""
     return " ".join(str(error).split())[:most] or type(error).__name__

@@ -126,8 +126,8 @@ def as_estimate(
     identifiable = unknowns.identifiable(std, prior)
     finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
     feasible = feasible & jnp.isfinite(cost) & finite
-    result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
-    result = RESULTS.where(far[:own].any(), RESULTS.at_bound, result)
+    result = RESULTS.where(far[:own].any(), RESULTS.at_bound, RESULTS.successful)
+    result = RESULTS.where(done, result, RESULTS.max_sweeps)
     result = RESULTS.where(~identifiable[:own].all(), RESULTS.unidentifiable, result)
     result = RESULTS.where(feasible, result, RESULTS.nonfinite_trajectory)
     result = RESULTS.where(valid, result, RESULTS.bracket_invalid)

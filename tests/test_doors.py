@@ -10,6 +10,8 @@ import math
 import os
 import subprocess
 import sys
+import threading
+import time
 import tokenize
 import tomllib
 import tracemalloc
@@ -28,7 +30,7 @@ from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
 
 import jaxos4
-from jaxos4._files import read_toml
+from jaxos4._files import read_toml, write_file
 from jaxos4.airframe import load_airframe
 from jaxos4.errors import InputError
 from jaxos4.export import TARGETS, export_vehicle, read_result
@@ -37,6 +39,7 @@ from jaxos4.identification.problem import bracket_of
 from jaxos4.logs import read_log
 from jaxos4.logs.messages import Messages
 from jaxos4.models import MODELS
+from jaxos4.networks.file import load_network
 from jaxos4.recording import read_recording
 from jaxos4.recording.inspection import airframe_draft, inspect_log
 from jaxos4.study import load_study, read_results
@@ -247,6 +250,46 @@ def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, ca
     with pytest.raises(InputError, match="no |more than it holds"):
         read_results(tmp_path)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
+def test_a_pipe_is_written_if_somebody_reads_it_and_else_refused(tmp_path):
+    """To open a pipe without a reader would wait for ever."""
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe: nobody reads this pipe; start its reader first"):
+        write_file(pipe, "x")
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_file(pipe, "x")
+    assert os.read(reader, 9) == b"x"
+    os.close(reader)
+
+
+PIPES = {
+    "result": jaxos4.read_result,
+    "airframe": load_airframe,
+    "log": read_log,
+    "columns": lambda path: read_log("log.csv", columns=path),
+    "network": load_network,
+}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
+@pytest.mark.parametrize("door", PIPES)
+def test_a_pipe_that_nobody_writes_is_refused(door, tmp_path):
+    """To open it would wait for ever."""
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(InputError):
+        PIPES[door](pipe)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
+def test_a_pipe_with_a_writer_is_read_to_its_end():
+    reader, writer = os.pipe()
+    thread = threading.Thread(target=lambda: (time.sleep(0.1), os.write(writer, MINE.encode()), os.close(writer)))
+    thread.start()
+    assert load_airframe(f"/dev/fd/{reader}").mass == 0.6
+    thread.join()
+    os.close(reader)
 
 
 # Texts in exported files and drafts

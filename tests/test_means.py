@@ -132,12 +132,23 @@ def gradient_of(problem, parameters, noise):
     return InnovationsProblem(problem, segments=1).innovations(parameters, noise).gradient.sum(axis=(0, 2))
 
 
+@pytest.mark.skipif("jax.default_backend() != 'cpu'")
+def test_innovations_and_rates_of_a_step_are_computed_once():
+    """Both, and the derivatives of both: XLA would repeat them for each result, and a shot takes a quarter longer."""
+    model = jaxos4.FlightModel(CINERAT, terms=("damping",))
+    problem = jaxos4.ShootingProblem(model, lively(60, 0), sigma=np.full(12, 0.02), channels="rates", method="rk4")
+    noise = LogNoise(*jnp.zeros((3, 3)))
+    program = gradient_of.lower(problem, model.alpha, noise).compile().compiled.as_text()
+    assert program.count(" conditional(") == 4
+
+
 # The forcing.
 
 
 @pytest.mark.slow
-def test_stretches_and_padding_do_not_change_the_forcing_of_means():
-    """Each stretch is as if it were alone, and so is what comes before the padding."""
+def test_stretches_padding_and_batches_do_not_change_the_forcing_of_means(monkeypatch):
+    """Each stretch is as if it were alone, and so is what comes before the padding. No batch divides a sample."""
+    monkeypatch.setattr(jaxos4.FlightModel, "batch", PARTS + 2)
     model = jaxos4.FlightModel(CINERAT, terms=("motor", "delay", "reaction", "accelerometer"))
     values = model.alpha.at[model.parameter_names.index("rotor_delay")].set(0.0041)
     parts = [lively(samples, i) for i, samples in enumerate((40, 30))]

@@ -5,7 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from pages import printed, says, words
+from pages import assert_inside, printed, says, words
 from synthetic_identification import (
     CONSTANTS,
     KNOWN,
@@ -18,9 +18,10 @@ from synthetic_identification import (
 
 from jaxos4.identification.results import Constant, RigidBody
 from jaxos4.report import write_flight_page
-from jaxos4.report.identification_figures import frequency_responses, priors, residual_figure
+from jaxos4.report.identification_figures import correlation_matrix, frequency_responses, priors, residual_figure
 from jaxos4.report.identification_signals import identified_signals
-from jaxos4.report.style import drawing, styles
+from jaxos4.report.panels import Line, Words
+from jaxos4.report.style import styles
 
 LOOK = styles(["ibss"])["ibss"]
 
@@ -31,42 +32,44 @@ def test_every_parameter_is_inside_the_axis_of_the_brackets(far):
     at = 1.0 + far
     row = msgspec.structs.replace(KNOWN, bracket=(low, high), estimate=at, ci95=(at - 0.5, at + 0.5))
     near = msgspec.structs.replace(row, estimate=1.0, ci95=(0.9, 1.1))
-    with drawing():
-        (panel,) = priors(identified_vehicle(parameters={"alpha8": row, "alpha3": near}), LOOK).axes
-    ends = panel.get_xlim()
-    for line in panel.lines:
-        places = np.asarray(line.get_xdata(), dtype=float)
-        assert ((ends[0] < places) & (places < ends[1])).all()
-    assert panel.lines[0].get_xdata()[1] == pytest.approx(far + 0.5)
-    assert panel.get_xscale() == ("symlog" if far > 5 else "linear")
+    (panel,) = priors(identified_vehicle(parameters={"alpha8": row, "alpha3": near}), LOOK).panels
+    interval, points = (mark for mark in panel.marks if isinstance(mark, Line) and len(mark.x))
+    np.testing.assert_allclose(interval.x[[0, 1, 3, 4]], [far - 0.5, far + 0.5, -0.1, 0.1], atol=1e-12)
+    np.testing.assert_allclose(points.x, [far, 0], atol=1e-12)
+    assert panel.x.ends[1] > far + 0.5
+    assert panel.x.kind == ("symlog" if far > 5 else "linear")
+    assert {"-1", "0", "1"} <= {*panel.x.labelled()[0].values()}
+    assert_inside(panel)
 
 
 def test_the_gain_has_the_mean_that_the_verdict_is_about_and_an_axis_that_shows_it():
     found = synthetic_response()
-    with drawing():
-        figure = frequency_responses(found, LOOK)
+    figure = frequency_responses(found, LOOK)
     for place, axis in ((0, found.roll), (3, found.pitch)):
-        gain, mean = figure.axes[place], axis.agreement()
-        bar = next(line for line in gain.lines if list(line.get_ydata()) == [mean.ratio] * 2)
-        assert list(bar.get_xdata()) == [mean.low, mean.high]
-        low, high = gain.get_ylim()
+        panel, mean = figure.panels[place], axis.agreement()
+        bar = next(mark for mark in panel.marks if mark.name == "mean gain with its 95 % interval")
+        assert (list(bar.x), list(bar.y)) == ([mean.low, mean.high], [mean.ratio] * 2)
+        low, high = panel.y.ends
         assert low < mean.interval[0] < mean.interval[1] < high
         assert high / low < 10
-    assert figure.axes[6].get_ylim() == pytest.approx((0.5, 2.0))
+    assert figure.panels[6].y.ends == (0.5, 2.0)
+    assert {*figure.legend()} >= {"measured / modelled", "model", "not clear"}
 
 
-def test_residuals_have_a_legend():
-    with drawing():
-        figure = residual_figure(behind_an_estimate()["correlations"])
-    said = [text.get_text() for panel in figure.axes[:2] for text in panel.get_legend().get_texts()]
-    assert said == ["95 % by chance", "roll torque", "pitch torque", "yaw torque"]
+def test_residuals_have_a_legend_and_both_signs_on_their_axes():
+    figure = residual_figure(behind_an_estimate()["correlations"])
+    assert [*figure.legend()] == ["95 % by chance", "roll torque", "pitch torque", "yaw torque"]
+    for panel in figure.panels:
+        assert_inside(panel)
+        assert len(panel.y.labelled(2)[0]) >= 2
 
 
-def test_each_row_and_column_of_the_correlations_has_its_name(tmp_path):
-    write_flight_page(tmp_path / "flight.html", identified_flight(**behind_an_estimate()))
-    matrix = (tmp_path / "flight.html").read_text(encoding="utf-8").split('class="matrix"')[1].split("</svg>")[0]
-    for name in ("alpha3", "alpha6"):
-        assert matrix.count(f">{name}</text>") == 2
+def test_each_row_and_column_of_the_correlations_has_its_name():
+    (panel,) = correlation_matrix(identified_flight(**behind_an_estimate()), LOOK).panels
+    assert [(each.text, each.y) for each in panel.marks if isinstance(each, Words)] == [("alpha3", 0), ("alpha6", 1)]
+    (pair,) = (mark for mark in panel.marks if isinstance(mark, Line) and mark.hollow)
+    assert (pair.tip, [*pair.x], [*pair.y]) == ("alpha6, alpha3: -0.95", [0], [1])
+    assert_inside(panel)
 
 
 def test_a_few_wild_samples_do_not_set_the_scale_of_the_gusts():

@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 
 import h5py
 import matplotlib.colors
-import matplotlib.figure
 import numpy as np
 import pytest
 import xarray as xr
@@ -21,8 +20,9 @@ from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.estimators import ESTIMATORS as REGISTRY
 from jaxos4.report import error_csv, error_table, study_page, write_report
+from jaxos4.report.matplotlib_figures import as_pdf
 from jaxos4.report.study_tables import scenario_tables, scenarios
-from jaxos4.report.style import drawing, log_axis, styles
+from jaxos4.report.style import styles
 from jaxos4.report.text import DASH, percent, plain
 from jaxos4.study import metrics, read_results
 
@@ -85,6 +85,18 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
 
+def test_figures_as_pdf_are_beside_those_as_svg_if_wanted(study, tmp_path, run):
+    study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
+    code, out, err = run("report", str(tmp_path), "--pdf")
+    assert (code, err) == (0, "")
+    assert "4 figures, as SVG and PDF" in out
+    files = {path.name: path.read_bytes()[:5] for path in (tmp_path / "figures").iterdir()}
+    assert files.keys() == {f"{name}.{kind}" for name in OF_SCENARIO for kind in ("svg", "pdf")}
+    assert {head for name, head in files.items() if name.endswith(".pdf")} == {b"%PDF-"}
+    (tmp_path / "found.json").write_text("{}")
+    refused(run("report", str(tmp_path / "found.json"), "--pdf"), "--pdf:", "leave it out")
+
+
 def test_the_csv_has_every_number(study):
     rows = list(csv.DictReader(io.StringIO(error_csv(study))))
     data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
@@ -100,24 +112,25 @@ def test_the_csv_has_every_number(study):
     assert {(row["unit"], row["rms_error_percent"], row["model"]) for row in alpha7} == {("1", "", "published")}
 
 
+def units_of(table):
+    return dict(heading[:-1].split(" [") for heading in table.headings[1:])
+
+
 def test_the_unit_in_a_head_is_that_of_the_cells_below_it():
     """alpha7 is 0, so that no error is a share of it; alpha2 and alpha5 are below the noise floor."""
     study = synthetic_study(flights=24, estimators=("ibss", "network"))
     data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
-    units = dict(scenario_tables(data)["error"].headings)
+    units = units_of(scenario_tables(data)["error"])
     assert units["alpha3"] == units["alpha8"] == "%"
     assert (units["alpha7"], units["alpha2"]) == ("1", "1/s")
     mixed = data.assign(truth=data["truth"].where(data["parameter"] != "alpha3", data["truth"] * (data["scale"] < 5)))
-    assert dict(scenario_tables(mixed)["error"].headings)["alpha3"] == "%; marked: 1/(kg m^2)"
+    assert units_of(scenario_tables(mixed)["error"])["alpha3"] == "%; marked: 1/(kg m^2)"
 
 
 def test_no_line_hides_another_and_a_title_says_who_sees_which_channels(study, report):
     data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
-    with drawing():
-        figures = [study_page.errors(data), study_page.overview(data)]
-    for figure in figures:
-        lines = [[line for line in figure.axes[0].lines if line.get_gid() == f"estimator-{i}"][0] for i in range(4)]
-        widths = [line.get_linewidth() for line in lines]
+    for figure in (study_page.errors(data), study_page.overview(data)):
+        widths = [next(mark.width for mark in figure.panels[0].marks if mark.group == i) for i in range(4)]
         assert widths == sorted(widths, reverse=True)
         assert len({*widths}) == 4
     said = "Not of the same channels: ibss, hybrid see all; network, svsf see rates"
@@ -279,12 +292,12 @@ def test_what_is_not_a_study_is_refused_and_nothing_is_written(write, tmp_path, 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
     (scenario,) = scenarios(study)
-    figures = {"coverage": study_page.coverage}
-    before = study_page.draw(figures, scenario.data)
-    assert list(before) == ["coverage"]
+    figure = study_page.coverage(scenario.data)
+    before = as_pdf(figure)
+    assert before.startswith(b"%PDF")
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):
         settings = dict(matplotlib.rcParams)
-        assert study_page.draw(figures, scenario.data) == before
+        assert as_pdf(figure) == before
         assert dict(matplotlib.rcParams) == settings
 
 
@@ -319,16 +332,3 @@ def test_estimators_differ_in_colour_mark_and_line_for_every_reader(vision):
         found = styles(names)
         assert len(set(found.values())) == len(found)
         assert all(found[name] == known[name] for name in names if name in known)
-
-
-@pytest.mark.parametrize("low", [0.04, 0.62, 0.84, 0.99])
-@pytest.mark.parametrize("high", [1.01, 1.6, 3.4, 12.0, 29.0, 5e3])
-def test_a_logarithmic_axis_has_a_tick_at_1_where_that_is_in_sight(low, high):
-    with drawing():
-        panel = matplotlib.figure.Figure(figsize=(2.2, 2.2)).add_subplot()
-        panel.set_ylim(low, high)
-        log_axis(panel, "y")
-        ticks = panel.get_yticks()
-    seen = ticks[(ticks >= low) & (ticks <= high)]
-    assert np.isclose(seen, 1).any()
-    assert 1 < len(seen) < 10

@@ -142,7 +142,7 @@ def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
     assert overlapping(texts) == []
     assert page.evaluate(CUT) == []
     for drawn, natural in page.locator(".panels svg").evaluate_all(WIDTHS):
-        assert drawn >= natural  # letters of 8 points keep at least 8 pixels
+        assert drawn >= 0.74 * natural  # letters of 12 pixels keep at least 8.9
 
 
 @pytest.mark.parametrize("name", ["study", "one flight", "vehicle", "os4", "log", "comparison"])
@@ -173,7 +173,7 @@ def test_texts_that_overlap_are_found(opened):
     page.evaluate("document.querySelector('h2').style.marginBottom = '-1.5rem'")
     assert overlapping(page.evaluate(TEXTS))
     page = opened("vehicle")
-    page.evaluate("(text => text.after(text.cloneNode(true)))(document.querySelector('#figure-response [id*=text_]'))")
+    page.evaluate("(text => text.after(text.cloneNode(true)))(document.querySelector('#figure-response .panels text'))")
     assert overlapping(page.evaluate(TEXTS))
 
 
@@ -209,6 +209,7 @@ def test_signals_zoom_together_and_stay_so(opened):
     page = opened("vehicle")
     values = page.locator("#timeline .u-value")
     page.locator("#timeline").scroll_into_view_if_needed()
+    assert {*values.all_text_contents()} == {""}  # no mark of a missing number beside a name
     assert page.locator("#view option:checked").text_content() == "0.248 s ahead"
     drawn = "() => [...document.querySelectorAll('#timeline canvas')].map(canvas => canvas.toDataURL())"
     changed = "before => document.querySelector('#timeline canvas').toDataURL() !== before"

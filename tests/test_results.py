@@ -361,7 +361,7 @@ def test_a_comparison_is_not_more_confident_than_its_results(tmp_path, run):
         page,
         "Iy: identified. Ix: use with care. Iz: refused",
         "Ix in results 2, 3",
-        "Dashed: the value in the airframe's file",
+        "pooled, 95 % airframe's file 95 % interval",  # the legend
     )
     says(page, "Next: ")
     other = of_inertias(2.3e-5, 1e-7, provenance={"flights": ["3.csv"]})

@@ -42,6 +42,13 @@ def verdict_of(name, quantity, doubts):
     return judge({name: quantity}, doubts).verdicts[name]
 
 
+@pytest.mark.parametrize(("share", "words"), [(0.004, "0.4 %"), (0.8149, "81 %"), (1.1, "110 %"), (10.0, "1000 %")])
+def test_a_move_is_told_in_percent_without_a_power_of_ten(share, words):
+    doubt = Doubt("implausible", "it errs", "log faster", {"Ix": Move(share, 2.0)})
+    (reason,) = verdict_of("Ix", Quantity("1 kg m^2"), [doubt]).reasons
+    assert reason.startswith(f"it errs (this would move it by {words})")
+
+
 @pytest.mark.parametrize(
     ("move", "result", "status"),
     [

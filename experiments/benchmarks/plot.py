@@ -7,8 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.benchmarks.contenders import is_ours
+from experiments.drawing import log_axis
 from experiments.shared import plotter, read_json
-from jaxos4.report.style import FAINT, INK, log_axis, styles
+from jaxos4.report.style import FAINT, INK, styles
 
 _AXES = {"flights": "flights in one call", "steps": "steps (rates alone)", "unknowns": "unknowns"}
 

@@ -4,9 +4,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid, log_axis
 from experiments.shared import plotter, read_each
 from jaxos4.report.study_page import dodged
-from jaxos4.report.style import INK, grid, log_axis, styles
+from jaxos4.report.style import INK, styles
 from jaxos4.study import metrics
 
 

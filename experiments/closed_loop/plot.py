@@ -2,8 +2,9 @@
 
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid
 from experiments.shared import plotter, read_json
-from jaxos4.report.style import INK, grid, styles
+from jaxos4.report.style import INK, styles
 
 INERTIAS = ("Ix", "Iy", "Iz")
 

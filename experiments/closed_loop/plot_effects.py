@@ -3,9 +3,10 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid
 from experiments.fits import INERTIAS, THRUST
 from experiments.shared import plotter, read_json
-from jaxos4.report.style import INK, grid, styles
+from jaxos4.report.style import INK, styles
 
 
 def draw(report: dict) -> Figure:

@@ -6,9 +6,10 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid
 from experiments.shared import plotter, read_by_noise
 from jaxos4.report.study_tables import error_unit
-from jaxos4.report.style import INK, PAPER, grid
+from jaxos4.report.style import INK, PAPER
 from jaxos4.report.text import plain
 from jaxos4.study import metrics
 

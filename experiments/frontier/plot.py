@@ -9,8 +9,9 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from experiments.drawing import grid, log_axis
 from experiments.shared import load_results, plotter
-from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
+from jaxos4.report.style import FAINT, INK, styles
 
 
 def draw(data: xr.Dataset) -> Figure:

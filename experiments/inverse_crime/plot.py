@@ -7,8 +7,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid, log_axis, scale_axis
 from experiments.shared import draw_spread, plotter, read_each
-from jaxos4.report.style import FAINT, INK, grid, log_axis, scale_axis, styles
+from jaxos4.report.style import FAINT, INK, styles
 from jaxos4.study import metrics
 
 # 95 % quantile of the largest of eight Gaussian magnitudes, in standard deviations.

@@ -4,8 +4,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid, log_axis
 from experiments.shared import draw_spread, plotter
-from jaxos4.report.style import INK, grid, log_axis, styles
+from jaxos4.report.style import INK, styles
 from jaxos4.study import metrics, read_results
 
 LEVEL = 0.95

@@ -1,5 +1,6 @@
 """The pictures of the documentation, drawn from real results: `python -m experiments pictures.run docs/pictures`."""
 
+import shutil
 import tomllib
 from html import escape
 from pathlib import Path
@@ -12,17 +13,16 @@ import matplotlib as mpl
 import numpy as np
 import typer
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 import jaxos4
-from experiments.sample_times.run import VEHICLE as CINERAT
-from experiments.shared import flight_files
 from jaxos4.estimators.solver import before_search
-from jaxos4.recording import read_recording
+from jaxos4.identification.verdict import ADVICE
 from jaxos4.results import NINETY_FIVE
 
 BLUE, ORANGE, INK, GREY = "#0072b2", "#d55e00", "#1b1e23", "#b9bec6"
-PICTURES = ("estimate", "halving", "sweeps", "floors", "real")
-PENDULUM = {"Ix": 7.2e-4, "Iy": 7.8e-4}  # of the CineRat, by its authors [kg m^2], to 7 %
+PICTURES = ("estimate", "halving", "sweeps", "floors", "real", "page")
+PENDULUM = {"Ix": 7.21e-4, "Iy": 7.76e-4, "Iz": 8.86e-4}  # of the CineRat, by its authors [kg m^2], to 7 %
 ROOMS = {
     "cli": "reads the arguments, calls the library, prints",
     "report": "tables, figures, HTML pages",
@@ -187,47 +187,80 @@ def floors_picture(pyproject: Path) -> str:
     )
 
 
-def real_picture(flight: Path) -> Figure:
-    """A real flight of the CineRat. Left: moments of inertia. Right: measured over modelled angular acceleration."""
-    found = jaxos4.identify(read_recording(flight, airframe=CINERAT)._replace(name=flight.stem), CINERAT)
-    figure = Figure(figsize=(9.0, 3.0), layout="constrained")
-    left, *right = figure.subplots(1, 3, width_ratios=(1.2, 1.0, 1.0))
+def real_picture(found: jaxos4.Identification) -> Figure:
+    """A real flight of the CineRat: the vehicle, rates that were not fitted, moments of inertia with their verdicts."""
+    figure = Figure(figsize=(9.6, 3.0), layout="constrained")
+    above, rates, bars = figure.subfigures(1, 3, width_ratios=(0.75, 1.35, 1.3))
+    draw_from_above(above.subplots(), found.airframe)
+    ahead = found.predictions
+    first = found.provenance.sample_time * ahead.start[: ahead.breaks[0]]  # the part that was not fitted first [s]
+    for axes, rate in zip(rates.subplots(2, sharex=True), "pq", strict=True):
+        found.plot.rates(rate, horizon=0.1, ax=axes).get_legend().remove()
+        axes.set_xlim(first[0], first[-1])
+        axes.label_outer()
+    rates.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    axes = bars.subplots()
     for row, (name, pendulum) in enumerate(PENDULUM.items()):
-        value, verdict = found.rigid_body.constants[name], found.verdicts[name]
-        left.errorbar(
-            [1e4 * value.estimate, 1e4 * pendulum],
-            [-row - 0.12, -row + 0.12],
-            xerr=[1e4 * NINETY_FIVE * value.std, 0.07e4 * pendulum],
-            fmt="none",
-            ecolor=[BLUE, ORANGE],
-            elinewidth=4,
-        )
-        left.text(5.0, -row - 0.22, verdict.status, va="top", color=BLUE)
-    left.plot([], color=BLUE, lw=4, label="jaxos4, 95 %")
-    left.plot([], color=ORANGE, lw=4, label="pendulum of the authors, ± 7 %")
-    left.set(xlabel="moment of inertia [1e-4 kg m²]", xlim=(4.8, 9.2), ylim=(-1.6, 0.9))
-    left.set_yticks([0, -1], PENDULUM)
-    left.legend(loc="upper left")
-    for axes, name in zip(right, ("roll", "pitch"), strict=True):
-        found.plot.response(name, ax=axes).set(ylim=(0.4, 2.5), xlim=(1, 15))
+        value, status = found.rigid_body.constants[name], found.verdicts[name].status
+        spans = {"jaxos4, 95 %": (value.estimate, NINETY_FIVE * value.std, BLUE)}
+        spans |= {"pendulum, ± 7 %": (pendulum, 0.07 * pendulum, ORANGE)}
+        for place, (label, (middle, half, color)) in enumerate(spans.items()):
+            pale = 0.35 if color == BLUE and not status.startswith("identified") else 1.0
+            span, y = 1e4 * np.array([middle - half, middle + half]), row + 0.2 * place - 0.1
+            axes.plot(span, [y, y], color=color, alpha=pale, lw=4, label=label if row == 0 else None)
+        axes.text(0.02, row + 0.2, ADVICE[status], va="top", color=BLUE, transform=axes.get_yaxis_transform())
+    axes.set(xlabel="moment of inertia [1e-4 kg m²]", ylim=(2.6, -0.4))
+    axes.set_yticks(range(len(PENDULUM)), PENDULUM)
+    bars.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return figure
+
+
+def draw_from_above(axes, airframe: jaxos4.Airframe) -> None:
+    """Arms and rotors of a vehicle, front up; arrows in which the rotors turn."""
+    for number, ((x, y), spin) in enumerate(zip(airframe.rotor_positions, airframe.rotor_spins, strict=True), start=1):
+        x, y, radius = 1e3 * float(x), 1e3 * float(y), 34.0  # mm
+        axes.plot([0, -y], [0, x], color=GREY, lw=4, zorder=0)
+        axes.add_patch(Circle((-y, x), radius, facecolor="white", edgecolor=INK, lw=1.1))
+        turn = np.radians(np.linspace(200, 200 + 280 * float(spin), 60))
+        arc = 0.72 * radius * np.stack([np.cos(turn), np.sin(turn)], axis=1) + [-y, x]
+        axes.plot(*arc.T, color=BLUE, lw=1.2)
+        axes.annotate("", arc[-1], arc[-8], arrowprops={"arrowstyle": "-|>", "color": BLUE, "shrinkA": 0})
+        axes.text(-y, x, str(number), ha="center", va="center", fontweight="bold")
+    axes.set(aspect="equal", title="3-inch quadrotor, 43 s")
+    axes.axis("off")
+
+
+def page_picture(page: Path, picture: Path) -> None:
+    """The top of a page of `jaxos4 estimate --report` as a browser shows it, as PNG."""
+    from playwright.sync_api import sync_playwright  # brings no browser, and only this picture needs it
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        sight = browser.new_page(viewport={"width": 1280, "height": 640})
+        sight.goto(page.resolve().as_uri())
+        sight.screenshot(path=picture)
 
 
 def main(
     out: Annotated[Path, typer.Argument(help="The folder to write to.")],
     only: Annotated[list[str] | None, typer.Option(help=f"Some of {', '.join(PICTURES)}; all by default.")] = None,
     pyproject: Annotated[Path, typer.Option(help="Where the floors are written.")] = Path("pyproject.toml"),
-    flights: Annotated[Path | None, typer.Option(help="The folder of the real flights.")] = None,
+    result: Annotated[Path | None, typer.Option(help="For `real`: README's result of the CineRat.")] = None,
+    page: Annotated[Path | None, typer.Option(help="For `page`: README's page of the simulated flight.")] = None,
 ) -> None:
-    """Draws the pictures of the documentation as SVG."""
+    """Draws the pictures of the documentation."""
     chosen = only or list(PICTURES)
+    for name, needed, given in (("real", "--result", result), ("page", "--page", page)):
+        if name in chosen and given is None:
+            raise SystemExit(f"{needed}: give the file for the picture `{name}`, or choose other pictures by --only.")
     out.mkdir(parents=True, exist_ok=True)
     if "floors" in chosen:
         (out / "floors.svg").write_text(floors_picture(pyproject))
     drawings = {}
-    if "real" in chosen:
-        (flight,) = flight_files(flights, ["cinerat/cinerat_281.csv"])
-        drawings["real"] = lambda: real_picture(flight)
+    if page is not None and "page" in chosen:
+        page_picture(page, out / "page.png")
+    if result is not None and "real" in chosen:
+        drawings["real"] = lambda: real_picture(jaxos4.read_result(result))
     if {"estimate", "halving", "sweeps"} & set(chosen):
         model, problem, bracket, estimate = simulated()
         drawings |= {

@@ -17,7 +17,10 @@ from jaxos4.recording import read_recording
 
 AIRFRAME = jaxos4.load_airframe("crazyflie")
 FLIGHT, STEP = "arpl_crazyflie_rollpitch.csv", 0.01
-SHOWN = {"roll_damping": 1.0, "pitch_damping": 1.0, "Ix": 1e5, "Iy": 1e5}
+JUDGED = "Ix", "Iy"
+SHOWN = {"roll_damping": "roll damping [1/s]", "pitch_damping": "pitch damping [1/s]"}
+SHOWN |= {name: f"{name} [1e-5 kg m^2]" for name in JUDGED}
+UNITS = dict.fromkeys(JUDGED, 1e5)
 
 
 def main(
@@ -31,11 +34,12 @@ def main(
     settings, report = jaxos4.VehicleSettings(sample_time=STEP, end=end), {}
     for n in every:
         found = jaxos4.identify([thinned(recording, float(n))], AIRFRAME, settings=settings).to_dict()
-        report[n] = {name: found[name] for name in ("result", "doubts", "parameters", "constants")}
+        report[n] = {name: found[name] for name in ("result", "doubts", "verdicts", "parameters", "constants")}
         write_report(out, report)
     rows = []
     for n, found in report.items():
         known = found["parameters"] | found["constants"]
-        numbers = (interval(known.get(name), size) for name, size in SHOWN.items())
-        rows.append((str(n), *numbers, found["result"], "; ".join(each["cause"] for each in found["doubts"])))
-    print_table("95 % intervals", ("one command of", *SHOWN, "result", "doubts"), rows, width=180)
+        numbers = (interval(known.get(name), UNITS.get(name, 1.0)) for name in SHOWN)
+        rows.append((str(n), *numbers, *(found["verdicts"][name]["status"] for name in JUDGED)))
+    headings = "one command of", *SHOWN.values(), *(f"verdict of {name}" for name in JUDGED)
+    print_table("thinned commands, 95 % intervals", headings, rows, width=180)

@@ -4,8 +4,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid, log_axis
 from experiments.shared import load_results, plotter
-from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
+from jaxos4.report.style import FAINT, INK, styles
 from jaxos4.results import NINETY_FIVE
 
 LEVEL = 0.01

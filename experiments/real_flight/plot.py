@@ -4,8 +4,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid
 from experiments.shared import plotter, read_json
-from jaxos4.report.style import BOUND_DASHES, INK, grid, styles
+from jaxos4.report.style import BOUND_DASHES, INK, styles
 from jaxos4.results import NINETY_FIVE
 
 INERTIAS, RATES = ("Ix", "Iy"), ("p", "q")

@@ -4,8 +4,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from experiments.drawing import grid, log_axis
 from experiments.shared import load_results, plotter
-from jaxos4.report.style import INK, grid, log_axis, styles
+from jaxos4.report.style import INK, styles
 
 SEARCHES = ("IBSS", "output error", "hybrid")
 LOOKS = dict(zip(SEARCHES, styles(["ibss", "output-error", "hybrid"]).values(), strict=True))

@@ -1,4 +1,4 @@
-"""Verdicts of Ix and Iy on real flights, each identified alone by the defaults; and whether repeated flights agree.
+"""Verdicts of moments of inertia on real flights, each identified alone; and whether repeated flights agree.
 
 The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.
 """
@@ -23,7 +23,7 @@ CRAZYFLIE = jaxos4.load_airframe("crazyflie")
 FLIGHTS = {f"arpl_crazyflie_{name}.csv": CRAZYFLIE for name in ("rollpitch", "yaw_a", "yaw_b", "hover")}
 FLIGHTS |= {f"nanobench/{name}.csv": CRAZYFLIE for name in sorted((*FITTED, *PREDICTED))}
 FLIGHTS |= {"cinerat/cinerat_281.csv": CINERAT}
-JUDGED = "Ix", "Iy"
+JUDGED = "Ix", "Iy", "Iz"
 
 
 def judged(path: Path, airframe: jaxos4.Airframe) -> Row:

@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import msgspec
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Arrays, Parameters, as_float
+from .._xla import compiled_cheaply
 from ..flight import RATES
 from ..models.state import Forcing, Rates
 from ..results import NINETY_FIVE
@@ -156,7 +156,7 @@ def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> F
     return np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
 
 
-@eqx.filter_jit
+@compiled_cheaply
 def _modelled(
     problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
 ) -> Float[Array, "steps 3"]:
@@ -166,7 +166,7 @@ def _modelled(
     return jnp.stack(problem.model.angular_acceleration(middle, forcing, tuple(parameters)), axis=1)
 
 
-@eqx.filter_jit
+@compiled_cheaply
 def _parts(
     problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
 ) -> tuple[Float[Array, "steps 3"], Float[Array, "steps 3"]]:

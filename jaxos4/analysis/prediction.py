@@ -4,13 +4,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import Arrays, Numeric, Parameters, as_float
+from .._xla import compiled_cheaply
 from ..flight import RATES, Flight
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST, ShootingProblem
@@ -129,7 +129,7 @@ def _ahead(flight: Flight, horizons: tuple[float, ...]) -> Int[np.ndarray, " hor
     return np.maximum(np.rint(np.asarray(horizons) / float(flight.dt)).astype(int), 1)
 
 
-@eqx.filter_jit
+@compiled_cheaply
 def _predict(
     problem: ShootingProblem,
     parameters: Parameters,

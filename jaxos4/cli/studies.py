@@ -12,6 +12,7 @@ from typer import Argument, Option
 import jaxos4
 
 from .._files import write_file
+from .._xla import add_flags
 from ..errors import InputError, in_words, printable
 from ._shared import ESTIMATORS, check_outputs, stages
 
@@ -83,6 +84,7 @@ def report(
     csv: Annotated[
         Path | None, Option(help="Of a study: errors, bounds, efficiency and coverage as a table (CSV).")
     ] = None,
+    pdf: Annotated[bool, Option("--pdf", help="Of a study: the figures as PDF too.")] = False,
 ) -> None:
     """Make the page of a result, or the report of a study.
 
@@ -97,6 +99,8 @@ def report(
             f"--csv: {source} is a result; `found.to_dataframe()` in Python makes its table. Leave it out."
         )
     if not source.is_dir():
+        if pdf:
+            raise InputError(f"--pdf: {source} is a result, which has a page alone; leave it out.")
         out = source.with_suffix(".html") if out is None else out
         check_outputs(source, out=out)
     elif out is not None:
@@ -109,7 +113,7 @@ def report(
             if csv is not None:
                 check_outputs(source / "results.nc", csv=csv)
                 write_file(csv, jaxos4.report.error_csv(dataset))
-            page, *figures = jaxos4.report.write_report(dataset, source)
+            page, *figures = jaxos4.report.write_report(dataset, source, pdf=pdf)
         else:
             found = jaxos4.read_result(source)
             progress("drawing")
@@ -117,7 +121,7 @@ def report(
             jaxos4.report.write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
-        typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")
+        typer.echo(f"{figures[0].parent}: {len(figures) // (1 + pdf)} figures, as SVG{' and PDF' if pdf else ''}")
     if csv is not None:
         typer.echo(f"{csv}: errors, bounds, efficiency and coverage")
 
@@ -169,6 +173,7 @@ def _compare_results(results: list[Path], page: Path | None) -> None:
 
 def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
+    add_flags(brief=quick)
     with stages("loading the library"):
         from rich.console import Console
 

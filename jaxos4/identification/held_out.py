@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._custom_types import Numeric, as_float
+from .._xla import compiled_cheaply
 from ..analysis.diagnostics import Correlations, residual_correlations, residual_diagnostics
 from ..analysis.evaluation import evaluate
 from ..analysis.open_loop import Traced, traced
@@ -106,7 +107,7 @@ def vehicle_traces(
     return traces.thinned(), crossed
 
 
-@eqx.filter_jit
+@compiled_cheaply
 def _regressed(problem: ShootingProblem, values: Array, fixed: Numeric) -> Array:
     """The parameters by regression; fixed ones, and those that it cannot estimate, have the values of the fit."""
     linear = np.array([not each.in_forcing for each in problem.model.parameters])

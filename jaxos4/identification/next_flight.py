@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from ..airframe import AXES, INERTIAS
+from ..errors import percent
 from ..results import NINETY_FIVE
 from .results import Identification
 from .verdict import IDENTIFIED, MISSING, RESERVED, UNCERTAIN, pooled_status
@@ -34,7 +35,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
             every = (each.provenance.fitted_seconds for each in fitted)
             motions.append(_more(axis.motion, spread, sum(x for x in every if isinstance(x, float))))
             flown.add(f"fly more {axis.motion}")
-            known.append(f"{axis.inertia} {100 * spread:.3g} %")
+            known.append(f"{axis.inertia} {percent(spread, 3)}")
     if motions:
         advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * UNCERTAIN:.0f} %"]
     for name, own in counted.items():

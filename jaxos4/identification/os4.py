@@ -22,7 +22,7 @@ from ..networks import TrainedNetwork
 from ..networks.file import load_network
 from ..networks.for_flight import GivenNetwork, network_for, network_provenance
 from ..recording.checks import KINEMATIC, self_checks
-from ..results import RESULTS
+from ..results import result_names
 from ..shooting import ShootingProblem, padded
 from .answers import Answer, Solution
 from .checks import check_os4
@@ -188,7 +188,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
             break
         problem = problem.reweighted(evaluate(problem, last.parameters, last.initial_state).errors)
         settled = (np.abs(np.asarray(problem.sigma) / before - 1) < SETTLED).all()
-        failed = estimator.shoots and bool(last.result != RESULTS.successful)
+        failed = estimator.shoots and str(result_names(last.result)) != "successful"
         is_last = settled or failed or number > MAX_PASSES
         if not is_last or not estimator.shoots:
             estimates.append(search(problem, number))

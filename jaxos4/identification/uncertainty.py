@@ -30,7 +30,7 @@ from .data import Data, Progress, silent
 from .results import FixedParameter, has_answer
 from .search import Optimum, disturbances_of, search
 
-PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
+PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
 _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 
 

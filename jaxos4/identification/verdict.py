@@ -9,6 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from ..airframe import INERTIAS
+from ..errors import percent
 
 IDENTIFIED = "identified"
 RESERVED = "identified with a reservation"
@@ -214,9 +215,9 @@ def _statuses_left(doubts: Sequence[Doubt], name: str) -> list[str]:
 def _reason(doubt: Doubt, name: str) -> str:
     """The doubt in words, with how far it moves this quantity, or the inertias if it is this quantity's own."""
     if (move := doubt.moves.get(name)) is not None:
-        return f"{doubt.cause} (this would move it by {100 * move.share:.2g} %)"
+        return f"{doubt.cause} (this would move it by {percent(move.share)})"
     moves = {each: doubt.moves.get(each) for each in INERTIAS}
-    sizes = [f"{each} by {100 * move.share:.2g} %" for each, move in moves.items() if move is not None]
+    sizes = [f"{each} by {percent(move.share)}" for each, move in moves.items() if move is not None]
     return f"{doubt} (this would move {', '.join(sizes)})" if sizes else str(doubt)
 
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._files import at_once
 from ..errors import InputError, printable, shortened
 from ..flight import Flight, with_force
 
@@ -237,7 +238,7 @@ def opened(path: Path, mode: str = "r") -> Iterator[IO]:
         refuse(path, "is not a file name, because it contains a null character; give the path of a log")
     encoding, errors = ("utf-8-sig", "surrogateescape") if mode == "r" else (None, None)
     try:
-        with open(path, mode, encoding=encoding, errors=errors) as file:
+        with open(path, mode, encoding=encoding, errors=errors, opener=at_once) as file:
             yield file
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "its name or content cannot be decoded"

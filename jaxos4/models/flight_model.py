@@ -52,7 +52,7 @@ class FlightModel(AbstractModel):
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0; the last number holds
       for all stretches that follow. Each recording has its own offsets and gyro biases.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
-    - `batch`: this many samples of a padded flight are computed together.
+    - `batch`: up to this many samples of a padded flight, or parts of them, are computed together.
 
     **Raises:** `ValueError` for terms that do not exist, are given twice or exclude each other, recordings that are not
     counted from 0, or a term that needs an unknown `airframe.max_rotor_speed` or `battery_voltage`.
@@ -154,7 +154,7 @@ class FlightModel(AbstractModel):
         last = samples - 1 if inputs.stretches is None else inputs.stretches.last[:, None]
         following = parts * np.arange(samples)[:, None] + parts // 2 + np.arange(parts)
         following = jnp.minimum(following, parts * last + parts - 1)
-        fine = self._rotors(inputs.divided, parameters, are_parts=True)
+        fine = self._rotors(inputs.divided, parameters, parts=parts)
         return self._beside(inputs, jax.tree.map(lambda leaf: leaf[following].mean(axis=1), fine))
 
     def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
@@ -171,10 +171,14 @@ class FlightModel(AbstractModel):
         left = 2 * jnp.diff(jnp.where(rows < parts, few, many))
         wide = jnp.maximum(length, 2 / parts)  # an instant is seen as the parts before and after it
         seen = jnp.diff(jnp.clip(edges - (1 - wide) / 2, 0, wide)) / wide
-        fine = self._rotors(inputs.divided, parameters, are_parts=True)
-        fine = jax.tree.map(lambda leaf: leaf.reshape(samples, parts), fine)
-        whole, early = jax.tree.map(lambda leaf: leaf.mean(axis=1), fine), jax.tree.map(lambda leaf: leaf @ left, fine)
-        return self._beside(inputs, whole._replace(specific_thrust=fine.thrust @ seen, early=early))
+
+        def averaged(fine: Forcing) -> Forcing:
+            fine = jax.tree.map(lambda leaf: leaf.reshape(-1, parts), fine)
+            whole = jax.tree.map(lambda leaf: leaf.mean(axis=1), fine)
+            early = jax.tree.map(lambda leaf: leaf @ left, fine)
+            return whole._replace(specific_thrust=fine.thrust @ seen, early=early)
+
+        return self._beside(inputs, self._rotors(inputs.divided, parameters, parts=parts, of_parts=averaged))
 
     def _beside(self, inputs: Inputs, rotors: Forcing) -> Forcing:
         """The forcing by the rotors, and what acts beside them."""
@@ -184,13 +188,16 @@ class FlightModel(AbstractModel):
         shares = tuple((own == i).astype(rotors.roll.dtype) for i in range(max(self.recordings) + 1))
         return rotors._replace(recording=shares, velocity=None if velocity is None else tuple(velocity.T))
 
-    def _rotors(self, inputs: Inputs, parameters, *, are_parts: bool = False) -> Forcing:
-        """The forcing by the rotors. `are_parts`: see `Grid`."""
-        grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=are_parts)
-        before = jnp.zeros_like(inputs.omega[0])
-        if inputs.length is None:
-            return self._driven(inputs, grid, Batch(grid, jnp.arange(len(inputs.omega)), before), parameters)[0]
-        return self._driven_in_batches(inputs, inputs.length, grid, before, parameters)
+    def _rotors(
+        self, inputs: Inputs, parameters, *, parts: int = 0, of_parts: Callable[[Forcing], Forcing] = lambda fine: fine
+    ) -> Forcing:
+        """The forcing by the rotors, as `of_parts` makes it. `parts`: of each sample, if `inputs` hold them."""
+        grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=parts > 0)
+        if inputs.length is not None:
+            whole = self.batch - self.batch % max(parts, 1)  # a batch holds all parts of its samples
+            return self._driven_in_batches(inputs, inputs.length, grid, parameters, whole, of_parts)
+        every = Batch(grid, jnp.arange(len(inputs.omega)), jnp.zeros_like(inputs.omega[0]))
+        return of_parts(self._driven(inputs, grid, every, parameters)[0])
 
     def _driven(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
         """The forcing by the rotors over some samples, and the rotor speeds at the end of the last."""
@@ -217,21 +224,23 @@ class FlightModel(AbstractModel):
         )
         return found, speeds.end[-1]
 
-    def _driven_in_batches(self, inputs: Inputs, length: Count, grid: Grid, before: Array, parameters) -> Forcing:
-        """`_driven` of the samples that count, batch by batch, so that padding takes no time."""
-        samples = inputs.omega.shape[0]
+    def _driven_in_batches(
+        self, inputs: Inputs, length: Count, grid: Grid, parameters, rows: int, of_parts: Callable[[Forcing], Forcing]
+    ) -> Forcing:
+        """`of_parts` of `_driven` for the samples that count, `rows` at a time, so that padding takes no time."""
+        samples, zeros = inputs.omega.shape[0], jnp.zeros(-(-inputs.omega.shape[0] // rows) * rows, float)
+        nothing = of_parts(Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros))
+        many = nothing.roll.shape[0] * rows // zeros.shape[0]
 
         def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
             filled, before = carry
-            rows = jnp.minimum(i * self.batch + jnp.arange(self.batch), samples - 1)
-            found, before = self._driven(inputs, grid, Batch(grid, rows, before), parameters)
-            place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * self.batch, axis=0)
-            return jax.tree.map(place, filled, found), before
+            batch = Batch(grid, jnp.minimum(i * rows + jnp.arange(rows), samples - 1), before)
+            found, before = self._driven(inputs, grid, batch, parameters)
+            place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * many, axis=0)
+            return jax.tree.map(place, filled, of_parts(found)), before
 
-        zeros = jnp.zeros(-(-samples // self.batch) * self.batch, before.dtype)
-        nothing = Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros)
-        filled, _ = jax.lax.fori_loop(0, -(-length // self.batch), fill, (nothing, before))
-        return jax.tree.map(lambda leaf: leaf[:samples], filled)
+        filled, _ = jax.lax.fori_loop(0, -(-length // rows), fill, (nothing, jnp.zeros_like(inputs.omega[0])))
+        return jax.tree.map(lambda leaf: leaf[: samples * many // rows], filled)
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """p', q', r' [rad/s^2]: the rigid body's, and the contribution of each term."""

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import RotorSpeeds, Scalar
 from .._registry import Registry
 from ..airframe import GRAVITY, MOTIONS, Airframe
 from .abstract import Contradiction, Parameter
 from .rotors import Batch, Commands, Grid, Motor, Speeds, delayed, driven
-from .state import Forcing, Rates, Vector
+from .state import Forcing, Rates, Samples, Vector
 
 # What a term can need from the logs or from the airframe.
 COMMANDS = "commands"
@@ -38,6 +38,7 @@ SAG, VOLTAGE_EXPONENT = "battery_sag", "voltage_exponent"
 
 T = TypeVar("T")
 Values = Mapping[str, Float[Array, "..."]]
+Places = Int[Array, "*rows"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,14 +163,9 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
     return total._replace(r=total.r - values["rotor_reaction"] * spin_up)
 
 
-def _scaled(share: Callable[[Values, Grid], Float[Array, " samples"]]) -> Callable[[Commands, Values, Grid], Commands]:
-    """The commands times a share, which is given for each sample of the flight."""
-
-    def command(omega: Commands, values: Values, grid: Grid) -> Commands:
-        shares = share(values, grid)
-        return lambda rows: omega(rows) * shares[rows][..., None]
-
-    return command
+def _scaled(share: Callable[[Values, Grid, Places], Samples]) -> Callable[[Commands, Values, Grid], Commands]:
+    """The commands times a share, which is given for some samples of the flight."""
+    return lambda omega, values, grid: lambda rows: omega(rows) * share(values, grid, rows)[..., None]
 
 
 def _drive(omega: RotorSpeeds, values: Values, batch: Batch, airframe: Airframe) -> Speeds:
@@ -233,7 +229,9 @@ _OWN: dict[str, Term] = {
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
         (Parameter(VOLTAGE_EXPONENT, "1", 0.5, center=0.5),),
         needs=frozenset({VOLTAGE, COMMANDS}),
-        command=_scaled(lambda values, grid: _known(grid.voltage, VOLTAGE, "voltage") ** values[VOLTAGE_EXPONENT]),
+        command=_scaled(
+            lambda values, grid, rows: _known(grid.voltage, VOLTAGE, "voltage")[rows] ** values[VOLTAGE_EXPONENT]
+        ),
     ),
     "fade": Term(
         "commands lose effect as the battery empties: battery_fade [1/s], the share of rotor speed lost in a second",
@@ -241,7 +239,7 @@ _OWN: dict[str, Term] = {
         needs=frozenset({COMMANDS, VERTICAL_FORCE}),
         # A logged voltage knows it.
         by_default=lambda available: VOLTAGE not in available,
-        command=_scaled(lambda values, grid: 1 - values["battery_fade"] * grid.elapsed),
+        command=_scaled(lambda values, grid, rows: 1 - values["battery_fade"] * grid.elapsed[rows]),
     ),
     "motor": Term(
         "motors follow their commands under the load of the propellers: rotor_lag [s], thrust_curve, motor_braking, "

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._custom_types import as_float
-from .._files import check_plain, reading, write_file
+from .._files import at_once, check_plain, reading, write_file
 from .._version import __version__
 from ..airframe import airframe_from_table, airframe_table
 from ..bracket import Bracket
@@ -69,7 +68,11 @@ def encode_network(network: TrainedNetwork) -> bytes:
 
 def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
     """Reads a file of `save_network`, by its path or open. Raises `InputError` for any other file, or `OSError`."""
-    content = path if isinstance(path, io.BytesIO) else io.BytesIO(Path(path).read_bytes())
+    if isinstance(path, io.BytesIO):
+        content = path
+    else:
+        with open(path, "rb", opener=at_once) as file:
+            content = io.BytesIO(file.read())
     place = "the network" if isinstance(path, io.BytesIO) else path
     with reading(place, "not a whole network file", _REMEDY, OSError):
         with zipfile.ZipFile(content) as archive:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import Key, Numeric, Scalar, as_float
-from ..errors import TrainingError
+from ..errors import TrainingError, percent
 from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
 from .features import CHUNK, Features, Flights, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
 
@@ -101,7 +101,7 @@ def train(
     held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
     flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
     if not flyable > FLYABLE:
-        what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
+        what = f"only {percent(float(flyable))} of the flights simulated in the bracket can be flown to their end"
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))

@@ -139,8 +139,8 @@ def prepare(
         smooth, noise, share = without_noise(each.stretches, airframe)
         stretched += [(number, stretch) for stretch in smooth]
         if share > NOISY:
-            how = f"white noise of {noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
-            notes.append(f"{recording.name}: rotor speeds have {how}; their expected values are used")
+            how = f"{noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
+            notes.append(f"{recording.name}: rotor speeds are noisy ({how}) and were smoothed")
     slowest = max(stretch.dt for _, stretch in stretched)
     steps = _sample_times(recordings[0].name, slowest, sample_time, predicted=predicted)
     coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)

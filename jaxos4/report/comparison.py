@@ -5,16 +5,15 @@ import os
 from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 
 from .._files import check_writable, write_file
 from ..airframe import INERTIAS
 from ..comparison import ComparedQuantity, Comparison
 from ..identification.verdict import ADVICE, RESERVED, STATUSES, headline
-from .html import draw, render
-from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, style
+from .page import Folded, Part, Picture, Row, Section, Table, Text, number, page, span
+from .panels import Band, Figure, Line, Panel, Scale, across
+from .style import BOUND_DASHES, FAINT, INK, Style, style
 from .text import DASH, Listing, plain, say
 
 
@@ -104,55 +103,97 @@ def forest(found: Comparison, look: Style) -> Figure:
 
     Dashed: the value in the airframe's file.
     """
-    count, drawn = len(found.names), [each for each in found.quantities if any(each.answers)]
-    figure, panels = grid(len(drawn), columns=3, height=0.9 + 0.19 * count)
-    for panel, each in zip(panels, drawn, strict=True):
+    count, panels = len(found.names), []
+    y = Scale(ends=(count - 0.4, -0.6), ticks={place: f"{place + 1}" for place in range(count)}, lines=False)
+    for each in found.quantities:
         ends = [end for row, used in zip(each.answers, each.used, strict=True) if row and used for end in row.ci95]
         ends = ends or [end for row in each.answers if row for end in row.ci95]
+        if not ends:
+            continue
         low, high = min(ends), max(ends)
         room = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-300)
         # Answers that do not count may reach far; the figure shows twice the room of those that do.
-        panel.set_xlim(low - room / 2, high + room / 2)
+        x, everywhere, marks = Scale(ends=(low - room / 2, high + room / 2)), (-math.inf, math.inf), []
         if math.isfinite(each.value):
-            panel.axvspan(*each.ci95, color=look.color, alpha=0.18, linewidth=0)
-            panel.axvline(each.value, color=look.color, linewidth=1.1)
+            marks += [Band(each.ci95, 2 * [-math.inf], 2 * [math.inf], look.color, 0.18, name="pooled, 95 %")]
+            marks += [Line(2 * [each.value], everywhere, look.color, 1.4)]
         if low - room / 2 < each.reference < high + room / 2:
-            panel.axvline(each.reference, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
+            marks += [Line(2 * [each.reference], everywhere, width=1.2, dash=BOUND_DASHES[2], name="airframe's file")]
         for place, (row, used) in enumerate(zip(each.answers, each.used, strict=True)):
             if row is not None:
-                color = INK if used else FAINT
-                panel.plot(row.ci95, [place, place], color=color, linewidth=1.4 if used else 0.9)
-                panel.plot([row.value], [place], "o", color=color, markersize=4, fillstyle="full" if used else "none")
-        panel.set_yticks(range(count), [f"{place + 1}" for place in range(count)])
-        panel.set_ylim(count - 0.4, -0.6)
-        panel.grid(axis="y", visible=False)
-        panel.xaxis.set_major_locator(MaxNLocator(4))
+                color, name = (INK, "95 % interval") if used else (FAINT, "refused by a verdict: does not count")
+                marks += [across([place], *([end] for end in row.ci95), color=color, width=1.8 if used else 1.2)]
+                marks += [Line([row.value], [place], color, 0, marker="o", size=6, hollow=not used)]
+                marks += [Line([], [], color, 1.8, marker="o", hollow=not used, name=name)]
         unit = "" if each.unit == "1" else f" [{each.unit}]"
-        panel.set_title(f"{each.name}{unit}{': differ' if each in found.different else ''}")
-    return figure
+        title = f"{each.name}{unit}{': differ' if each in found.different else ''}"
+        panels.append(Panel(title, marks, x, y, height=70 + 20 * count))
+    return Figure("forest", panels)
 
 
 def write_comparison(path: str | os.PathLike[str], found: Comparison, *, command: str = "") -> None:
     """Writes the page of a comparison, completely or not at all. `command`: that makes it again. Raises `OSError`."""
     check_writable(path)
-    figures = []
-    if any(any(each.answers) for each in found.quantities):
-        with drawing():
-            figures = [draw(forest(found, style(0)), "forest")]
-    write_file(
-        path,
-        render(
-            "comparison.html.j2",
-            title=f"{len(found.names)} results compared",
-            found=found,
-            figures=figures,
-            headline=" ".join(headline(found.statuses).values()),
-            agreement=agreement(found),
-            rows=[(each, judged(found, each), list(quantity_cells(found, each))) for each in found.quantities],
-            shared=SHARED,
-            isfinite=np.isfinite,
-            command=command,
-            notes=found.notes,
-            provenance=[(f"result {place}", name) for place, name in enumerate(found.names, start=1)],
-        ),
+    said, count = " ".join(headline(found.statuses).values()), len(found.reasons)
+    top: list[Part] = [Text(f"{said} {agreement(found)}", f"verdict{' warning' if found.different else ''}")]
+    if count:
+        lines = Text([f"{line}." for line in found.reasons])
+        top.append(Folded(f"{count} reason{'s' if count > 1 else ''}", [lines], id="reasons"))
+    if found.notes:
+        top.append(Text([f"{note}." for note in found.notes], id="notes"))
+    top.append(Text(found.next_flight[0].upper() + found.next_flight[1:], id="next"))
+    sections = [
+        Section("forest", "Each quantity in each result", _forest(found), "Figure"),
+        Section("pooled", "Pooled values", [_pooled(found)], "Pooled"),
+        Section("each", "Each result", [_each(found)], "Each result"),
+    ]
+    about = (
+        f"The same quantities in {len(found.names)} results, each with its 95 % interval; whether the results agree, "
+        "and their pooled value."
     )
+    text = page(
+        title=f"{len(found.names)} results compared",
+        about=about,
+        top=top,
+        sections=sections,
+        command=command,
+        provenance=[(f"result {place}", name) for place, name in enumerate(found.names, start=1)],
+    )
+    write_file(path, text)
+
+
+def _forest(found: Comparison) -> list[Part]:
+    if not any(any(each.answers) for each in found.quantities):
+        return []
+    of = enumerate(zip(found.names, found.flights, strict=True), start=1)
+    caption = f"{'; '.join(f'{place}: {name}, of {flights}' for place, (name, flights) in of)}."
+    return [Picture(forest(found, style(0)), f"Each quantity in each result, with 95 % intervals. {caption}")]
+
+
+def _pooled(found: Comparison) -> Part:
+    rows = []
+    for each in found.quantities:
+        ends = span(each.ci95) if np.isfinite(each.value) else ""
+        used = f"{sum(each.used)} of {len(found.names)}"
+        tested = number(each.chi2, 3), number(each.p, 2)
+        rows.append(Row.of(each.name, each.unit, used, number(each.value), ends, *tested, *judged(found, each)))
+    note = (
+        "The mean of the results that count, weighted by 1 / variance. p: the probability that results of one value "
+        "scatter this much or more (chi-squared). If they scatter more than their intervals say, the pooled interval "
+        "is widened to fit. All quantities are tested together: one of them is said to differ by chance in "
+        f"{100 * found.level:g} % of comparisons. {SHARED}"
+    )
+    headings = ("quantity", "unit", "results", "pooled", "95 % interval", "chi²", "p", "results", "pooled value")
+    return Table("pooled-table", "Pooled value of each quantity", headings, [("", rows)], [note], wide=True)
+
+
+def _each(found: Comparison) -> Part:
+    groups = [
+        (
+            each.name if each.unit == "1" else f"{each.name} [{each.unit}]",
+            [Row.of(*cells) for cells in quantity_cells(found, each)],
+        )
+        for each in found.quantities
+    ]
+    headings = ("result", "estimate", "95 % interval", "note")
+    return Table("each-table", "Each quantity in each result", headings, groups)

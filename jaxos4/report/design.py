@@ -8,9 +8,12 @@ from rich.console import Console
 
 from .._files import write_file
 from ..design import Design
+from .panels import Figure, Line, Panel, Scale
+from .style import Dash, Style, styles
+from .svg import as_file
 from .text import Listing, plain
 
-_COLUMNS = 4
+_WIDTH, _HEIGHT = 270.0, 190.0  # of a panel [px]
 # By the kind of design: what a missing bound means, what the geometric mean is taken of, what the other inputs share
 # with the design, and the titles of the panels of the inputs.
 _WORDS = {
@@ -68,39 +71,31 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
 
     A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds).
     """
-    from .style import INK, drawing, grid, label, log_axis, styles, svg  # a second that the table does not need
-
     task, designed, in_percent = found.task, found.designed, found.task.kind == "references"
-    every, targets = {"designed": designed, **found.standard}, task.scale.size
-    with drawing():
-        figure, panels = grid(_COLUMNS + targets, columns=_COLUMNS, height=1.9)
-        looks, shown = styles(list(every)), round(2 * designed.period / designed.dt)
-        time = designed.dt * np.arange(designed.inputs.shape[0])
-        for i, (panel, title) in enumerate(zip(panels, _WORDS[task.kind][-1], strict=False)):
-            for name in ("designed",) if in_percent else ("multisine", "designed"):
-                if name in every:
-                    look = looks[name]
-                    panel.plot(time[:shown], every[name].inputs[:shown, i], color=look.color, linestyle=look.dash)
-            panel.set_title(title)
-        for i, panel in enumerate(panels[_COLUMNS:]):
-            panel.axhline(100 * accuracy if in_percent else float(task.scale[i]), color=INK, linewidth=0.8)
-            for name, one in every.items():
-                if one.history is None:
-                    seconds = np.geomspace(designed.period, 10 * designed.duration, 50)
-                    bound = one.bounds[i] * np.sqrt(one.duration / seconds)
-                    bound = np.where(bound < task.unexcited[i], 100 * bound / task.scale[i], np.nan)
-                else:
-                    seconds, bound = time, one.history[:, i]
-                    bound = np.where(bound < 3 * task.scale[i], bound, np.nan)
-                panel.plot(seconds, bound, color=looks[name].color, linestyle=looks[name].dash, label=name)
-            if in_percent:
-                log_axis(panel, "x")
-            log_axis(panel, "y")
-            panel.set_title(f"{task.names[i]}: bound [{'%' if in_percent else task.units[i]}]")
-        label(figure, x="time [s]")
-        for panel in panels[_COLUMNS:] if in_percent else ():
-            panel.set_xlabel("flight [s]")
-        handles = panels[_COLUMNS].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside lower center", ncols=len(every))
-        content = svg(figure)
-    write_file(out, content)
+    every, panels = {"designed": designed, **found.standard}, []
+    looks, shown = styles(list(every)), round(2 * designed.period / designed.dt)
+    time, wanted = designed.dt * np.arange(designed.inputs.shape[0]), "wanted" if in_percent else "bracket"
+    for i, title in enumerate(_WORDS[task.kind][-1]):
+        flown = [name for name in (("designed",) if in_percent else ("multisine", "designed")) if name in every]
+        lines = [Line(time[:shown], every[name].inputs[:shown, i], *_look(looks[name]), name=name) for name in flown]
+        panels.append(Panel(title, lines, Scale(label="time [s]"), width=_WIDTH, height=_HEIGHT))
+    x = Scale("log", label="flight [s]") if in_percent else Scale(label="time [s]")
+    for i, (name, unit) in enumerate(zip(task.names[: task.scale.size], task.units, strict=False)):
+        line = 100 * accuracy if in_percent else float(task.scale[i])
+        marks = [Line((-math.inf, math.inf), (line, line), width=1.2, name=wanted)]
+        for kind, one in every.items():
+            if one.history is None:
+                seconds = np.geomspace(designed.period, 10 * designed.duration, 50)
+                bound = one.bounds[i] * np.sqrt(one.duration / seconds)
+                bound = np.where(bound < task.unexcited[i], 100 * bound / task.scale[i], np.nan)
+            else:
+                seconds, bound = time, one.history[:, i]
+                bound = np.where(bound < 3 * task.scale[i], bound, np.nan)
+            marks.append(Line(seconds, bound, *_look(looks[kind]), name=kind))
+        title = f"{name}: bound [{'%' if in_percent else unit}]"
+        panels.append(Panel(title, marks, x, Scale("log"), _WIDTH, _HEIGHT))
+    write_file(out, as_file(Figure("design", panels, columns=4)))
+
+
+def _look(look: Style) -> tuple[str, float, Dash]:
+    return look.color, 1.6, look.dash

@@ -1,17 +1,10 @@
 """The figures of an identification's page."""
 
-import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from markupsafe import Markup, escape
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Patch
-from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from ..airframe import INERTIAS, MOTIONS, Airframe
 from ..analysis.diagnostics import Correlations
@@ -22,111 +15,73 @@ from ..flight import STATE_NAMES
 from ..identification.results import Constant, Identification, SampleTime
 from ..models.state import CASCADE_ORDER
 from ..results import NINETY_FIVE
-from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, grid, label, style, ticks_at
+from .panels import Band, Figure, Line, Mark, Panel, Scale, Words, across, spread
+from .style import BOUND_DASHES, FAINT, GRID, INK, Style, style
 
 _FAR = (2, 10, 100, 1000, 10000, 100000)  # ticks of brackets that were left far behind, in half-widths
+_EVERYWHERE = (-math.inf, math.inf)  # from one end of an axis to the other
+_ALL = "95 % interval"
 
 
 def priors(found: Identification, look: Style) -> Figure | None:
     """Each parameter within its bracket: grey the bracket, coloured the 95 % interval of the estimate."""
     rows = {
-        name: (row.bracket, row.estimate, row.ci95 if row.ci95 else (row.estimate, row.estimate))
+        name.replace("_", " "): (row.bracket, row.estimate, row.ci95 if row.ci95 else (row.estimate, row.estimate))
         for name, row in found.parameters.items()
         if row.bracket and row.estimate is not None and row.bracket[0] < row.bracket[1]
     }
     if not rows:
         return None
-    figure, (panel,) = grid(1, columns=1, width=3.3, height=0.5 + 0.19 * len(rows))
-    reach = 2.0
-    for place, (bracket, value, interval) in enumerate(rows.values()):
-        center, half = np.mean(bracket), (bracket[1] - bracket[0]) / 2
-        low, at, high = (np.array([interval[0], value, interval[1]]) - center) / half
-        reach = max(reach, abs(low), abs(high))
-        panel.barh(place, 2, left=-1, height=0.7, color=FAINT, alpha=0.3, linewidth=0)
-        panel.plot([low, high], [place, place], color=look.color, linewidth=2.2)
-        panel.plot(at, place, look.marker, color=look.color, markersize=3.5)
-    panel.set_yticks(range(len(rows)), [name.replace("_", " ") for name in rows])
-    panel.set_ylim(len(rows) - 0.4, -0.6)
-    if reach > 5:  # one parameter far away would shrink all others to dots
-        panel.set_xscale("symlog", linthresh=2.0, linscale=2.0)
-        ticks_at(panel.xaxis, [-x for x in _FAR if x < reach] + [-1, 0, 1] + [x for x in _FAR if x < reach])
-    panel.set_xlim(-1.1 * reach, 1.1 * reach)
-    panel.grid(axis="y", visible=False)
-    label(figure, x="from the centre of the bracket, in half-widths")
-    return figure
+    low, high = np.array([bracket for bracket, _, _ in rows.values()]).T
+    ends = np.array([(interval[0], value, interval[1]) for _, value, interval in rows.values()])
+    ends = ((ends.T - (low + high) / 2) / ((high - low) / 2)).T
+    reach, places = 1.1 * max(2.0, float(np.abs(ends).max())), np.arange(len(rows))
+    is_far = reach > 5.5  # one parameter far away would shrink all others to dots
+    ticks = [-x for x in _FAR[::-1]] + [-1, 0, 1, *_FAR] if is_far else range(-5, 6)
+    marks = [Band((-1, 1), 2 * [k - 0.35], 2 * [k + 0.35], name="bracket") for k in places.tolist()]
+    lines = across(places, ends[:, 0], ends[:, 2], color=look.color, width=3.0)
+    points = Line(ends[:, 1], places, look.color, width=0, marker=look.marker, size=6)
+    names = Line([], [], look.color, 3.0, marker=look.marker, name=_ALL)
+    label = "from the bracket's centre, in half-widths"
+    x = Scale("symlog" if is_far else "linear", (-reach, reach), {at: f"{at:g}" for at in ticks}, label)
+    y = Scale(ends=(len(rows) - 0.4, -0.6), ticks=dict(enumerate(rows)), lines=False)
+    return Figure("priors", [Panel("", [*marks, lines, points, names], x, y, 340, 60 + 20 * len(rows))])
 
 
 def residual_figure(found: Correlations) -> Figure:
     """The correlations of the residuals of each channel with themselves and with the torques; bands: 95 % by chance."""
-    names = [STATE_NAMES[column] for column in CASCADE_ORDER[: len(found.own)]]
-    figure, panels = grid(2 * len(names), columns=2, height=1.55)
-    lags = found.with_torque.shape[2] // 2
-    for i, name in enumerate(names):
-        own, crossed = panels[2 * i : 2 * i + 2]
-        count = found.own.shape[1]
-        own.axhspan(-found.bound[i], found.bound[i], color=FAINT, alpha=0.3, linewidth=0)
-        stems = np.stack(
-            [np.zeros(count), found.own[i], np.full(count, np.nan)], axis=1
-        )  # one line: a third of the bytes
-        own.plot(np.repeat(np.arange(1, count + 1), 3), stems.ravel(), color=style(0).color, linewidth=1.6)
-        own.set_title(f"{name}: with itself")
-        most = float(np.max(found.torque_bound[i]))
-        crossed.axhspan(-most, most, color=FAINT, alpha=0.3, linewidth=0)
-        for place, dash in enumerate((0, 2, 1)):
-            values, look = found.with_torque[i, place], {"color": style(place).color, "linestyle": BOUND_DASHES[dash]}
-            crossed.plot(range(-lags, lags + 1), values, label=f"{MOTIONS[place]} torque", linewidth=1.1, **look)
-        if i == 0:  # in the panels, because a page shows each panel by itself
-            own.legend([Patch(color=FAINT, alpha=0.3)], ["95 % by chance"], fontsize=7, loc="upper right")
-            crossed.legend(fontsize=7, loc="upper right", ncols=3, handlelength=2.4)
-        crossed.set_title(f"{name}: with the torques")
-        for panel, values, bound in ((own, found.own[i], found.bound[i]), (crossed, found.with_torque[i], most)):
-            # The first panels have room for their legends.
-            reach = (1.6 if i == 0 else 1.15) * max(float(np.abs(values).max(initial=0.0)), bound, 0.05)
-            reach = min(reach, 1.6 if i == 0 else 1.15)
-            panel.set_ylim(-reach, reach)
-            panel.axhline(0, color=INK, linewidth=0.7)
-            panel.grid(visible=False)
-            panel.yaxis.set_major_locator(MaxNLocator(2, steps=[1, 2, 5, 10]))
-            panel.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    label(figure, x="lag [samples]")
-    return figure
+    panels, lags, count = [], found.with_torque.shape[2] // 2, found.own.shape[1]
+    x = Scale(label="lag [samples]")
+    for i, name in enumerate(STATE_NAMES[column] for column in CASCADE_ORDER[: len(found.own)]):
+        own = [spread(np.arange(1, count + 1), np.zeros(count), found.own[i], color=style(0).color)]
+        torques = [
+            Line(np.arange(-lags, lags + 1), values, style(k).color, 1.4, BOUND_DASHES[dash], name=f"{motion} torque")
+            for k, (values, motion, dash) in enumerate(zip(found.with_torque[i], MOTIONS, (0, 2, 1), strict=True))
+        ]
+        for title, bound, marks, values in (
+            ("with itself", float(found.bound[i]), own, found.own[i]),
+            ("with the torques", float(np.max(found.torque_bound[i])), torques, found.with_torque[i]),
+        ):
+            reach = 1.15 * min(max(float(np.abs(values).max(initial=0.0)), bound, 0.05), 1.0)
+            chance = Band(_EVERYWHERE, 2 * [-bound], 2 * [bound], name="95 % by chance")
+            axis = Line(_EVERYWHERE, (0, 0), width=0.9)
+            y = Scale(ends=(-reach, reach))
+            panels.append(Panel(f"{name}: {title}", [chance, axis, *marks], x, y, 430, 150))
+    return Figure("residuals", panels, columns=2)
 
 
-def path_in_space(traces: Traces, look: Style, *, turn: float = -60.0, height: float = 28.0) -> Figure:
-    """The measured path in its box, with its shadow; an OS4's prediction. `turn`, `height`: of the view [degrees]."""
-    turned, up = np.radians([turn, height])
-    right = np.array([-np.sin(turned), np.cos(turned), 0.0])
-    above = np.array([-np.cos(turned) * np.sin(up), -np.sin(turned) * np.sin(up), np.cos(up)])
-    paths = [traces.position]
+def path(traces: Traces, look: Style) -> Figure:
+    """The measured path from above and from two sides, and an OS4's prediction."""
+    paths, panels = [traces.position], []
     if traces.predicted.shape[1] == len(CASCADE_ORDER):
         paths.append(traces.predicted[:, [6, 8, 10]])
-    every = np.concatenate(paths)
-    low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
-    room = np.maximum(0.05 * np.max(high - low) - (high - low) / 2, 0.0) + 1e-3
-    low, high = low - room, high + room
-    corners = np.where(list(np.ndindex(2, 2, 2)), high, low)
-    figure, (panel,) = grid(1, columns=1, width=4.4, height=3.6)
-
-    def draw(points: Float[np.ndarray, "_points 3"], **how: Any) -> None:
-        panel.plot(points @ right, points @ above, **how)
-
-    for i, j in itertools.combinations(range(8), 2):
-        if np.count_nonzero(corners[i] != corners[j]) == 1:
-            draw(corners[[i, j]], color=FAINT, linewidth=0.6)
-    draw(np.column_stack([paths[0][:, :2], np.full(len(paths[0]), low[2])]), color=FAINT, linewidth=0.8)
-    draw(paths[0], color=INK, linewidth=1.0, linestyle=BOUND_DASHES[1])
-    for path in paths[1:]:
-        draw(path, color=look.color, linewidth=1.4)
-    draw(paths[0][:1], color=INK, marker="o", markersize=4)
-    for axis, ends in enumerate(([0, 4], [4, 6], [0, 1])):  # the edges in front, and the left one
-        middle = corners[ends].mean(axis=0)
-        text, align = f"{'xyz'[axis]} {low[axis]:.3g} to {high[axis]:.3g} m", ("right", "left", "right")[axis]
-        panel.text(
-            middle @ right, middle @ above, f" {text} ", ha=align, va="center" if axis == 2 else "top", fontsize=8
-        )
-    panel.set_aspect("equal")
-    panel.set_axis_off()
-    return figure
+    for title, i, j in (("from above", 0, 1), ("from the side", 0, 2), ("from the front", 1, 2)):
+        marks = [Line(*paths[0].T[[i, j]], width=1.2, dash=BOUND_DASHES[1], name="measured, from the dot on")]
+        marks += [Line(*each.T[[i, j]], color=look.color, name="predicted") for each in paths[1:]]
+        marks += [Line(*paths[0][:1].T[[i, j]], width=0, marker="o", size=6)]
+        x, y = Scale(label=f"{'xyz'[i]} [m]"), Scale()
+        panels.append(Panel(f"{title}: {'xyz'[j]} [m]", marks, x, y, height=300, equal=True))
+    return Figure("path", panels)
 
 
 def correlations(found: Identification) -> Float[np.ndarray, "parameters parameters"]:
@@ -138,30 +93,25 @@ def correlations(found: Identification) -> Float[np.ndarray, "parameters paramet
     return matrix
 
 
-def correlation_matrix(found: Identification, *, least: float = 0.05, most: int = 400) -> Markup:
-    """The correlations of the parameters as an SVG: a square for each pair, hollow if negative; rows and columns named.
+def correlation_matrix(found: Identification, look: Style, *, least: float = 0.05) -> Figure:
+    """The correlations of the parameters: a square for each pair, hollow if negative.
 
-    Those below `least` are left out; if there are more than `most`, the smallest too.
+    A name stands at the right end of its row, where its column begins. Correlations below `least` are left out.
     """
-    names, cell, matrix = list(found.parameters), 18, correlations(found)
-    room = 10 + 7 * max(map(len, names))
-    sizes = np.sort(np.abs(matrix[np.tril_indices(len(names))]))[::-1]
-    least = max(least, float(sizes[most])) if sizes.size > most else least
-    marks = []
-    for row, name in enumerate(names):
-        y = cell * row + cell // 2
-        marks.append(f'<text x="{room - 6}" y="{y + 4}" text-anchor="end">{escape(name.replace("_", " "))}</text>')
-        for column in np.flatnonzero(np.abs(matrix[row, : row + 1]) >= least).tolist():
-            value = float(matrix[row, column])
-            half, x = 0.44 * cell * abs(value) ** 0.5, room + cell * column + cell // 2
-            tip = escape(f"{name}, {names[column]}: {value:.2f}")
-            box = f'x="{x - half:.1f}" y="{y - half:.1f}" width="{2 * half:.1f}" height="{2 * half:.1f}"'
-            marks.append(f'<rect class="{"plus" if value > 0 else "minus"}" {box}><title>{tip}</title></rect>')
-        x = room + cell * (row + 1) + 3  # beside the diagonal, where the column of this parameter begins
-        marks.append(f'<text x="{x}" y="{y + 4}">{escape(name.replace("_", " "))}</text>')
-    width, height = 2 * room + cell * len(names), cell * len(names)
-    shape = f'viewBox="0 0 {width} {height}" style="max-width: {1.5 * width:.0f}px"'
-    return Markup(f'<svg class="matrix" {shape}>{"".join(marks)}</svg>')  # noqa: S704  # names are escaped
+    names, matrix = [name.replace("_", " ") for name in found.parameters], correlations(found)
+    count, cell = len(names), 16
+    marks: list[Mark] = [Words(k + 0.4, k, name) for k, name in enumerate(names)]
+    for k in range(count):
+        marks += [Line((-0.6, k), (k, k), GRID, 1.0), Line((k, k), (k, count - 0.4), GRID, 1.0)]
+    for row, column in zip(*(each.tolist() for each in np.nonzero(np.tril(np.abs(matrix) >= least))), strict=True):
+        value = float(matrix[row, column])
+        color, name = (look.color, "positive") if value > 0 else (INK, "negative")
+        size, tip = 0.75 * cell * abs(value) ** 0.5, f"{names[row]}, {names[column]}: {value:.2f}"
+        marks.append(Line([column], [row], color, 0, (0, ()), "s", size, value < 0, name, tip=tip))
+    room = 8 * max(map(len, names))
+    x, y = Scale(ends=(-0.6, count - 0.4 + room / cell)), Scale(ends=(count - 0.4, -0.6))
+    size = (24 + room + cell * count, 24 + cell * count)
+    return Figure("matrix", [Panel("", marks, x, y, *size, bare=True)])
 
 
 def strongest(found: Identification, *, least: float = 0.9, most: int = 5) -> list[tuple[str, str, float]]:
@@ -172,118 +122,108 @@ def strongest(found: Identification, *, least: float = 0.9, most: int = 5) -> li
     return sorted((pair for pair in pairs if abs(pair[2]) > least), key=lambda pair: -abs(pair[2]))[:most]
 
 
+def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:
+    """The vehicle as it was identified: left from above, front up, right its moments of inertia with 95 % intervals."""
+    positions = 1e3 * np.asarray(airframe.rotor_positions, dtype=float)
+    distances = np.linalg.norm(positions[:, None] - positions, axis=2)
+    radius, turn = 0.42 * distances[distances > 0].min(), np.linspace(0, 2 * np.pi, 41)
+    circle = radius * np.stack([np.cos(turn), np.sin(turn)])
+    marks: list[Mark] = []
+    for i, ((x, y), spin) in enumerate(zip(positions, np.asarray(airframe.rotor_spins), strict=True)):
+        end = 1 - radius / max(math.hypot(x, y), radius)  # of the arm, at the rotor's disk
+        at, turned = np.array([[-y], [x]]), np.radians(np.linspace(200, 200 + 280 * spin, 60))
+        arc = 0.72 * radius * np.stack([np.cos(turned), np.sin(turned)]) + at
+        back = math.atan2(*(arc[:, -4] - arc[:, -1])[::-1])
+        tips = [arc[:, -1] + 0.25 * radius * np.array([math.cos(back + a), math.sin(back + a)]) for a in (-0.5, 0.5)]
+        marks += [Line((0, -end * y), (0, end * x), FAINT, 4.0), Line(*(circle + at), width=1.4)]
+        head = np.stack([tips[0], arc[:, -1], tips[1]], axis=1)
+        marks += [Line(x, y, look.color, 1.6) for x, y in (arc, head)]
+        marks += [Words(-y, x, f"{i + 1}", "middle")]
+    place = {each.axis: (1e3 * each.value, 1e3 * NINETY_FIVE * each.std) for each in center}
+    (cx, ex), (cy, ey) = (place.get(axis, (0.0, 0.0)) for axis in "xy")
+    marks += [Line((-cy - ey, -cy + ey), (cx, cx), width=1.4), Line((-cy, -cy), (cx - ex, cx + ex), width=1.4)]
+    marks += [Line([-cy], [cx], width=0, marker="P", size=11)]
+    bars: list[Mark] = []
+    for row, (name, given) in enumerate(zip(INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
+        if name in constants:
+            value, half = constants[name].estimate, NINETY_FIVE * constants[name].std
+            bars += [Band((0, value), 2 * [row - 0.25], 2 * [row + 0.25], look.color, 0.35)]
+            bars += [across([row], [value - half], [value + half], color=look.color, width=2.2, name=_ALL)]
+            bars += [Line([value], [row], look.color, 0, marker=look.marker)]
+        else:
+            bars += [Words(0, row, "not identified")]
+        bars += [Line(2 * [given], (row - 0.36, row + 0.36), dash=BOUND_DASHES[2], name="airframe's file")]
+    top = max(float(np.nanmax(each.x)) for each in bars if isinstance(each, Line))
+    x, y = Scale(ends=(0.0, 1.08 * top)), Scale(ends=(2.6, -0.6), ticks=dict(enumerate(INERTIAS)), lines=False)
+    above = Panel("from above [mm], front up", marks, width=430, height=320, equal=True)
+    return Figure("vehicle", [above, Panel("moments of inertia [kg m²]", bars, x, y, 430, 320)], columns=2)
+
+
 GAINS = (0.5, 2.0)
 """The gains that a figure of the response shows at least: verdicts are about some percent."""
 _WIDEST = (0.2, 5.0)  # and at most: what reaches further is unknown
 
 
-def gain_band(one: AxisResponse) -> Float[np.ndarray, "2 frequencies"]:
-    """The ends of the 95 % interval of the gain, finite."""
-    factor = np.exp(np.minimum(one.half_width, 50.0))  # beyond every figure
-    return np.array([one.gain / factor, one.gain * factor])
+def gain(name: str, one: AxisResponse, look: Style) -> Panel:
+    """The gain of an axis with its 95 % band where it is clear, and its mean, about which the verdict is."""
+    factor, mean, ends = np.exp(np.minimum(one.half_width, 50.0)), one.agreement(), GAINS  # 50: beyond every figure
+    marks = _response(one, one.gain, np.array([one.gain / factor, one.gain * factor]), 1.0, look)
+    if np.isfinite(mean.interval).all():
+        low, high = mean.interval
+        marks += [Band((mean.low, mean.high), 2 * [low], 2 * [high], INK, 0.18)]
+        marks += [Line((mean.low, mean.high), 2 * [mean.ratio], width=2.2, name="mean gain with its 95 % interval")]
+        ends = min(ends[0], max(0.8 * low, _WIDEST[0])), max(ends[1], min(1.25 * high, _WIDEST[1]))
+    ticks = {x: f"{x:g}" for x in (0.1, 0.2, 0.5, 0.7, 1, 1.4, 2, 5, 10)}
+    return Panel(f"{name}: gain", marks, y=Scale("log", ends, ticks))
 
 
-def draw_response(
-    panel: Axes,
+def _response(
     one: AxisResponse,
     values: Float[np.ndarray, " frequencies"],
     band: Float[np.ndarray, "2 frequencies"],
     model: float,
-    color: str,
-) -> None:
-    """Draws gain or phase with its band; faintly at frequencies without a clear response; dashed: the model."""
-    panel.plot(one.frequency, values, color=FAINT, linewidth=0.8)
-    low, high = np.where(one.clear, band, np.nan)
-    panel.fill_between(one.frequency, low, high, color=color, alpha=0.25, linewidth=0)
-    panel.plot(one.frequency, np.where(one.clear, values, np.nan), color=color)
-    panel.axhline(model, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
-
-
-def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:
-    """The vehicle as it was identified: left from above, front up, right its moments of inertia with 95 % intervals."""
-    figure, (above, bars) = grid(2, columns=2, height=3.4)
-    positions = 1e3 * np.asarray(airframe.rotor_positions, dtype=float)
-    (x, y), distances = positions.T, np.linalg.norm(positions[:, None] - positions, axis=2)
-    radius = 0.42 * distances[distances > 0].min()
-    for i, spin in enumerate(np.asarray(airframe.rotor_spins)):
-        end = 1 - 0.25 * radius / max(math.hypot(x[i], y[i]), radius)  # leaves room for the number
-        above.plot([0, -end * y[i]], [0, end * x[i]], color=FAINT, linewidth=3, zorder=1)
-        above.add_patch(Circle((-y[i], x[i]), radius, facecolor=PAPER, edgecolor=INK, linewidth=1.1))
-        turn = np.radians(np.linspace(200, 200 + 280 * spin, 60))
-        arc = 0.72 * radius * np.stack([np.cos(turn), np.sin(turn)], axis=1) + [-y[i], x[i]]
-        above.plot(*arc.T, color=look.color, linewidth=1.2)
-        above.annotate("", arc[-1], arc[-6], arrowprops={"arrowstyle": "-|>", "color": look.color, "shrinkA": 0})
-        above.text(-y[i], x[i], f"{i + 1}", ha="center", va="center", fontsize=10, fontweight="bold")
-    place = {each.axis: (1e3 * each.value, 1e3 * NINETY_FIVE * each.std) for each in center}
-    (cx, ex), (cy, ey) = (place.get(axis, (0.0, 0.0)) for axis in "xy")
-    above.errorbar(-cy, cx, xerr=ey or None, yerr=ex or None, color=INK, marker="P", markersize=6, capsize=2, zorder=4)
-    above.margins(0.08)
-    above.set_aspect("equal", adjustable="datalim")
-    above.set_title("from above [mm], front up")
-    for row, (name, given) in enumerate(zip(INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
-        bars.plot([given, given], [row - 0.36, row + 0.36], color=INK, linewidth=1.4, linestyle=BOUND_DASHES[2])
-        if name not in constants:
-            bars.text(0, row, "  not identified", va="center")
-            continue
-        value, half = constants[name].estimate, NINETY_FIVE * constants[name].std
-        bars.barh(row, value, height=0.5, color=look.color, alpha=0.35)
-        bars.errorbar(value, row, xerr=half, color=look.color, capsize=4, marker=look.marker)
-    bars.set_yticks(range(3), INERTIAS)
-    bars.tick_params(axis="y", length=0, pad=8)
-    bars.set_ylim(2.6, -0.6)
-    bars.set_xlim(left=0)
-    bars.grid(axis="y", visible=False)
-    bars.set_title("moments of inertia [kg m²], 95 %")
-    return figure
+    look: Style,
+) -> list[Mark]:
+    """Gain or phase with its band; faintly at frequencies without a clear response; dashed: the model."""
+    return [
+        Line(one.frequency, values, FAINT, 1.1, name="not clear"),
+        Band(
+            one.frequency, np.where(one.clear, band[0], np.nan), np.where(one.clear, band[1], np.nan), look.color, 0.25
+        ),
+        Line(one.frequency, np.where(one.clear, values, np.nan), look.color, name="measured / modelled"),
+        Line(_EVERYWHERE, 2 * [model], width=1.2, dash=BOUND_DASHES[2], name="model"),
+    ]
 
 
 def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     """Gain, phase and coherence of each axis with 95 % bands, faint where they are not clear; dashed: the model."""
-    figure, panels = grid(9, columns=3, height=1.9)
     top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
-    for row, (name, axis) in enumerate(found._asdict().items()):
-        gain, phase, coherence = panels[3 * row : 3 * row + 3]
-        degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
-        draw_response(gain, axis, axis.gain, gain_band(axis), 1.0, look.color)
-        draw_response(phase, axis, degrees, np.array([degrees - spread, degrees + spread]), 0.0, look.color)
-        coherence.plot(axis.frequency, axis.coherence, color=look.color)
-        mean, ends = axis.agreement(), GAINS
-        if np.isfinite(mean.interval).all():
-            low, high = mean.interval
-            gain.fill_between([mean.low, mean.high], low, high, color=INK, alpha=0.18, linewidth=0)
-            gain.plot([mean.low, mean.high], [mean.ratio] * 2, color=INK, linewidth=1.6)
-            ends = min(ends[0], max(0.8 * low, _WIDEST[0])), max(ends[1], min(1.25 * high, _WIDEST[1]))
-        gain.set_yscale("log")
-        gain.set_ylim(ends)
-        ticks_at(gain.yaxis, (0.1, 0.2, 0.5, 0.7, 1, 1.4, 2, 5, 10))
-        phase.set_ylim(-180, 180)
-        phase.yaxis.set_major_locator(MultipleLocator(90))
-        coherence.set_ylim(0, 1.03)
-        for panel, title in ((gain, "gain"), (phase, "phase [degrees]"), (coherence, "coherence")):
-            panel.set_title(f"{name}: {title}")
-            panel.set_xscale("log")
-            panel.set_xlim(1.0, top)
-            ticks_at(panel.xaxis, (1, 2, 5, 10, 20, 40))
-    label(figure, x="frequency [Hz]")
-    return figure
+    x, panels = Scale("log", (1.0, top), {at: f"{at}" for at in (1, 2, 5, 10, 20, 40)}, "frequency [Hz]"), []
+    turns = Scale(ends=(-180, 180), ticks={at: f"{at}" for at in range(-180, 181, 90)})
+    for name, axis in found._asdict().items():
+        degrees, half = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
+        phase = _response(axis, degrees, np.array([degrees - half, degrees + half]), 0.0, look)
+        panels += [
+            gain(name, axis, look),
+            Panel(f"{name}: phase [degrees]", phase, y=turns),
+            Panel(f"{name}: coherence", [Line(axis.frequency, axis.coherence, look.color)], y=Scale(ends=(0, 1.03))),
+        ]
+    return Figure("response", [panel._replace(x=x) for panel in panels])
 
 
 def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: Style) -> Figure:
     """Ix, Iy, Iz at each sample time with 95 % intervals. Lines: the `chosen` one [s], and its moments of inertia."""
-    figure, panels = grid(3, columns=3, height=2.4)
-    ticks = [1e3 * each.sample_time for each in answers]
-    for panel, name in zip(panels, INERTIAS, strict=True):
-        rows = {each.sample_time: each.constants[name] for each in answers if name in each.constants}
-        for sample_time, row in rows.items():
-            if math.isclose(sample_time, chosen):
-                panel.axhline(row.estimate, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[2])
-        times, values = [1e3 * sample_time for sample_time in rows], [row.estimate for row in rows.values()]
-        errors = [NINETY_FIVE * row.std for row in rows.values()]
-        panel.errorbar(times, values, yerr=errors, markersize=4, capsize=3, **look.line)
-        panel.axvline(1e3 * chosen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
-        panel.set_title(f"{name} [kg m²]" if rows else f"{name}: not identified")
-        panel.set_xscale("log")
-        panel.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
-        ticks_at(panel.xaxis, ticks)
-    label(figure, x="sample time [ms]")
-    return figure
+    panels, times = [], [1e3 * each.sample_time for each in answers]
+    x = Scale("log", (0.8 * times[0], 1.25 * times[-1]), {time: f"{time:.3g}" for time in times}, "sample time [ms]")
+    for name in INERTIAS:
+        rows = {1e3 * each.sample_time: each.constants[name] for each in answers if name in each.constants}
+        at, values = list(rows), np.array([row.estimate for row in rows.values()])
+        half = NINETY_FIVE * np.array([row.std for row in rows.values()])
+        kept = [row.estimate for time, row in rows.items() if math.isclose(time, 1e3 * chosen)]
+        marks = [Line(_EVERYWHERE, 2 * [each], FAINT, 1.2, BOUND_DASHES[2]) for each in kept]
+        marks += [Line(at, values, look.color, dash=look.dash, marker=look.marker, name="estimate, 95 %")]
+        marks += [spread(at, values - half, values + half, color=look.color)]
+        marks += [Line(2 * [1e3 * chosen], _EVERYWHERE, width=1.2, dash=BOUND_DASHES[1], name="chosen")]
+        title, y = (f"{name} [kg m²]", Scale()) if rows else (f"{name}: not identified", Scale(ticks={}))
+        panels.append(Panel(title, marks, x, y))
+    return Figure("sample-times", panels)

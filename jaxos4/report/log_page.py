@@ -3,12 +3,9 @@
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from jaxtyping import Float, Int
-from matplotlib.figure import Figure
 
 from .._files import check_writable, write_file
 from ..airframe import MOTIONS, Airframe
@@ -21,31 +18,19 @@ from ..recording.checks import Evidence
 from ..recording.inspection import Inspection, inspect_log
 from ..recording.prepared import prepare
 from ..recording.stretches import Stretch, cut
-from .html import draw, render
-from .style import BOUND_DASHES, FAINT, INK, drawing, grid, label, log_axis, style
-from .terminal import unit_of
-from .timeline import Axis, Line, Panel, View, signals, spans, thinned
+from . import timeline
+from .page import Part, Picture, Row, Section, Signals, Table, Text, number, page
+from .panels import Band, Figure, Line, Panel, Scale
+from .style import BOUND_DASHES, style
+from .terminal import part_rows, unit_of
+from .text import plain
 
-
-class PageRules(NamedTuple):
-    """Sizes and limits of the page of a log.
-
-    - `samples`: of each signal at most; a page then has less than 600 kB.
-    - `parts`: rows of the table of parts at most, the longest parts.
-    - `segment`: of which the spectra are means [s]. `slowest`: the lowest frequency of a spectrum [Hz].
-    - `bins`: of the motors' speeds. `usual`: the share of the time in which the rotors' speeds lie in the
-      band of the spectra.
-    """
-
-    samples: int = 5000
-    parts: int = 60
-    segment: float = 1.0
-    slowest: float = 1.0
-    bins: int = 60
-    usual: float = 0.9
-
-
-RULES = PageRules()
+_SAMPLES = 5000  # of each signal at most; a page then has less than 600 kB
+_LONGEST = 60  # parts in the table at most, the longest
+_SEGMENT = 1.0  # s; spectra are means of segments of this length
+_SLOWEST = 1.0  # Hz; the lowest frequency of a spectrum
+_BINS = 60  # of the motors' speeds
+_USUAL = 0.9  # of the time the rotors turn at speeds in the band of the spectra
 _SIGNALS = (
     ("rate [rad/s]", RATES, ("p", "q", "r")),
     ("force [m/s²]", np.arange(12, 15), ("ax", "ay", "az")),
@@ -62,7 +47,6 @@ def write_log_page(
     *,
     found: Inspection | None = None,
     command: str = "",
-    rules: PageRules = RULES,
 ) -> None:
     """Writes the page of a log, completely or not at all.
 
@@ -78,33 +62,103 @@ def write_log_page(
     full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     plausible = Evidence(recording, airframe).plausible.recording
     flown = [cut(plausible, Stretch(part.begin, part.end)) for part in found.parts if part.usable]
-    band = None if is_share(recording) or not flown else rotor_band(flown, rules)
-    with drawing():
-        figures = {"motors": motors(flown, full, rules), "spectra": spectra(flown, band, rules)} if flown else {}
-        drawings = {name: draw(figure, name) for name, figure in figures.items() if figure is not None}
-    longest = sorted(found.parts, key=lambda part: part.begin - part.end)[: rules.parts]
-    shown, block = logged(recording, found, rules)
-    text = render(
-        "log.html.j2",
+    band = None
+    if flown and not is_share(recording):
+        speeds, rare = np.concatenate([each.omega for each in flown]), (1 - _USUAL) / 2
+        low, high = np.quantile(speeds, [rare, 1 - rare]) / (2 * np.pi)
+        band = float(low), float(high)
+    shown, block = logged(recording, found)
+    label = recording.facts.format.label if recording.facts.format else "recording"
+    sampled = f"{found.samples} samples, one every {plain(1e3 * found.sample_time)} ms"
+    top: list[Part] = [Text(verdict(found), f"verdict{' warning' if found.refusals else ''}")]
+    top += [Text([f"Cannot identify a vehicle: {line}." for line in found.refusals])] if found.refusals else []
+    caption = (
+        "Horizontal: time [s]. Grey: not usable, for the reason in the table of parts. The options above the figure "
+        "name the part that is in sight, for jaxos4 estimate."
+    )
+    if block > 1:
+        blocks = f"{plain(1e3 * recording.dt * block)} ms"
+        caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
+    seen = Signals(shown, caption, range=True)
+    commands = recording.commanded and full == 1
+    sections = [
+        Section("signals", "Logged signals", [seen, Text(fitted(recording, airframe), id="fitted")], "Signals"),
+        Section("checks", "Failed checks", _checks(found), "Checks"),
+        Section("parts", "Parts that can be used", [_parts(found)], "Parts"),
+        Section("measured", "Sampling, gaps and ranges", [_measured(found, commands)], "Measured"),
+        Section("motors", "Motors and their limits", _motors(flown, full), "Motors"),
+        Section("spectra", "Vibration", _spectra(flown, band), "Spectra"),
+    ]
+    text = page(
         title=printable(Path(recording.name).name),
-        found=msgspec.structs.replace(found, parts=tuple(sorted(longest, key=lambda part: part.begin))),
-        shorter=len(found.parts) - len(longest),
-        format=recording.facts.format.label if recording.facts.format else "recording",
-        verdict=verdict(found),
-        signals=shown,
-        block=1e3 * recording.dt * block if block > 1 else None,
-        fitted=fitted(recording, airframe),
-        measured=[
-            (name, unit_of(name, recording.commanded and full == 1), one) for name, one in found.measured.items()
-        ],
-        drawings=drawings,
-        limited=np.isfinite(full),
-        shares=is_share(recording),
-        rotor_band=band,
+        about=f"{label}, {found.begin:.2f} to {found.end:.2f} s, {sampled}. Nothing was fitted.",
+        top=top,
+        sections=sections,
         command=command,
+        notes=found.notes,
         provenance=[("log", recording.name)],
     )
     write_file(path, text)
+
+
+def _checks(found: Inspection) -> list[Part]:
+    rows = [
+        Row.of(
+            *(", ".join(each.quantities), "contradicted" if each.contradicted else "concerned"),
+            *(each.cause, each.size, each.remedy),
+        )
+        for each in found.findings
+    ]
+    headings = ("quantity", "", "cause", "size", "what to do")
+    return [Table("checks-table", "Checks that found something", headings, [("", rows)], wide=True)] if rows else []
+
+
+def _parts(found: Inspection) -> Part:
+    rows = [Row.of(*cells) for cells in part_rows(found, _LONGEST)]
+    shorter = len(found.parts) - len(rows)
+    note = (
+        "Roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s]. An axis that is weak "
+        f"or none is not identified by this part.{f' {shorter} shorter parts are not listed.' if shorter else ''}"
+    )
+    headings = ("from [s]", "to [s]", "use", *MOTIONS)
+    return Table("parts-table", "Parts of the log in order of time", headings, [("", rows)], [note])
+
+
+def _measured(found: Inspection, commands: bool) -> Part:
+    rows = [
+        Row.of(
+            *(name, unit_of(name, commands), number(one.rate), number(1e3 * one.longest_gap, 3)),
+            *(number(one.least), number(one.most)),
+        )
+        for name, one in found.measured.items()
+    ]
+    headings = ("channel", "unit", "rate [Hz]", "longest gap [ms]", "least", "largest")
+    return Table("measured-table", "What was measured, and how often", headings, [("", rows)])
+
+
+def _motors(flown: Sequence[Recording], full: float) -> list[Part]:
+    if not flown:
+        return []
+    kind = "command, as a share of full scale" if full == 1 else "speed [rad/s]"
+    caption = (
+        f"The share of the usable time that each motor spends at each {kind}. Motors at a limit cannot answer the "
+        "controller, and their parts are not used."
+    )
+    return [Picture(motors(flown, full), caption)]
+
+
+def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> list[Part]:
+    if not flown or (figure := spectra(flown, band)) is None:
+        return []
+    turns = (
+        f" The rotors turn {band[0]:.0f} to {band[1]:.0f} Hz; their blades pass twice as often or more." if band else ""
+    )
+    caption = (
+        f"Amplitude spectral density in the usable parts.{turns} Motion of a vehicle lies below about 20 Hz. A peak "
+        "above is vibration; vibration above half the sampling rate folds down into the motion, and no setting removes "
+        "it."
+    )
+    return [Picture(figure, caption)]
 
 
 def verdict(found: Inspection) -> str:
@@ -125,7 +179,7 @@ def is_share(recording: Recording) -> bool:
     return recording.commanded and float(np.nanmax(recording.omega, initial=0.0)) <= 1.0
 
 
-def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) -> tuple[str, int]:
+def logged(recording: Recording, found: Inspection) -> tuple[str, int]:
     """All signals of a log for the time axis, grey where it is not usable, and the `thinned` samples of a block."""
     panels, width = [], 0
     motor = ("command" if is_share(recording) else "motor [rad/s]", recording.omega, tuple("1234"))
@@ -135,20 +189,20 @@ def logged(recording: Recording, found: Inspection, rules: PageRules = RULES) ->
         groups.append(("battery [V]", recording.voltage[:, None], ("battery",)))
     groups = [group for group in groups if np.isfinite(group[1]).any()]
     every = [
-        thinned(recording.time, bridged(recording.time, column)[:, None], rules.samples)
+        timeline.thinned(recording.time, bridged(recording.time, column)[:, None], _SAMPLES)
         for _, measured, _ in groups
         for column in measured.T
     ]
     time, _, block = every[0]
     values = np.hstack([fewer for _, fewer, _ in every])
     for title, _, names in groups:
-        lines = (Line(name, values[:, width + i], style(i)) for i, name in enumerate(names))
-        panels.append(Panel(title, [line for line in lines if np.isfinite(line.values).any()]))
+        lines = (timeline.Line(name, values[:, width + i], style(i)) for i, name in enumerate(names))
+        panels.append(timeline.Panel(title, [line for line in lines if np.isfinite(line.values).any()]))
         width += len(names)
-    axis = Axis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
+    axis = timeline.Axis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
     begin = recording.time[0]
     shaded = [(part.begin - begin, part.end - begin) for part in found.parts if not part.usable]
-    return signals(axis, [View("", time - begin, panels)], shaded=shaded), block
+    return timeline.signals(axis, [timeline.View("", time - begin, panels)], shaded=shaded), block
 
 
 def _sensed(recording: Recording, which: Int[np.ndarray, " columns"]) -> Float[np.ndarray, "samples columns"]:
@@ -186,71 +240,56 @@ def fitted(recording: Recording, airframe: Airframe | None) -> str:
     used = f"{ready.seconds[0]:.1f} s would be fitted, in samples of {1e3 * float(ready.fitted.dt):.3g} ms"
     if ready.tested is None:
         return f"{used}, and nothing held out."
-    held = spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
+    held = timeline.spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
     parts = ", ".join(f"{begin:.1f} to {end:.1f}" for begin, end in held[:8]) + ", ..." * (len(held) > 8)
     return f"{used}; {ready.seconds[1]:.1f} s would be held out and predicted: {parts} s."
 
 
-def rotor_band(flown: Sequence[Recording], rules: PageRules = RULES) -> tuple[float, float]:
-    """The usual frequencies of the rotors [Hz]: the ends of the band of most speeds."""
-    speeds, beyond = np.concatenate([each.omega for each in flown]), (1 - rules.usual) / 2
-    low, high = np.quantile(speeds, [beyond, 1 - beyond]) / (2 * np.pi)
-    return float(low), float(high)
-
-
-def motors(flown: Sequence[Recording], full: float, rules: PageRules = RULES) -> Figure:
+def motors(flown: Sequence[Recording], full: float) -> Figure:
     """The share of the time that each motor spends at each speed; dashed: full speed."""
-    figure, panels = grid(4, columns=4, height=1.9)
     omega = np.concatenate([each.omega for each in flown])
     largest = float(omega.max())
     top = full if np.isfinite(full) and full < 3 * largest else largest
-    edges = np.linspace(0.0, max(top, largest, 1e-9), rules.bins + 1)
-    shares = [np.histogram(column, edges)[0] / len(omega) for column in omega.T]
-    for i, (panel, share) in enumerate(zip(panels, shares, strict=True)):
-        panel.fill_between(
-            edges, np.append(100 * share, 0.0), step="post", color=style(i).color, alpha=0.3, linewidth=0
-        )
-        panel.step(edges, np.append(100 * share, 0.0), where="post", color=style(i).color, linewidth=1.1)
+    edges = np.linspace(0.0, max(top, largest, 1e-9), _BINS + 1)
+    shares = [100 * np.histogram(column, edges)[0] / len(omega) for column in omega.T]
+    x = Scale(ends=(0.0, 1.02 * float(edges[-1])), label="command" if full == 1.0 else "speed [rad/s]")
+    y, panels = Scale(ends=(0.0, 1.05 * max(float(each.max()) for each in shares))), []
+    for i, share in enumerate(shares):
+        at, steps, color = np.repeat(edges, 2)[1:-1], np.repeat(share, 2), style(i).color
+        marks = [Band(at, np.zeros(at.size), steps, color), Line(at, steps, color, 1.4)]
         if top == full:
-            panel.axvline(full, color=INK, linewidth=1.1, linestyle=BOUND_DASHES[2])
-        panel.set_title(f"motor {i + 1}: time [%]")
-        panel.set_ylim(0, 105 * max(each.max() for each in shares))
-    label(figure, x="command" if full == 1.0 else "speed [rad/s]")
-    return figure
+            marks.append(Line((full, full), (-np.inf, np.inf), dash=BOUND_DASHES[2], name="full speed"))
+        panels.append(Panel(f"motor {i + 1}: time [%]", marks, x, y, 270, 190))
+    return Figure("motors", panels, columns=4)
 
 
-def spectra(flown: Sequence[Recording], band: tuple[float, float] | None, rules: PageRules = RULES) -> Figure | None:
+def spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> Figure | None:
     """Amplitude spectral densities of gyro and accelerometer; band: how often the rotors turn."""
     kinds = {"gyro [rad/s/√Hz]": RATES, "accelerometer [m/s²/√Hz]": np.arange(12, 15)}
     sensed = (np.hstack([_sensed(each, which) for which in kinds.values()]) for each in flown)
-    frequency, whole = amplitude_density(sensed, flown[0].dt, rules)
-    found = {title: whole[:, 3 * i : 3 * i + 3] for i, title in enumerate(kinds)}
-    found = {title: density for title, density in found.items() if np.isfinite(density).any()}
-    if not found:
-        return None
-    figure, panels = grid(len(found), columns=2, width=4.5 * len(found), height=2.6)
-    for panel, (title, density) in zip(panels, found.items(), strict=True):
-        for column, look, dash in zip(density.T, map(style, range(3)), (0, 2, 1), strict=True):
-            panel.plot(frequency, column, color=look.color, linestyle=BOUND_DASHES[dash])
-        if band is not None:
-            panel.axvspan(*band, color=FAINT, alpha=0.25, linewidth=0)
-        panel.set_title(title)
-        panel.set_xlim(rules.slowest, frequency[-1])
-        for which in ("x", "y"):
-            log_axis(panel, which)
-    label(figure, x="frequency [Hz]")
-    return figure
+    frequency, whole = amplitude_density(sensed, flown[0].dt)
+    x, panels = Scale("log", (_SLOWEST, float(frequency[-1])), label="frequency [Hz]"), []
+    rotors = [] if band is None else [Band(band, 2 * [-np.inf], 2 * [np.inf], opacity=0.25, name="rotors turn")]
+    for i, title in enumerate(kinds):
+        density = whole[:, 3 * i : 3 * i + 3]
+        lines = [
+            Line(frequency, column, style(k).color, 1.4, BOUND_DASHES[dash], name=name)
+            for k, (column, dash, name) in enumerate(zip(density.T, (0, 2, 1), "xyz", strict=True))
+        ]
+        if np.isfinite(density).any():
+            panels.append(Panel(title, [*rotors, *lines], x, Scale("log"), 430, 260))
+    return Figure("spectra", panels, columns=2) if panels else None
 
 
 def amplitude_density(
-    parts: Iterable[Float[np.ndarray, "_ channels"]], dt: float, rules: PageRules = RULES
+    parts: Iterable[Float[np.ndarray, "_ channels"]], dt: float
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies channels"]]:
     """Frequencies [Hz] and the amplitude spectral density of signals, by Welch's means of overlapping segments.
 
     A channel has the mean over the segments in which it was measured, or NaN. Reference: Welch 1967, IEEE
     Trans. Audio Electroacoustics 15.
     """
-    size = max(round(rules.segment / dt), 8)
+    size = max(round(_SEGMENT / dt), 8)
     window, frequency = np.hanning(size)[:, None], np.fft.rfftfreq(size, dt)
     total = measured = np.zeros((frequency.size, 1))
     for part in parts:
@@ -261,5 +300,5 @@ def amplitude_density(
             measured += np.isfinite(power)
             total += np.nan_to_num(power)
     mean = np.where(measured, total / np.maximum(measured, 1), np.nan)
-    density, kept = 2 * dt * mean / np.square(window).sum(), frequency >= rules.slowest
+    density, kept = 2 * dt * mean / np.square(window).sum(), frequency >= _SLOWEST
     return frequency[kept], np.sqrt(density[kept])

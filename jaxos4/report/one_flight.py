@@ -2,19 +2,20 @@
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
 
 from ..study import metrics
-from .study_tables import Entry, Table, names, positive_scales, scale_labels, shown_level
-from .style import INK, estimator_gid, grid, label, legend, styles
+from .page import Entry, Row, Table
+from .panels import Figure, Line, Panel, Scale, across
+from .study_tables import names, positive_scales, scale_labels, shown_level
+from .style import styles
 from .text import DASH, plain
 
-_HEADINGS = ("unit", "truth", "estimate", "interval", "bound", "error / bound")
+_HEADINGS = ("parameter", "unit", "truth", "estimate", "interval", "bound", "error / bound")
 
 
-def is_of_one(dataset: xr.Dataset) -> bool:
+def is_of_one(data: xr.Dataset) -> bool:
     """Whether each scenario has one flight."""
-    return dataset.sizes["flight"] == 1
+    return data.sizes["flight"] == 1
 
 
 def estimates(data: xr.Dataset) -> Table:
@@ -30,9 +31,11 @@ def estimates(data: xr.Dataset) -> Table:
                 truth, value, low, high, bound = (plain(float(each.isel(parameter=k)), 4) for each in shown)
                 ends = DASH if np.isnan(half.values[k]) else f"{low} to {high}"
                 cells = (units[k], truth, value, ends, bound, plain(float(error.isel(at | {"parameter": k})), 2))
-                rows.append((name, tuple(map(Entry, cells)), j))
+                rows.append(Row(name, tuple(map(Entry, cells)), j))
             groups.append((f"{scale}, {estimator}", rows))
-    return Table([(heading, "") for heading in _HEADINGS], groups)
+    caption = f"Each estimate, its interval of {100 * shown_level(data):g} %, and the truth"
+    source = "From estimate, truth, half_width, bound, result."
+    return Table("estimates", caption, _HEADINGS, groups, [source])
 
 
 def outcomes(data: xr.Dataset) -> list[str]:
@@ -59,21 +62,16 @@ def intervals(data: xr.Dataset) -> Figure | None:
     half = data["half_width"].sel(level=shown_level(data)) / least.where(least > 0)
     if not np.isfinite(error.values).any():
         return None
-    estimators, parameters, count = names(data, "estimator"), names(data, "parameter"), data.sizes["scale"]
-    height = 0.6 + len(parameters) * (0.14 + 0.06 * len(estimators))
-    figure, panels = grid(count, columns=min(count, 3), width=3.3 * min(count, 3), height=height)
-    for i, panel in enumerate(panels):
-        for j, look in enumerate(styles(estimators).values()):
-            y = np.arange(len(parameters)) + 0.6 * (j - (len(estimators) - 1) / 2) / len(estimators)
+    estimators, parameters, panels = names(data, "estimator"), names(data, "parameter"), []
+    places = np.arange(len(parameters))
+    scale = Scale(ends=(len(parameters) - 0.4, -0.6), ticks=dict(enumerate(parameters)), lines=False)
+    height = 90 + len(parameters) * (14 + 6 * len(estimators))
+    for i, title in enumerate(scale_labels(data)):
+        marks = [Line((0, 0), (-np.inf, np.inf), width=1.5)]
+        for j, (name, look) in enumerate(styles(estimators).items()):
+            y = places + 0.6 * (j - (len(estimators) - 1) / 2) / len(estimators)
             x, reach = (each.isel(scale=i, estimator=j).values for each in (error, half))
-            panel.hlines(y, x - reach, x + reach, color=look.color, linewidth=1.4, gid=estimator_gid(j))
-            marks = {"color": look.color, "marker": look.marker, "linestyle": "none", "markersize": 4}
-            panel.plot(x, y, gid=estimator_gid(j), **marks)
-        panel.axvline(0, color=INK, linewidth=1.1, zorder=1.4)
-        panel.set_yticks(range(len(parameters)), parameters)
-        panel.set_ylim(len(parameters) - 0.4, -0.6)
-        panel.grid(axis="y", visible=False)
-        panel.set_title(scale_labels(data)[i])
-    label(figure, x="(estimate - truth) / bound")
-    legend(figure, estimators)
-    return figure
+            marks += [across(y, x - reach, x + reach, color=look.color, group=j)]
+            marks += [Line(x, y, look.color, 0, marker=look.marker, size=6, group=j, name=name)]
+        panels.append(Panel(title, marks, Scale(label="(estimate - truth) / bound"), scale, height=height))
+    return Figure("intervals", panels)

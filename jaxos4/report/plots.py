@@ -11,8 +11,10 @@ from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
 from ..identification.results import Identification
-from .identification_figures import GAINS, draw_response, gain_band
-from .style import BOUND_DASHES, FAINT, INK, log_axis, styles
+from .identification_figures import gain
+from .matplotlib_figures import draw
+from .panels import Scale
+from .style import BOUND_DASHES, FAINT, INK, Style, styles
 
 _RATES = ("p", "q", "r")
 
@@ -41,7 +43,7 @@ class Plots(NamedTuple):
         ax = _axes(ax)
         ax.plot(time, measured, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1], label="measured")
         label = f"predicted {ahead.horizons[nearest]:.3g} s ahead"
-        ax.plot(time, predicted, color=self._color, linewidth=1.2, label=label)
+        ax.plot(time, predicted, color=self._look.color, linewidth=1.2, label=label)
         ax.set(xlabel="time [s]", ylabel=f"{rate} [rad/s]")
         ax.legend()
         return ax
@@ -53,8 +55,8 @@ class Plots(NamedTuple):
             raise InputError("the result has no moments of inertia.")
         ax, given = _axes(ax), dict(zip(INERTIAS, np.asarray(self.found.airframe.inertia), strict=True))
         for place, row in enumerate(rows):
-            ax.plot([place, place], row.ci95, color=self._color if row.trusted else FAINT)
-            ax.plot(place, row.value, "o", color=self._color if row.trusted else FAINT)
+            ax.plot([place, place], row.ci95, color=self._look.color if row.trusted else FAINT)
+            ax.plot(place, row.value, "o", color=self._look.color if row.trusted else FAINT)
             ax.plot(place, given[row.name], "x", color=INK)
         ax.set_xticks(range(len(rows)), [row.name for row in rows])
         ax.set(ylabel="kg m²", xlim=(-0.5, len(rows) - 0.5))
@@ -67,16 +69,15 @@ class Plots(NamedTuple):
         """
         if (response := self.found.response) is None:
             raise InputError("the result has no frequency response: it is of an OS4, has no answer, or is older.")
-        one, ax = response[_place("axis", axis, response._fields)], _axes(ax)
-        draw_response(ax, one, one.gain, gain_band(one), 1.0, self._color)
-        ax.set(xlabel="frequency [Hz]", ylabel=f"gain, {axis}", xlim=(1.0, HIGHEST), ylim=GAINS)
-        for which in ("x", "y"):
-            log_axis(ax, which)
+        panel = gain(axis, response[_place("axis", axis, response._fields)], self._look)
+        x = Scale("log", (1.0, HIGHEST), {at: f"{at}" for at in (1, 2, 5, 10, 20, 40)}, "frequency [Hz]")
+        ax = _axes(ax)
+        draw(panel._replace(x=x), ax)
         return ax
 
     @property
-    def _color(self) -> str:
-        return styles([self.found.estimator])[self.found.estimator].color
+    def _look(self) -> Style:
+        return styles([self.found.estimator])[self.found.estimator]
 
 
 def _place(argument: str, value: str, names: tuple[str, ...]) -> int:

@@ -8,6 +8,9 @@ from rich.console import Console
 from .._files import write_file
 from ..forecast import QUANTITIES, FlightPrediction
 from ..logs.sampling import euler_angles
+from .panels import Band, Figure, Line, Panel, Scale
+from .style import BOUND_DASHES, style
+from .svg import as_file
 from .text import Listing, percent, plain, say
 
 
@@ -42,50 +45,36 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
 
     `most`: the longest time that it shows [s], but two horizons at least.
     """
-    from .style import BOUND_DASHES, INK, drawing, grid, style, svg  # a second that the table does not need
-
     columns = [("roll [rad]", 6), ("pitch [rad]", 7), ("yaw [rad]", 8)]
     columns += [(f"{axis} [rad/s]", 9 + i) for i, axis in enumerate("pqr")]
     if "velocity" not in found.missing:
         columns += [(f"{axis} [m/s]", 3 + i) for i, axis in enumerate(("vx", "vy", "vz"))]
-    with drawing():
-        figure, panels = grid(len(columns), columns=3, width=11.0, height=1.9)
-        look, shown, times = style(0), [], found.time.tolist()
-        for start, time in enumerate(times):
-            is_free = not shown or time >= times[shown[-1]] + found.horizons[-1]
-            if is_free and time + found.horizons[-1] <= times[0] + max(most, 2 * found.horizons[-1]):
-                shown.append(start)
-        # Lines break between predictions.
-        x = np.pad(found.time[shown, None] + found.horizons, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
-        both = (found.measured[shown], found.predicted[shown])  # with angles in the place of the quaternion
-        measured, predicted = (
-            np.concatenate([x[..., :6], euler_angles(x[..., 6:10]), x[..., 10:]], axis=-1) for x in both
+    shown, times = [], found.time.tolist()
+    for start, time in enumerate(times):
+        is_free = not shown or time >= times[shown[-1]] + found.horizons[-1]
+        if is_free and time + found.horizons[-1] <= times[0] + max(most, 2 * found.horizons[-1]):
+            shown.append(start)
+    # Lines break between predictions.
+    x = np.pad(found.time[shown, None] + found.horizons, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+    both = (found.measured[shown], found.predicted[shown])  # with angles in the place of the quaternion
+    measured, predicted = (np.concatenate([x[..., :6], euler_angles(x[..., 6:10]), x[..., 10:]], axis=-1) for x in both)
+    # The same turn of an angle.
+    predicted[..., 6:9] = np.unwrap(predicted[..., 6:9], axis=-2)
+    measured[..., 6:9] -= 2 * np.pi * np.nan_to_num(np.round((measured - predicted)[..., 6:9] / (2 * np.pi)))
+    look, panels = style(0), []
+    for title, column in columns:
+        y, half, seen = (
+            np.pad(values[..., column], ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+            for values in (predicted, found.half_width[shown], measured)
         )
-        # The same turn of an angle.
-        predicted[..., 6:9] = np.unwrap(predicted[..., 6:9], axis=-2)
-        measured[..., 6:9] -= 2 * np.pi * np.nan_to_num(np.round((measured - predicted)[..., 6:9] / (2 * np.pi)))
-        handles = []
-        for panel, (title, column) in zip(panels, columns, strict=True):
-            y, half, seen = (
-                np.pad(values[..., column], ((0, 0), (0, 1)), constant_values=np.nan).ravel()
-                for values in (predicted, found.half_width[shown], measured)
-            )
-            band = panel.fill_between(x, y - half, y + half, color=look.color, alpha=0.22, linewidth=0)
-            (line,) = panel.plot(x, y, color=look.color)
-            (dots,) = panel.plot(x, seen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
-            handles = [dots, line, band]
-            panel.set_title(title)
-            panel.margins(x=0.01)
-            # The band of the first predictions is wide, because their offsets are unknown.
-            lines = np.concatenate([y, seen])
-            low, high = np.nanmin(lines), np.nanmax(lines)
-            panel.set_ylim(low - 0.4 * (high - low) - 1e-3, high + 0.4 * (high - low) + 1e-3)
-        for panel in panels[-3:]:
-            panel.set_xlabel("time [s]")
-        labels = ("measured", f"predicted up to {found.horizons[-1]:.3g} s ahead", "95 % band")
-        figure.set_layout_engine(None)  # to fit all labels exactly would take half of the time
-        below, width, height = 0.5, *figure.get_size_inches()
-        figure.subplots_adjust(0.5 / width, (below + 0.4) / height, 1 - 0.1 / width, 1 - 0.3 / height, hspace=0.35)
-        figure.legend(handles, labels, loc="lower left", ncols=3)
-        drawn = svg(figure)
-    write_file(path, drawn)
+        marks = [
+            Band(x, y - half, y + half, look.color, 0.22, name="95 % band"),
+            Line(x, y, look.color, name=f"predicted up to {found.horizons[-1]:.3g} s ahead"),
+            Line(x, seen, width=1.2, dash=BOUND_DASHES[1], name="measured"),
+        ]
+        # The band of the first predictions is wide, because their offsets are unknown.
+        lines = np.concatenate([y, seen])
+        low, high = float(np.nanmin(lines)), float(np.nanmax(lines))
+        room = 0.4 * (high - low) + 1e-3
+        panels.append(Panel(title, marks, Scale(label="time [s]"), Scale(ends=(low - room, high + room))))
+    write_file(path, as_file(Figure("prediction", panels)))

@@ -1,20 +1,20 @@
 """The report of a study: the figures of its scenarios, and one HTML page that needs no other file."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
 
 from .._files import check_writable, write_file
+from ..logs.table import counted
 from ..study import metrics
 from . import one_flight, study_tables
-from .html import Drawing, draw as draw_panels, render, swatch
-from .study_tables import best_estimators, bounds, error_unit, names, positive_scales, scenarios
-from .style import BOUND_DASHES, INK, Style, drawing, estimator_gid, grid, label, legend, log_axis, scale_axis, styles
+from .page import Folded, Part, Picture, Section, Text, page
+from .panels import Figure, Line, Panel, Scale, across, spread
+from .study_tables import ScenarioData, best_estimators, bounds, error_unit, names, positive_scales, scenarios
+from .style import BOUND_DASHES, Style, styles
+from .svg import as_file
 from .text import plain
 
 MOST_DRAWN = 12
@@ -22,217 +22,273 @@ MOST_DRAWN = 12
 
 # Attributes of the Dataset, and their labels on the page.
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
-_COLUMNS, _SPECIFICATION = 4, "specification.toml"
+_SPECIFICATION = "specification.toml"
 _AGAIN = f"jaxos4 study {_SPECIFICATION} --out .  # in the folder of this page"
-_WIDEST, _NARROWEST = 3.0, 1.0  # line widths [pt] of the first and the last estimator, so that none hides another
+_WIDEST, _NARROWEST = 4.0, 1.4  # line widths [px] of the first and the last estimator, so that none hides another
+_EVERYWHERE = (-np.inf, np.inf)
+_BEST = "1 is the best that an unbiased estimator can do."
+# Of each figure: its title and its caption.
+_WORDS = {
+    "intervals": (
+        "Estimates and their intervals",
+        "Estimate - truth of each parameter, in multiples of the smallest Cramer-Rao bound of any estimator, with "
+        "intervals. The line at 0 is the truth. From estimate, truth, half_width, bound.",
+    ),
+    "overview": (
+        "Which method, at which noise?",
+        "RMSE / least bound of any estimator (geometric mean over the parameters), with the 95 % Monte-Carlo interval "
+        f"of one parameter; left against noise, right against simulated flights. {_BEST} An estimator that looks at "
+        "the body rates alone cannot reach 1 if others see more channels. From metrics.accuracy, mean_rollouts.",
+    ),
+    "error": (
+        "Error against noise",
+        "Root-mean-square error over the converged flights, and the Cramer-Rao bounds of the channels used. From "
+        "metrics.estimator_error, bound_error.",
+    ),
+    "efficiency": (
+        "Efficiency against noise",
+        f"RMSE / bound, each estimator relative to its own bound, with 95 % Monte-Carlo intervals. {_BEST} From "
+        "metrics.efficiency.",
+    ),
+    "coverage": (
+        "Coverage by level",
+        "Share of intervals that contain the truth, averaged over the parameters, with 95 % Monte-Carlo intervals. "
+        "Long lines: the level that the intervals claim. From metrics.mean_coverage.",
+    ),
+}
 
 
-def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
-    """Draws all figures, then writes `report.html` and `figures/*.svg`; returns their paths, the page first.
+def write_report(dataset: xr.Dataset, directory: Path, *, pdf: bool = False) -> list[Path]:
+    """Writes `report.html` and `figures/*.svg`, and as PDF too if wanted; returns their paths, the page first.
 
     The specification is written too, as `specification.toml`: the page's command names it.
     """
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
-    every, drawings, sections = list(scenarios(dataset)), [], []
-    of_one = one_flight.is_of_one(dataset)
-    figures = {"intervals": one_flight.intervals} if of_one else SCENARIO_FIGURES
-    for number, title, data in every:
-        shown = figures if number <= MOST_DRAWN else {}
-        drawings.append(draw(shown, data, f"-{number}" if len(every) > 1 else ""))
-        found = {"number": number, "label": title, "figures": drawings[-1], "best": best_estimators(data)}
-        found["channels"] = study_tables.channels_by_estimator(data)
-        found |= {"tables": study_tables.scenario_tables(data), "trouble": study_tables.troubled_flights(data)}
-        if of_one:
-            found |= {"outcomes": one_flight.outcomes(data), "best": {}}
-            found["tables"]["estimates"] = one_flight.estimates(data)
-        sections.append(found)
-    estimators, attributes = names(dataset, "estimator"), {name: str(x) for name, x in dataset.attrs.items()}
+    sections, drawn, several = [], [], len(list(scenarios(dataset))) > 1
+    for scenario in scenarios(dataset):
+        figures = draw(scenario, several=several) if scenario.number <= MOST_DRAWN else {}
+        sections += _scenario(scenario, figures, bool((dataset["scale"] == 0).any()))
+        drawn += figures.values()
+    attributes = {name: str(x) for name, x in dataset.attrs.items()}
     specification = attributes.get("specification", "")
-    missing, cells = study_tables.cells_not_run(dataset)
-    page = render(
-        "study.html.j2",
+    text = page(
         title=attributes.get("title", "") or "A study",
-        command=_AGAIN if specification else "",
-        specification=specification,
-        provenance=[(shown, attributes[name]) for name, shown in _PROVENANCE.items() if name in attributes],
-        estimators=estimators,
-        bounds=list(bounds(dataset))[: len(BOUND_DASHES)],
-        swatches=[swatch(look) for look in styles(estimators).values()],
+        about=_about(dataset),
+        top=_trouble(dataset),
         sections=sections,
-        of_one=of_one,
-        level=f"{100 * study_tables.shown_level(dataset):g} %",
-        failed=study_tables.failed_cells(dataset),
-        missing=missing,
-        cells=cells,
-        drawn=min(len(drawings), MOST_DRAWN),
-        zero_scale=bool((dataset["scale"] == 0).any()),
+        command=_AGAIN if specification else "",
+        provenance=[(shown, attributes[name]) for name, shown in _PROVENANCE.items() if name in attributes],
+        after=_after(specification),
+        estimators=styles(names(dataset, "estimator")),
     )
-    files = {folder / f"{each.stem}.svg": each.svg for figures in drawings for each in figures.values()}
     folder.mkdir(exist_ok=True)
     if specification:
         write_file(directory / _SPECIFICATION, specification)
+    files = {folder / f"{figure.stem}.svg": as_file(figure) for figure in drawn}
+    if pdf:
+        from .matplotlib_figures import as_pdf  # a second
+
+        files |= {folder / f"{figure.stem}.pdf": as_pdf(figure) for figure in drawn}
     for path, content in files.items():
         write_file(path, content)
-    write_file(target, page)
+    write_file(target, text)
     return [target, *files]
 
 
-def draw(figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, suffix: str = "") -> dict[str, Drawing]:
-    """The figures whose data are present. `suffix`: the end of the names of the files."""
-    made = {}
-    for name, draw_figure in figures.items():
-        with drawing():
-            if (figure := draw_figure(data)) is not None:
-                made[name] = draw_panels(figure, f"{name}{suffix}")
-    return made
+def _about(dataset: xr.Dataset) -> str:
+    counts = names(dataset, "estimator"), list(scenarios(dataset)), range(study_tables.cells_not_run(dataset)[1])
+    sizes = (counted(len(each), kind) for each, kind in zip(counts, ("estimator", "scenario", "cell"), strict=True))
+    of_one = (
+        " Each scenario has one flight: there are answers, but no statistics. The file of a study holds no signals; "
+        "jaxos4 estimate FLIGHT --report shows those of a flight."
+    )
+    about = f"Identification of a quadrotor's parameters from simulated, noisy flights: {', '.join(sizes)}."
+    return about + of_one * one_flight.is_of_one(dataset)
+
+
+def _trouble(dataset: xr.Dataset) -> list[Part]:
+    """Cells that were not run, and those that failed; scenarios without figures."""
+    (missing, cells), (failed, listed) = study_tables.cells_not_run(dataset), study_tables.failed_cells(dataset)
+    parts: list[Part] = []
+    if missing:
+        runs = "; the command at the end of the page runs them" * ("specification" in dataset.attrs)
+        parts.append(Text(f"Incomplete: {missing} of {cells} cells have not been run yet{runs}.", "warning"))
+    if failed:
+        parts += [Text(f"{failed} of {cells} cells failed:", "warning"), Text(listed)]
+    if (count := len(list(scenarios(dataset)))) > MOST_DRAWN:
+        parts.append(Text(f"The first {MOST_DRAWN} scenarios have figures; all {count} have tables.", "note"))
+    return parts
+
+
+def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: bool) -> list[Section]:
+    """The sections of one scenario."""
+    number, label, data = scenario
+    of_one = one_flight.is_of_one(data)
+    tables = {"estimates": one_flight.estimates(data)} if of_one else {}
+    tables |= study_tables.scenario_tables(data)
+    differ = "; ".join(f"{', '.join(who)} see {seen}" for seen, who in study_tables.channels_by_estimator(data).items())
+    differ = f" Not of the same channels: {differ}" if "; " in differ else ""
+
+    def picture(name: str) -> list[Part]:
+        if name not in figures:
+            return []
+        (title, caption), figure = _WORDS[name], figures[name]
+        title += differ * (name == "overview")
+        return [Picture(figure, f"{caption} Drawn in figures/{figure.stem}.svg.", title)]
+
+    def table(name: str) -> Part:
+        one = tables[name]
+        return one._replace(id=f"{name}-{number}", wide=len(one.headings) > 7)
+
+    def section(title: str, parts: list[Part]) -> Section:
+        return Section(f"{title.split()[0].lower()}-of-{number}", title, parts, level=3)
+
+    first: list[Part] = []
+    if of_one:
+        outcomes = one_flight.outcomes(data)
+        first.append(Text(outcomes) if len(outcomes) > 1 else Text(outcomes[0], "verdict"))
+        first += [*picture("intervals"), table("estimates")]
+    elif best := best_estimators(data):
+        said = "; ".join(f"{who} at {scales}" for scales, who in best.items())
+        first.append(Text(f"Most accurate, within Monte-Carlo error: {said}.", "verdict"))
+    sections = [Section(f"scenario-{number}", label, [*first, *picture("overview")])]
+    if not of_one:
+        ratio, shares = [table("efficiency")], [table("coverage"), table("levels")]
+        sections += [
+            section("Errors", [*picture("error"), table("error")]),
+            section("Efficiency", [*picture("efficiency"), Folded("Every number of the efficiency", ratio)]),
+            section("Coverage", [*picture("coverage"), Folded("Every number of the coverage", shares)]),
+        ]
+    last = [table("results"), *_troubled(data)]
+    if has_zero and figures:
+        last.append(Text("A logarithmic axis cannot show the noise scale 0: it is in the tables only.", "note"))
+    return [*sections, section("Results and rollouts", last)]
+
+
+def _troubled(data: xr.Dataset) -> list[Part]:
+    total, listed = study_tables.troubled_flights(data)
+    first = f"; the first {len(listed)}" if len(listed) < total else ""
+    note = "These flights are counted in the table above, but not in errors, efficiency and coverage."
+    summary = f"{counted(total, 'flight')} without a successful result{first}"
+    return [Folded(summary, [Text(listed), Text(note, "note")], is_open=True)] if total else []
+
+
+def _after(specification: str) -> list[Part]:
+    note = (
+        "All numbers on this page are computed from results.nc in this folder, by the functions of "
+        "jaxos4.study.metrics that the captions name. Errors include flights with the result successful or "
+        "unidentifiable. An unidentifiable estimate is a real estimate, but no better than its bracket."
+    )
+    written = [Folded("Specification", [Text(specification, "verbatim")], is_open=True)] if specification else []
+    return [*written, Text(note, "note")]
+
+
+def draw(scenario: ScenarioData, *, several: bool = False) -> dict[str, Figure]:
+    """The figures whose data are present. `several`: their names end with the scenario's number."""
+    kinds = {"intervals": one_flight.intervals} if one_flight.is_of_one(scenario.data) else SCENARIO_FIGURES
+    found = {name: make(scenario.data) for name, make in kinds.items()}
+    suffix = f"-{scenario.number}" if several else ""
+    return {name: figure._replace(stem=f"{name}{suffix}") for name, figure in found.items() if figure is not None}
 
 
 def errors(data: xr.Dataset) -> Figure | None:
     """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
     data = positive_scales(data)
-    found, best, seen = metrics.estimator_error(data), metrics.bound_error(data), bounds(data)
-    units = [error_unit(data, place) for place in range(data.sizes["parameter"])]
-    values = [found[kind].isel(parameter=place) for place, (kind, _, _) in enumerate(units)]
-    figure, x = _against_noise(data, values, "RMS error", bounds=list(seen)), data["scale"].values
-    if figure is None:
-        return None
-    for place, (panel, (kind, unit, why)) in enumerate(zip(figure.axes, units, strict=True)):
-        for dash, estimator in zip(BOUND_DASHES, seen.values(), strict=False):
-            y = best[kind].isel(parameter=place, estimator=estimator).values
-            marker = "_" if len(x) == 1 else None
-            panel.plot(x, y, color=INK, linestyle=dash, linewidth=1.1, marker=marker, zorder=1.9)
-        log_axis(panel, "y")
-        panel.set_title(f"{names(data, 'parameter')[place]} [{unit}]")
-        if why:
-            low, high = panel.get_ylim()
-            panel.set_ylim(low, high * (high / low) ** 0.22)
-            panel.text(0.03, 0.98, f"absolute: {why}", transform=panel.transAxes, va="top", fontsize=7)
-    return figure
+    found, best, x, panels = metrics.estimator_error(data), metrics.bound_error(data), data["scale"].values, []
+    seen_by, dots = bounds(data), {"marker": "" if len(x) > 1 else "s", "size": 4}
+    for place, name in enumerate(names(data, "parameter")):
+        kind, unit, why = error_unit(data, place)
+        values, least = (_by(each[kind].isel(parameter=place), "estimator", "scale") for each in (found, best))
+        marks = [_line(data, i, look, x, values[i]) for i, look in _looks(data)]
+        marks += [
+            Line(x, least[estimator], width=1.5, dash=dash, name=f"bound, {seen}", **dots)
+            for dash, (seen, estimator) in zip(BOUND_DASHES, seen_by.items(), strict=False)
+        ]
+        title, subtitle = f"{name} [{unit}]", f"absolute: {why}" if why else ""
+        panels.append(Panel(title, marks, _scales(x), Scale("log"), 270, 220, subtitle))
+    return _if_known("error", panels, found["absolute"])
 
 
 def efficiency(data: xr.Dataset) -> Figure | None:
     """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
     data = positive_scales(data)
-    found = metrics.efficiency(data)
-    values = [found["efficiency"].isel(parameter=place) for place in range(data.sizes["parameter"])]
-    figure = _against_noise(data, values, "RMSE / bound", interval=found)
-    if figure is None:
-        return None
-    for panel in figure.axes:
-        panel.axhline(1, color=INK, linewidth=1.1, zorder=1.9)
-    lows, highs = zip(*(panel.get_ylim() for panel in figure.axes), strict=True)
-    for panel in figure.axes:
-        panel.set_ylim(min(lows), max(highs))
-        log_axis(panel, "y")
-    return figure
+    found, scales, panels = metrics.efficiency(data), data["scale"].values, []
+    values, low, high = (_by(found[each], "parameter", "estimator", "scale") for each in ("efficiency", "low", "high"))
+    for place, name in enumerate(names(data, "parameter")):
+        marks = [Line(_EVERYWHERE, (1, 1), width=1.5)]
+        for i, look in _looks(data):
+            x, at = dodged(scales, i, data.sizes["estimator"]), (place, i)
+            marks += [_line(data, i, look, x, values[at])]
+            marks += [spread(x, low[at], high[at], color=look.color, width=1.3, group=i)]
+        panels.append(Panel(name, marks, _scales(scales), Scale("log"), 270, 220))
+    ends = [end for panel in panels for end in panel.fitted().y.ends or ()]
+    panels = [panel._replace(y=Scale("log", (min(ends), max(ends)))) for panel in panels]
+    return _if_known("efficiency", panels, found["efficiency"])
 
 
-def _against_noise(
-    data: xr.Dataset,
-    values: list[xr.DataArray],
-    quantity: str,
-    *,
-    interval: xr.Dataset | None = None,
-    bounds: Sequence[str] = (),
-) -> Figure | None:
-    """A panel for each parameter: its `values` for each estimator against the noise scale, with intervals if any."""
-    if not any(one.notnull().any() for one in values):
-        return None
-    figure, axes = grid(len(values), columns=_COLUMNS, height=2.2)
-    scales = data["scale"].values
-    for parameter, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
-        for place, look in _looks(data):
-            x = scales if interval is None else dodged(scales, place, data.sizes["estimator"])
-            wide = _width(data, place)
-            y, gid = values[parameter].isel(estimator=place).values, estimator_gid(place)
-            panel.plot(x, y, gid=gid, linewidth=wide, markersize=2.5 + 1.8 * wide, **look.line)
-            if interval is not None:
-                one = interval.isel(parameter=parameter, estimator=place)
-                ends = one["low"].values, one["high"].values
-                panel.vlines(x, *ends, color=look.color, linewidth=1.0, gid=estimator_gid(place))
-        if not np.isfinite(values[parameter].values).any():
-            panel.text(0.5, 0.5, "no estimates", transform=panel.transAxes, ha="center")
-        scale_axis(panel, scales)
-        panel.set_yscale("log")
-        panel.set_title(name)
-    label(figure, x="noise scale", y=quantity)
-    legend(figure, names(data, "estimator"), bounds=bounds)
-    return figure
+def _by(values: xr.DataArray, *axes: str) -> np.ndarray:
+    return values.transpose(*axes).values
+
+
+def _if_known(stem: str, panels: list[Panel], values: xr.DataArray) -> Figure | None:
+    return Figure(stem, panels, columns=4) if values.notnull().any() else None
 
 
 def coverage(data: xr.Dataset) -> Figure | None:
     """Share of intervals that contain the truth against the level that they claim, at each noise scale."""
-    found = metrics.mean_coverage(data)
-    if not found["coverage"].notnull().any():
-        return None
-    estimators, levels, count = names(data, "estimator"), data["level"].values, data.sizes["scale"]
-    figure, axes = grid(count, columns=_COLUMNS, width=2.25 * min(count, _COLUMNS) + 1.2, height=2.8)
-    lowest = min(float(found["low"].min()), float(levels.min())) - 0.04
-    for place, panel in enumerate(axes):
-        one = found.isel(scale=place)
-        for x, level in enumerate(levels):
-            panel.hlines(level, x - 0.45, x + 0.45, color=INK, linewidth=1.4)
-        for row, look in _looks(data):
-            shift = 0.7 * (row / max(len(estimators) - 1, 1) - 0.5)
-            at, part, gid = np.arange(len(levels)) + shift, one.isel(estimator=row), estimator_gid(row)
-            panel.vlines(at, part["low"].values, part["high"].values, color=look.color, linewidth=1.0, gid=gid)
-            shares = part["coverage"].values
-            panel.plot(at, shares, color=look.color, marker=look.marker, linestyle="none", markersize=4, gid=gid)
-        panel.set_title(f"noise scale {data['scale'].values[place]:g}")
-        panel.set_xticks(range(len(levels)), [f"{100 * level:g} %" for level in levels])
-        panel.set_ylim(lowest, 1.02)
-        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
-        panel.grid(axis="x", visible=False)
-    label(figure, x="level claimed", y="intervals that contain the truth")
-    legend(figure, estimators)
-    return figure
+    found, panels = metrics.mean_coverage(data), []
+    estimators, levels = names(data, "estimator"), data["level"].values
+    share, low, high = (_by(found[each], "scale", "estimator", "level") for each in ("coverage", "low", "high"))
+    lowest, places = min(float(np.nanmin(low)), float(levels.min())) - 0.04, np.arange(len(levels))
+    y = Scale(ends=(lowest, 1.02), ticks={x / 10: f"{10 * x} %" for x in range(11)})
+    ticks: dict[float, str] = {k: f"{100 * x:g} %" for k, x in enumerate(levels.tolist())}
+    x = Scale("linear", (-0.6, len(levels) - 0.4), ticks, "level claimed", lines=False)
+    for place, scale in enumerate(data["scale"].values):
+        marks = [across(levels, places - 0.45, places + 0.45, width=1.8)]
+        for i, look in _looks(data):
+            x_of, at = places + 0.7 * (i / max(len(estimators) - 1, 1) - 0.5), (place, i)
+            marks += [spread(x_of, low[at], high[at], color=look.color, width=1.3, group=i)]
+            marks += [Line(x_of, share[at], look.color, 0, marker=look.marker, size=6, group=i, name=estimators[i])]
+        panels.append(Panel(f"noise scale {scale:g}", marks, x, y, 270, 240))
+    return _if_known("coverage", panels, found["coverage"])
 
 
 def overview(data: xr.Dataset) -> Figure | None:
     """RMSE / least bound, the mean of all parameters: left against the noise scale, right against the rollouts."""
     data = positive_scales(data)
-    found = metrics.accuracy_interval(data)
+    found, scales = metrics.accuracy_interval(data), data["scale"].values
     rollouts = metrics.mean_rollouts(data).transpose("scale", "estimator").values
     values, low, high = (found[name].values for name in ("accuracy", "low", "high"))
     known = np.isfinite(values) & np.isfinite(rollouts)
     if not known.any():
         return None
-    figure, (by_noise, by_rollouts) = grid(2, columns=2, height=3.6)
     none = 0.5  # the place on the logarithmic axis for an estimator without rollouts
-    spent = np.maximum(rollouts, none)
-    for row, look in _looks(data):
-        at, line = known[:, row], {"color": look.color, "linestyle": look.dash, "gid": estimator_gid(row)}
-        line["linewidth"] = _width(data, row)
-        x, y, across = dodged(data["scale"].values, row, data.sizes["estimator"])[at], values[at, row], spent[at, row]
-        by_noise.plot(x, y, **line)
-        by_noise.vlines(x, low[at, row], high[at, row], color=look.color, linewidth=1.0, gid=estimator_gid(row))
-        by_rollouts.plot(across, y, **{**line, "zorder": 1.5})
-        for size, (place, a, b, c) in enumerate(zip(np.flatnonzero(at), x, across, y, strict=True)):
-            tip = f"noise x {data['scale'].values[place]:g}: {plain(c)} ({plain(low[place, row])} to "
-            tip += f"{plain(high[place, row])}), {plain(rollouts[place, row])} rollouts"
-            marks: dict[str, Any] = {"color": look.color, "marker": look.marker, "linewidths": 0}
-            marks["gid"] = estimator_gid(row, f"{names(data, 'estimator')[row]}, {tip}")
-            by_noise.scatter(a, c, s=30, **marks)
-            by_rollouts.scatter(b, c, s=26 + 30 * size, alpha=0.8, **marks)
-    for panel in (by_noise, by_rollouts):
-        panel.axhline(1, color=INK, linewidth=1.1, zorder=1.4)
-        panel.set_ylim(min(0.9, 0.9 * np.nanmin(low[known])), 1.15 * np.nanmax(high[known]))
-        log_axis(panel, "y")
-    by_noise.set_title("RMSE / least bound, by noise")
-    scale_axis(by_noise, data["scale"].values)
-    by_noise.set_xlabel("noise scale")
-    by_rollouts.set_title("RMSE / least bound, by rollouts")
-    by_rollouts.set_xscale("log")
+    spent, count = np.maximum(rollouts, none), data.sizes["estimator"]
+    by_noise = [Line(_EVERYWHERE, (1, 1), width=1.5)]
+    by_rollouts = list(by_noise)
+    for i, look in _looks(data):
+        at, name = np.flatnonzero(known[:, i]), names(data, "estimator")[i]
+        x, y = dodged(scales, i, count)[at], values[at, i]
+        line = _line(data, i, look, x, y)._replace(marker="", name="")
+        by_noise += [line, spread(x, low[at, i], high[at, i], color=look.color, width=1.3, group=i)]
+        by_rollouts += [line._replace(x=spent[at, i])]
+        for size, (place, a) in enumerate(zip(at.tolist(), x, strict=True)):
+            tip = f"{name}, noise x {scales[place]:g}: {plain(values[place, i])} ({plain(low[place, i])} to "
+            tip += f"{plain(high[place, i])}), {plain(rollouts[place, i])} rollouts"
+            mark = Line([a], [values[place, i]], look.color, 0, marker=look.marker, name=name, group=i, tip=tip)
+            by_noise += [mark]
+            by_rollouts += [mark._replace(x=[spent[place, i]], size=6.0 + 2 * size)]
+    y = Scale("log", (min(0.9, 0.9 * float(np.nanmin(low[known]))), 1.15 * float(np.nanmax(high[known]))))
     powers = 10.0 ** np.arange(np.ceil(np.log10(max(spent[known].max(), 10.0))) + 1)
     ticks = {none: "none"} if (rollouts[known] <= 0).any() else {}
-    ticks |= {power: f"{power:,.0f}" for power in powers}
-    by_rollouts.set_xticks(list(ticks), list(ticks.values()))
-    by_rollouts.xaxis.set_minor_locator(NullLocator())
-    by_rollouts.set_xlim(min(ticks) / 1.5, max(ticks) * 1.2)
-    by_rollouts.set_xlabel("rollouts for one flight; larger marks: more noise")
-    legend(figure, names(data, "estimator"))
-    return figure
+    ticks |= {power: f"{power:,.0f}" for power in powers.tolist()}
+    x = Scale("log", (min(ticks) / 1.5, max(ticks) * 1.2), ticks, "rollouts for one flight; larger marks: more noise")
+    panels = [
+        Panel("RMSE / least bound, by noise", by_noise, _scales(scales), y, 430, 300),
+        Panel("RMSE / least bound, by rollouts", by_rollouts, x, y, 430, 300),
+    ]
+    return Figure("overview", panels, columns=2)
 
 
 def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
@@ -241,9 +297,17 @@ def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
     return scales * np.exp(0.3 * gap * (place / max(count - 1, 1) - 0.5))
 
 
-def _width(data: xr.Dataset, place: int) -> float:
-    """The width of the line of an estimator [pt]: a later one lies on an earlier one, and is narrower."""
-    return _WIDEST - (_WIDEST - _NARROWEST) * place / max(data.sizes["estimator"] - 1, 1)
+def _scales(scales: np.ndarray) -> Scale:
+    """The axis of the noise, with a tick at each scale."""
+    ends = float(scales.min()) / 1.8, float(scales.max()) * 1.8
+    return Scale("log", ends, {scale: f"{scale:g}" for scale in scales.tolist()}, "noise scale")
+
+
+def _line(data: xr.Dataset, place: int, look: Style, x: np.ndarray, y: np.ndarray) -> Line:
+    """The line of an estimator: a later one lies on an earlier one, and is narrower."""
+    width = _WIDEST - (_WIDEST - _NARROWEST) * place / max(data.sizes["estimator"] - 1, 1)
+    name = names(data, "estimator")[place]
+    return Line(x, y, look.color, width, look.dash, look.marker, 3.5 + 1.8 * width, name=name, group=place)
 
 
 def _looks(data: xr.Dataset) -> Iterator[tuple[int, Style]]:
@@ -257,4 +321,4 @@ SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "efficiency": efficiency,
     "coverage": coverage,
 }
-"""The figures of each scenario. Each is `None` if its data are absent. `study.html.j2` has titles and captions."""
+"""The figures of each scenario. Each is `None` if its data are absent."""

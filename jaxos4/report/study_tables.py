@@ -4,8 +4,8 @@ import csv
 import io
 import itertools
 import json
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -13,6 +13,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..study import OUTCOMES, metrics
+from .page import Entry, Row, Table
 from .text import DASH, Listing, percent, plain
 
 _PHRASES = {
@@ -82,40 +83,27 @@ def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
     return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
 
 
-class Entry(NamedTuple):
-    """A number as text, with its interval and its mark."""
-
-    text: str
-    interval: str = ""
-    mark: str = ""
-
-
-class Table(NamedTuple):
-    """Rows of text, in groups of one noise scale.
-
-    - `headings`: of the columns after the first, each with its unit or an empty string.
-    - `groups`: the label of each group, and its rows: a label, cells, and the index of an estimator if the row is of
-      one. The page hides the row with the estimator.
-    - `notes`: the meaning of the marks.
-    """
-
-    headings: list[tuple[str, str]]
-    groups: Sequence[tuple[str, Sequence[tuple[str, tuple[Entry, ...], int | None]]]]
-    notes: tuple[str, ...] = ()
-
-
 def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     """The tables of one scenario, by name."""
+    parameters, level = names(data, "parameter"), shown_level(data)
+    levels = [f"{100 * x:g} %" for x in data["level"].values]
 
-    def table(found: xr.Dataset, measure: str, text: Callable[[float], str], headings: list[str]) -> Table:
-        return _by_estimator(data, headings, lambda at: _with_intervals(found.isel(at), measure, text))
+    def table(
+        name: str, measure: str, found: xr.Dataset, text: Callable[[float], str], headings: list[str], caption: str
+    ) -> Table:
+        source = f"From estimate, truth, {'bound' if name == 'efficiency' else 'half_width'}, result (metrics.{name})."
+        rows = _by_estimator(data, lambda at: _with_intervals(found.isel(at), measure, text))
+        return Table(name, caption, ("estimator", *headings), rows, [source])
 
-    parameters, levels = names(data, "parameter"), [f"{100 * x:g} %" for x in data["level"].values]
+    ratio = "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do"
+    held = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
+    means = "Intervals that contain the truth [%] by the level that they claim, averaged over the parameters"
+    covered = metrics.coverage(data).sel(level=level)
     return {
         "error": _error_table(data),
-        "efficiency": table(metrics.efficiency(data), "efficiency", plain, parameters),
-        "coverage": table(metrics.coverage(data).sel(level=shown_level(data)), "coverage", percent, parameters),
-        "levels": table(metrics.mean_coverage(data), "coverage", percent, levels),
+        "efficiency": table("efficiency", "efficiency", metrics.efficiency(data), plain, parameters, ratio),
+        "coverage": table("coverage", "coverage", covered, percent, parameters, held),
+        "levels": table("mean_coverage", "coverage", metrics.mean_coverage(data), percent, levels, means),
         "results": _result_table(data),
     }
 
@@ -137,22 +125,27 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
 
     groups = []
     for place, label in enumerate(scale_labels(data)):
-        least = [(f"bound, {x}", cells(best.isel(scale=place, estimator=at)), None) for x, at in bounds(data).items()]
+        least = [
+            Row(f"bound, {x}", cells(best.isel(scale=place, estimator=at)), reference=True)
+            for x, at in bounds(data).items()
+        ]
         every = enumerate(names(data, "estimator"))
-        rows = [(name, cells(found.isel(scale=place, estimator=at)), at) for at, name in every]
-        groups.append((label, [*least, *rows, ("bracket centre", cells(middle.isel(scale=place)), None)]))
-    used = {cell.mark for _, rows in groups for _, cells, _ in rows for cell in cells}
+        rows = [Row(name, cells(found.isel(scale=place, estimator=at)), at) for at, name in every]
+        groups.append((label, [*least, *rows, Row("bracket centre", cells(middle.isel(scale=place)), reference=True)]))
+    used = {cell.mark for _, rows in groups for row in rows for cell in row.cells}
     notes = (
         f"{mark} absolute error, in the parameter's unit: {reason}, so a percentage is meaningless."
         for mark, reason in zip(_MARKS, metrics.NO_PERCENTAGE, strict=True)
         if mark and mark in used
     )
-    headings = []
+    headings = ["estimator"]
     for place, (name, unit) in enumerate(zip(names(data, "parameter"), names(data, "unit"), strict=True)):
-        column = [cells[place] for _, rows in groups for _, cells, _ in rows if cells[place].text != DASH]
+        column = [row.cells[place] for _, rows in groups for row in rows if row.cells[place].text != DASH]
         marked = [bool(cell.mark) for cell in column]
-        headings.append((name, "%" if not any(marked) else unit if all(marked) else f"%; marked: {unit}"))
-    return Table(headings, groups, tuple(notes))
+        headings.append(f"{name} [{'%' if not any(marked) else unit if all(marked) else f'%; marked: {unit}'}]")
+    caption = "RMS error [% of the truth; where marked, in the parameter's unit]"
+    source = "From estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)."
+    return Table("error", caption, headings, groups, [*notes, source])
 
 
 def _result_table(data: xr.Dataset) -> Table:
@@ -166,7 +159,10 @@ def _result_table(data: xr.Dataset) -> Table:
         return (*numbers, Entry(plain(float(spent.isel(at)))), *hit)
 
     headings = [names(counts, "code")[place].replace("_", " ") for place in occurs]
-    return _by_estimator(data, [*headings, "rollouts", "seed hits"], cells)
+    caption = "Flights by result, mean rollouts, and the hybrid's seed brackets that contain the truth [%]"
+    source = "From result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)."
+    headings = ("estimator", *headings, "rollouts", "seed hits")
+    return Table("results", caption, headings, _by_estimator(data, cells), [source])
 
 
 def best_estimators(data: xr.Dataset) -> dict[str, str]:
@@ -179,8 +175,8 @@ def best_estimators(data: xr.Dataset) -> dict[str, str]:
     return {", ".join(scales) if len(best) > 1 else "every noise": names for names, scales in best.items()}
 
 
-def troubled_flights(data: xr.Dataset) -> dict[str, Any]:
-    """The flights that were run and did not converge: the first 20 `listed`, and the `total`."""
+def troubled_flights(data: xr.Dataset) -> tuple[int, list[str]]:
+    """The number of flights that were run and did not converge, and the first 20."""
     order = ("scale", "estimator", "flight")
     bad = (metrics.was_run(data) & ~metrics.converged(data)).transpose(*order).values
     results, places = data["result"].transpose(*order).values[bad], np.argwhere(bad)
@@ -190,18 +186,18 @@ def troubled_flights(data: xr.Dataset) -> dict[str, Any]:
         f"{scales[i]}, {estimators[j]}, flight {flights[k]}: {known.get(int(result), 'unknown result')}"
         for (i, j, k), result in zip(places[:_MOST_LISTED], results[:_MOST_LISTED], strict=True)
     ]
-    return {"listed": listed, "total": len(places)}
+    return len(places), listed
 
 
-def failed_cells(dataset: xr.Dataset) -> dict[str, Any]:
-    """The cells of a study that raised an error, with its message: the first 20 `listed`, and the `total`."""
+def failed_cells(dataset: xr.Dataset) -> tuple[int, list[str]]:
+    """The number of cells of a study that raised an error, and the first 20 with the message."""
     failures = json.loads(dataset.attrs.get("failures", "[]"))
     shown = [name for name in metrics.SCENARIO if dataset.sizes[name] > 1] or ["estimator"]
     listed = [
         f"cell {failure['cell']}, {', '.join(f'{name} {failure[name]}' for name in shown)}: {failure['message']}"
         for failure in failures[:_MOST_LISTED]
     ]
-    return {"listed": listed, "total": len(failures)}
+    return len(failures), listed
 
 
 def channels_by_estimator(data: xr.Dataset) -> dict[str, list[str]]:
@@ -245,14 +241,15 @@ def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
     return int(missing.sum()), missing.size
 
 
-def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[str, int]], tuple[Entry, ...]]) -> Table:
-    """A table with a row for each noise scale and estimator; `cells` gives the row's cells from its indices."""
+def _by_estimator(
+    data: xr.Dataset, cells: Callable[[dict[str, int]], tuple[Entry, ...]]
+) -> list[tuple[str, list[Row]]]:
+    """A row for each noise scale and estimator; `cells` gives the row's cells from its indices."""
     estimators = list(enumerate(names(data, "estimator")))
-    groups = [
-        (label, [(name, cells({"scale": scale, "estimator": at}), at) for at, name in estimators])
+    return [
+        (label, [Row(name, cells({"scale": scale, "estimator": at}), at) for at, name in estimators])
         for scale, label in enumerate(scale_labels(data))
     ]
-    return Table([(heading, "") for heading in headings], groups)
 
 
 def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Entry, ...]:
@@ -273,12 +270,12 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
     notes: dict[str, None] = {}
     for scenario in scenarios(dataset):
         table, rows = _error_table(scenario.data, digits=2), []
-        headings = [heading for heading, _ in table.headings]
+        headings = [heading.partition(" [")[0] for heading in table.headings[1:]]
         blank = [""] * len(headings)
         for label, group in table.groups:
             rows += [["", *blank]] * bool(rows) + [[label, *blank]]
-            rows += [[name, *(cell.text + cell.mark for cell in cells)] for name, cells, _ in group]
+            rows += [[row.name, *(cell.text + cell.mark for cell in row.cells)] for row in group]
         listing = Listing(["", *headings], rows, headings, apart=1)  # 80 columns must do
         parts += [Text(f"RMS error [%], {scenario.label}"), listing.table()]
-        notes |= dict.fromkeys(table.notes)
+        notes |= dict.fromkeys(table.notes[:-1])  # the last one says how the page's numbers are computed
     return Group(*parts, *(Text(note) for note in notes))

@@ -294,16 +294,22 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
         console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
     for note in found.notes:
         console.print(f"note: {note}")
-    rows = []
-    shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:most]
-    for part in sorted(shown, key=lambda part: part.begin):
-        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
-        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
+    rows = part_rows(found, most)
     headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
     Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
-    if len(found.parts) > len(shown):
-        console.print(f"and {len(found.parts) - len(shown)} shorter parts")
+    if len(found.parts) > len(rows):
+        console.print(f"and {len(found.parts) - len(rows)} shorter parts")
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
+
+
+def part_rows(found: Inspection, most: int) -> list[tuple[str, ...]]:
+    """The cells of the `most` longest parts of a log, in order of time: from, to, use, and the excitation by axis."""
+    rows = []
+    longest = sorted(found.parts, key=lambda part: part.begin - part.end)[:most]
+    for part in sorted(longest, key=lambda part: part.begin):
+        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
+        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
+    return rows
 
 
 def print_information(console: Console, found: FlightInformation) -> None:

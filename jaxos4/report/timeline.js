@@ -14,7 +14,7 @@
   const values = ([middle, step, text]) =>
     Array.from(new Int16Array(bytes(text)), (level) => (level === -32768 ? null : middle + step * level));
   const integers = (text) => Array.from(new Int16Array(bytes(text)));
-  const text = (value) => (value == null ? "–" : String(Number(value.toPrecision(4))));
+  const text = (value) => (value == null ? "" : String(Number(value.toPrecision(4))));
   // Labels have as many decimals as the distance of the ticks.
   function labels(places, step) {
     let digits = 0;
@@ -95,7 +95,7 @@
     if (half) {
       const moved = (by) => y[lines.length - 1].map((value) => (value == null ? null : value + by));
       y.push(moved(-half), moved(half));
-      const edge = { width: 0, points: { show: false }, class: "edge" };
+      const edge = { width: 0, points: { show: false }, value: () => "", class: "edge" };
       series.push({ ...edge }, { ...edge });
       bands.push({ series: [lines.length + 2, lines.length + 1], fill: `${lines[lines.length - 1].color}38` });
     }
@@ -109,7 +109,7 @@
         { ...axis, size: 28, splits: ticks, values: (_, at, axis, space, step) => labels(at, step) },
         { ...axis, label: title, size: 52, labelSize: 20, space: height < 120 ? 14 : 22 },
       ],
-      series: [{ label: "time [s]", value: (_, x) => (x == null ? "–" : own(x).toFixed(3)) }, ...series],
+      series: [{ label: "time [s]", value: (_, x) => (x == null ? "" : own(x).toFixed(3)) }, ...series],
       bands,
       hooks: {
         drawClear: [background],

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar
-from ..batching import with_batch
+from ..batching import computed_once, with_batch
 from ..models.state import Forcing, Rates, State
+from .feedback import Feedback, InputGains, by_inputs, feedback_slopes
 from .gains import (
     RATE_COUNT,
     Channels,
     Covariance,
-    Gains,
     LogNoise,
     Observed,
     Series,
@@ -68,64 +68,41 @@ class _Known(NamedTuple):
     disturbance: tuple[Segments, ...]
 
 
-class InputGains(NamedTuple):
-    """What a unit of each input innovation adds to the estimates at the end of its sample, by feedthrough.
-
-    - `driven`: to the rate [rad/s], or to the force besides the model's [m/s^2].
-    - `disturbance`: to the disturbance [rad/s^2], or [m/s^2].
-    """
-
-    driven: tuple[Float[Array, " channels *segments"], ...]
-    disturbance: tuple[Float[Array, " channels *segments"], ...]
-
-
-class _Feedback(NamedTuple):
-    """The parts of a filter that depend on the noise, by channel: its `Gains`, `InputGains`, and fields of `Step`."""
-
-    driven: tuple[Segments, ...]
-    driven_later: tuple[Segments, ...]
-    disturbance_later: tuple[Segments, ...]
-    driven_seen: tuple[Segments, ...]
-    seen: tuple[Segments, ...]
-    kept: tuple[Segments, ...]
-    driven_kept: tuple[Segments, ...]
-    reach: tuple[Segments, ...]
-    by_input: InputGains
-
-    @classmethod
-    def of(cls, gains: Gains, step: Step, by_input: InputGains) -> "_Feedback":
-        fields = gains.driven, gains.driven_later, gains.disturbance_later, step.driven_seen, step.seen
-        return cls(*map(tuple, (*fields, *step.transition)), by_input=by_input)
-
-
 def _advance(
-    functions: tuple[Callable, ...], known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
+    functions: tuple[Callable, ...],
+    known: _Known,
+    forcing: Forcing,
+    scalars: Scalars,
+    feedback: Feedback,
+    row: _Row,
+    going: Bool[Array, " segments"],
 ) -> tuple[_Known, tuple[Segments, ...]]:
-    """The estimates one sample later, and the innovations of this sample."""
+    """The estimates one sample later, and the innovations of this sample. `going`: the segments that have not diverged.
+
+    Innovations and rates are computed once for all that uses them, and so are their derivatives.
+    """
     move, average, observe = functions
     seen = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
-    mean = average(State(Rates(*known.driven[:RATE_COUNT])), forcing, scalars).rates
-    rates = Rates(*(x + a for x, a in zip(mean, seen, strict=False)))
-    outputs = observe(State(rates), forcing, scalars)
-    forces = zip(outputs, feedback.driven_seen, known.driven, seen, strict=True)
-    outputs = (*outputs[:RATE_COUNT], *(h + share * x + a for h, share, x, a in [*forces][RATE_COUNT:]))
+
+    def compared() -> tuple[Segments, ...]:
+        mean = average(State(Rates(*known.driven[:RATE_COUNT])), forcing, scalars).rates
+        rates = Rates(*(x + a for x, a in zip(mean, seen, strict=False)))
+        outputs = observe(State(rates), forcing, scalars)
+        forces = zip(outputs, feedback.driven_seen, known.driven, seen, strict=True)
+        outputs = (*outputs[:RATE_COUNT], *(h + share * x + a for h, share, x, a in [*forces][RATE_COUNT:]))
+        return tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
+
+    errors = computed_once(going, compared)
     # What was not measured has no gain.
-    errors = tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
     driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
-    rates = move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates
+    rates = computed_once(going, lambda: move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates)
     driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
-    added = tuple(_by_inputs(gains, row.inputs) for gains in feedback.by_input)
+    added = tuple(by_inputs(gains, row.inputs) for gains in feedback.by_input)
     later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, added[0], strict=True)
     driven = tuple(x + a * d + gain * e + v for x, a, d, gain, e, v in later)
     faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, added[1], strict=True)
     disturbance = tuple(share * d + gain * e + v for share, d, gain, e, v in faded)
     return _emptied(_Known(driven, disturbance), row.restarts_next), errors
-
-
-def _by_inputs(gains: tuple[Array, ...], inputs: Float[Array, "feedthroughs channels segments"]) -> Channels:
-    """What input innovations add to an estimate, by channel."""
-    each = (v * (k if k.ndim > 1 else k[:, None]) for k, v in zip(gains, inputs, strict=True))
-    return sum(each, jnp.zeros(inputs.shape[1:], dtype=float))
 
 
 def _emptied(known: _Known, where: Bool[Array, " segments"]) -> _Known:
@@ -136,12 +113,12 @@ class _Carry(NamedTuple):
     """The state of the filters between blocks of rows, each part with its derivatives, and the sums so far.
 
     - `covariance`: with its derivatives in the noise, on the first axis.
-    - `known`: with its derivatives in the parameters, and in the noise, on the first axis.
+    - `known`: with its derivatives in the parameters, and then in the noise, on the first axis.
     - `last`: the last `LAGS` standardised innovations.
     """
 
     covariance: tuple[Covariance, Covariance]
-    known: tuple[_Known, _Known, _Known]
+    known: tuple[_Known, _Known]
     last: Float[Array, "lags channels segments"]
     sums: Innovations
 
@@ -261,12 +238,10 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         information=jnp.zeros((channels, unknowns, unknowns, segments), dtype=float),
         products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
     )
-    no_slopes = (
-        jax.tree.map(lambda _, some=some: jnp.broadcast_to(zero, (some, segments)), known) for some in (count, levels)
-    )
+    no_slopes = jax.tree.map(lambda _: jnp.zeros((count + levels, segments), dtype=float), known)
     carry = _Carry(
         (covariance, jax.vmap(push)(steps[1])),
-        (known, *no_slopes),
+        (known, no_slopes),
         jnp.zeros((LAGS, channels, segments), dtype=float),
         nothing,
     )
@@ -276,7 +251,7 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     seen = jnp.where(missing[:, None], 0.0, inputs)
     row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, seen, observed.restart, following)
     explained, known_noise = (
-        jax.vmap(_by_inputs, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough)
+        jax.vmap(by_inputs, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough)
     )
     fed = explained, jnp.square(known_noise), jnp.moveaxis(inputs, 2, 1)
     data = row, observed.counts, fed, forcing, forcing_tangents
@@ -308,10 +283,11 @@ def _filter_rows(
     """
     count, segments = parameters.shape[0], counts.shape[1]
     scalars, own = tuple(parameters), parameters.shape[1:]
-    units = tuple(np.eye(count, dtype=parameters.dtype))
+    unknowns = jax.tree.leaves(carry.known[1])[0].shape[0]
+    units = tuple(np.eye(count, unknowns, dtype=parameters.dtype))
 
     def body(carry, rows):
-        (covariance, by_noise), (known, slopes, noise_slopes), feasible = carry
+        (covariance, by_noise), (known, slopes), feasible = carry
         forcing, tangents, row = rows
         for x in known.driven[:RATE_COUNT]:
             feasible = feasible & (jnp.abs(x) < FASTEST)
@@ -319,41 +295,31 @@ def _filter_rows(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
-        fed = _Feedback.of(gains, steps[0], by_input)
+        fed = Feedback.of(gains, steps[0], by_input)
         # The noise acts by the feedback alone, and the parameters do not act on it.
-        _, push = jax.linearize(lambda known, fed: advance(known, forcing, scalars, fed, row), known, fed)
-        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, _directions(gain_slopes, steps[1], by_input))
+        fed_slopes = feedback_slopes(gain_slopes, steps[1], by_input, count)
 
-        def filtered(known: _Known, scalars: tuple, forcing: Forcing = forcing):
-            return advance(known, forcing, scalars, fed, row)
+        def filtered(known: _Known, fed: Feedback, scalars: tuple, forcing: Forcing = forcing):
+            return advance(known, forcing, scalars, fed, row, feasible)
 
-        def pushed(slopes: _Known, units: tuple, *others: Any) -> Any:
-            return push(slopes, tuple(jnp.broadcast_to(unit, own) for unit in units), *others)
+        def pushed(slopes: _Known, fed: Feedback, units: tuple, *others: Any) -> Any:
+            return push(slopes, fed, tuple(jnp.broadcast_to(unit, own) for unit in units), *others)
 
-        at, directions = (known, scalars), (slopes, units)
+        at, directions = (known, fed, scalars), (slopes, fed_slopes, units)
         if tangents is not None:
-            wide = jax.tree.map(lambda t: jnp.zeros((count, segments), dtype=float).at[positions].set(t), tangents)
+            wide = jax.tree.map(lambda t: jnp.zeros((unknowns, segments), dtype=float).at[positions].set(t), tangents)
             at, directions = (*at, forcing), (*directions, wide)
         (known, errors), push = jax.linearize(filtered, *at)
         slopes, by_errors = jax.vmap(pushed)(*directions)  # pyright: ignore[reportArgumentType]
-        found = tuple(map(jnp.stack, (errors, by_errors, by_noise_errors))), gains.variance, gain_slopes.variance
-        return ((covariance, by_noise), (known, slopes, noise_slopes), feasible), found
+        found = tuple(map(jnp.stack, (errors, by_errors))), gains.variance, gain_slopes.variance
+        return ((covariance, by_noise), (known, slopes), feasible), found
 
     first = carry.covariance, carry.known, carry.sums.feasible
     (covariance, known, feasible), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
-    (errors, *slopes), variance, variance_slopes = found
+    (errors, slopes), variance, variance_slopes = found
     counts = row.is_measured & counts[:, None]
-    errors, slopes = errors - fed[0], jnp.concatenate([*slopes, -fed[2]], axis=2)
+    errors, slopes = errors - fed[0], jnp.concatenate([slopes, -fed[2]], axis=2)
     noise = slice(count, count + variance_slopes.shape[1])
     found, last = likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, fed[1], noise)
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)
-
-
-def _directions(gains: Gains, steps: Step, by_input: InputGains) -> _Feedback:
-    """The derivatives of the feedback in the levels of the noise, then in the gains of input innovations."""
-    levels, units = gains.variance.shape[0], basis(by_input)
-    of_noise = jax.tree.map(lambda leaf: jnp.zeros((levels, *leaf.shape[1:]), leaf.dtype), units)
-    some, more = jax.vmap(_Feedback.of)(gains, steps, of_noise), len(jax.tree.leaves(by_input))
-    wide = jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, more), *((0, 0),) * (leaf.ndim - 1))), some)
-    return wide._replace(by_input=jax.tree.map(lambda a, b: jnp.concatenate([a, b]), of_noise, units))

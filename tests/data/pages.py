@@ -4,9 +4,11 @@ import html
 import io
 import re
 
+import numpy as np
 from rich.console import Console
 
 from jaxos4.report import print_identification
+from jaxos4.report.panels import Band
 
 
 def words(text):
@@ -35,9 +37,19 @@ def stands_alone(text):
     assert text.count("<script") == text.count("</script") == 1
 
 
+def assert_inside(panel):
+    """Asserts that all numbers of a panel's marks are inside its axes."""
+    panel = panel.fitted()
+    for mark in panel.marks:
+        heights = (mark.low, mark.high) if isinstance(mark, Band) else (mark.y,)
+        for scale, values in ((panel.x, mark.x), *((panel.y, each) for each in heights)):
+            places = scale.place(values)
+            assert ((places >= -1e-9) & (places <= 1 + 1e-9) | np.isnan(places)).all(), (panel.title, mark)
+
+
 # The width of each element, and the pixels that it needs for letters of a readable size, in one question.
 WIDTHS = "all => all.map(one => [one.getBoundingClientRect().width, one.viewBox.baseVal.width])"
-# The texts that a reader sees, with their boxes: lines of HTML, and texts of figures, which are outlines.
+# The texts that a reader sees, with their boxes: lines of HTML, and texts of figures.
 TEXTS = r"""() => {
   const found = [];
   const seen = (element) => element.checkVisibility({visibilityProperty: true});
@@ -50,17 +62,17 @@ TEXTS = r"""() => {
     range.selectNodeContents(node);
     for (const box of range.getClientRects()) add(node.data.trim().slice(0, 30), box);
   }
-  for (const group of document.querySelectorAll('g[id*="text_"]')) {
-    if (seen(group)) add(group.id, group.getBoundingClientRect());
+  for (const text of document.querySelectorAll("svg text")) {
+    if (seen(text)) add(text.textContent, text.getBoundingClientRect());
   }
   return found;
 }"""
 # The texts of figures that are not completely inside their panel, which cuts them.
-CUT = """() => [...document.querySelectorAll('svg g[id*="text_"]')].filter(text => {
+CUT = """() => [...document.querySelectorAll('svg text')].filter(text => {
   const box = text.getBoundingClientRect(), panel = text.ownerSVGElement.getBoundingClientRect();
   return box.width && (box.left < panel.left - 1 || box.right > panel.right + 1
     || box.top < panel.top - 1 || box.bottom > panel.bottom + 1);
-}).map(text => text.id)"""
+}).map(text => text.textContent)"""
 # Of each cell of a table: its heading, the label that a card shows above it, and its text without a point.
 CARDS = r"""() => [...document.querySelectorAll("figure.table table")].flatMap(table => {
   const heads = [...table.querySelectorAll("thead th")].map(head => head.textContent.trim());

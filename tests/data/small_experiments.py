@@ -9,6 +9,7 @@ import pytest
 
 import jaxos4
 from experiments import shared
+from experiments.drawing import rendered
 
 
 def load(name, script="run"):
@@ -30,7 +31,7 @@ def plot(folder: pathlib.Path, name, script="plot", results="out.json", *, suffi
     """Draws the results of an experiment in a folder. Only the comparison is drawn as PDF too."""
     with pytest.MonkeyPatch.context() as patch:
         if ".pdf" not in suffixes:
-            patch.setattr(shared, "pdf", lambda figure: b"")
+            patch.setattr(shared, "rendered", lambda figure, kind: rendered(figure, kind) if kind == "svg" else b"")
         load(name, script).main(folder / results, folder / f"{name} {script}")
     for suffix in suffixes:
         figures = list((folder / f"{name} {script}").glob(f"*{suffix}"))

@@ -20,10 +20,10 @@ FOLLOWS, UNRELATED = 0.2, 0.1
 VELOCITY_ERROR = 0.15
 _ATTITUDE = (*INERTIAS, "attitude")
 _CLOCKS = {  # how to say that it is wrong, and what it concerns
-    "gyro": ("is", INERTIAS),
-    "accelerometer": ("is", (*INERTIAS, "thrust", "motors")),
-    "attitude": ("is", ("attitude",)),
-    "motors": ("are", ("motors",)),
+    "gyro": ("is", "lags", INERTIAS),
+    "accelerometer": ("is", "lags", (*INERTIAS, "thrust", "motors")),
+    "attitude": ("is", "lags", ("attitude",)),
+    "motors": ("are", "lag", ("motors",)),
 }
 
 SCALE = 0.1  # of attitude against gyro, relative; inertias are wrong by the scale of the gyro
@@ -147,12 +147,16 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
         f"the {name} {_CLOCKS[name][0]} recorded {1e3 * abs(wrong[i]):.0f} ms {'late' if wrong[i] > 0 else 'early'}"
         for name, i in named.items()
     ]
+    off = wrong[best[0]]
+    if len(named) == 2 and wrong[[*named.values()]].prod() < 0:  # one difference of two clocks, seen from either
+        early, behind = sorted(named, key=lambda name: wrong[named[name]])
+        causes, off = [f"the {behind} {_CLOCKS[behind][1]} the {early}"], abs(off)
     return Finding(
         "_or_".join(named) + "_clock",
         ", or ".join(causes),
-        f"{1e3 * wrong[best[0]]:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
+        f"{1e3 * off:.1f} +- {2e3 / math.sqrt(squares[best[0]]):.2g} ms",
         "shift the time stamps, or log without a filter",
-        tuple(dict.fromkeys(quantity for name in named for quantity in _CLOCKS[name][1])),
+        tuple(dict.fromkeys(quantity for name in named for quantity in _CLOCKS[name][2])),
         # The delay of the motors is estimated with the other parameters.
         bool(abs(wrong[best[0]]) > LATE and "motors" not in named),
     )

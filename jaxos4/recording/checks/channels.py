@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from ...airframe import AXES, INERTIAS
+from ...errors import percent
 from ...flight import FORCE_NAMES, RATES
 from ...logs.table import counted
 from .evidence import HELD, Evidence, Finding
@@ -23,7 +24,7 @@ def uneven_time(evidence: Evidence) -> Finding | None:
         return None
     missing = 1 - (steps.size + 1) / (np.sum(steps) / step + 1)
     if missing > 0:
-        size = f"{100 * missing:.2g} % of the samples are missing, in gaps of up to {1e3 * steps.max():.3g} ms"
+        size = f"{percent(missing)} of the samples are missing, in gaps of up to {1e3 * steps.max():.3g} ms"
     else:
         size = f"steps of {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms"
     return Finding(
@@ -59,7 +60,7 @@ def clipped_values(evidence: Evidence) -> Finding | None:
     found = evidence.plausible.clipped
     if not found:
         return None
-    each = [f"{n}: {count} ({100 * share:.2g} %) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
+    each = [f"{n}: {count} ({percent(share)}) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
     many = bool(max(share for _, share, _ in found.values()) > MANY_CLIPPED)
     return Finding(
         "clipped_values",
