@@ -69,7 +69,9 @@ def test_mujoco_sysid_solves_its_own_example():
 def test_mujoco_sysid_is_exact_on_its_own_physics():
     module = sysid()
     loop = jaxos4.ClosedLoop(flights.CRAZYFLIE, gust=0.0, **QUIET)
-    found = module.fit(log_of(flights.in_mujoco(loop, 3, 8.0)), window=0.5)
+    flight = flights.in_mujoco(loop, 3, 8.0)
+    assert flight.commanded
+    found = module.fit(log_of(flight), window=0.5)
     np.testing.assert_allclose(found.inertia, TRUE, rtol=4e-3)
     assert not found.warnings
 

@@ -93,7 +93,8 @@ def in_mujoco(loop: jaxos4.ClosedLoop, seed: int, duration: float) -> jaxos4.Fli
     states = np.full((len(omega), len(jaxos4.STATE_NAMES)), np.nan)
     for names, values in ((("p", "q", "r"), gyro), (("phi", "theta", "psi"), attitude)):
         states[:, [jaxos4.STATE_NAMES.index(name) for name in names]] = values
-    return jaxos4.Flight(time=DT * np.arange(len(omega)), omega=omega, states=states, specific_force=force)
+    held = {"commanded": True, "held": True}
+    return jaxos4.Flight(time=DT * np.arange(len(omega)), omega=omega, states=states, specific_force=force, **held)
 
 
 def in_rotorpy(gust: float, seed: int, duration: float) -> jaxos4.Flight:
