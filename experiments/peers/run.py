@@ -8,6 +8,7 @@ and Iy in flights that are not reported.
 
 import functools
 import importlib
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -116,18 +117,21 @@ def figures(rows: list[Row]) -> Iterator[str]:
     yield f"{np.median([row['seconds'] for row in rows]):.1f}"
 
 
-def print_report(report: Row, tools: dict[str, Any], duration: float, chosen: Callable[[str, str], Row]) -> None:
+def print_report(
+    report: Row, every: dict[str, Case], tools: dict[str, Any], duration: float, chosen: Callable[[str, str], Row]
+) -> None:
     """Settings, simulated flights, and real ones."""
     settings = [
         (name, *(", ".join(f"{k} {v}" for k, v in chosen(name, air).items()) for air in TUNED_ON)) for name in tools
     ]
     print_table("settings of the peers", ("tool", *TUNED_ON), settings)
+    groups = {case: [case] for case in dict.fromkeys(row["case"] for row in report["rows"])}
+    groups |= {f"all {air}": [case for case in groups if every[case].calm == (air == "calm")] for air in TUNED_ON}
     lines = []
-    for case in dict.fromkeys(row["case"] for row in report["rows"]):
-        for tool in (OURS, *tools):
-            rows = [row for row in report["rows"] if (row["case"], row["tool"]) == (case, tool) and "lost" not in row]
-            if rows:
-                lines.append((case, tool, str(len(rows)), *figures(rows)))
+    for (group, kinds), tool in itertools.product(groups.items(), (OURS, *tools)):
+        rows = [row for row in report["rows"] if row["case"] in kinds and row["tool"] == tool and "lost" not in row]
+        if rows:
+            lines.append((group, tool, str(len(rows)), *figures(rows)))
     errors = [f"{name} {what} [%]" for name in INERTIAS for what in ("mean", "RMS")]
     headings = "flights", "tool", "number", *errors, "95 % hold [%]", "warned [%]", "seconds"
     print_table(f"errors of moments of inertia, flights of {duration:g} s", headings, lines, width=200)
@@ -198,4 +202,4 @@ def main(
 
     fill(out, report, report["real"], trials, real_row)
     report["rows"].sort(key=lambda row: wanted.index(row["case"]))
-    print_report(report, peers, duration, chosen)
+    print_report(report, every, peers, duration, chosen)
