@@ -50,10 +50,13 @@ def shares(found: Fit, truth: np.ndarray) -> Row:
     return {name: {"error": e, "std": s} for name, e, s in zip(INERTIAS, errors, stds, strict=True)}
 
 
-def timed(estimate: Callable[[], Fit]) -> tuple[Fit, Row]:
-    """A fit, with warnings and seconds as the begin of its row."""
+def timed(peer: Any, log: Log, setting: Row) -> tuple[Fit | None, Row]:
+    """A fit, or `None` if the tool failed, with warnings and seconds as the begin of its row."""
     begin = time.perf_counter()
-    found = estimate()
+    try:
+        found = peer.fit(log, **setting)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return None, {"warnings": [f"failed: {error}"], "seconds": time.perf_counter() - begin}
     return found, {"warnings": found.warnings, "seconds": time.perf_counter() - begin}
 
 
@@ -66,8 +69,8 @@ def simulated(case: Case, flight: jaxos4.Flight | None, i: int, peer: Any, setti
         warnings = [*row.pop("doubts", []), *([] if row["result"] == "successful" else [row["result"]])]
         return row | {"warnings": warnings}
     log = Log.of(Recording.of(flight, "flight"), given_airframe(case.vehicle, i), commands=case.commands)
-    found, row = timed(lambda: peer.fit(log, **setting))
-    return row | shares(found, np.asarray(case.vehicle.inertia))
+    found, row = timed(peer, log, setting)
+    return row if found is None else row | shares(found, np.asarray(case.vehicle.inertia))
 
 
 def measured(folder: Path | None, name: str, peer: Any, setting: Row) -> Row:
@@ -75,7 +78,9 @@ def measured(folder: Path | None, name: str, peer: Any, setting: Row) -> Row:
     recording, (_, airframe, _, logged, _) = real(folder, name), REAL[name]
     if peer is not None:
         log = Log.of(recording, airframe, commands=logged == "commands")
-        found, row = timed(lambda: peer.fit(log, **setting))
+        found, row = timed(peer, log, setting)
+        if found is None:
+            return row
         pairs = zip(found.inertia.tolist(), found.std.tolist(), strict=True)
         return row | {n: {"estimate": x, "std": s} for n, (x, s) in zip(INERTIAS, pairs, strict=True)}
     begin = time.perf_counter()
