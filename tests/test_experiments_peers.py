@@ -101,7 +101,7 @@ def test_a_fast_log_is_averaged_and_what_was_not_measured_is_interpolated():
 def test_all_tools_get_the_same_flights_and_who_is_missing_is_skipped(capsys, monkeypatch, shared_flights, tmp_path):
     monkeypatch.setitem(load("peers").PEERS, "CasADi", "no_such_module")
     cases = {"flights": 2, "duration": 10.0, "only": ["Crazyflie, 0"], "tools": ["jaxos4", "regression", "CasADi"]}
-    report = result_of(tmp_path, "peers", recorded=["CineRat"], folder=shared_flights, **cases)
+    report = result_of(tmp_path, "peers", recorded=["CineRat"], recordings=shared_flights, **cases)
     plot(tmp_path, "peers")
     assert [(row["flight"], row["tool"]) for row in report["rows"]] == [
         (i, tool) for i in range(2) for tool in ("jaxos4", "regression")

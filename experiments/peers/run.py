@@ -161,9 +161,7 @@ def main(
     only: Annotated[list[str] | None, typer.Option(help="Kinds of simulated flights; all by default.")] = None,
     tools: Annotated[list[str], typer.Option(help="jaxos4 and the peers.")] = (OURS, *PEERS),
     recorded: Annotated[list[str], typer.Option(help="Real flights; - for none.")] = tuple(REAL),
-    folder: Annotated[
-        Path | None, typer.Option("--flights-in", help="Of real flights; default: $JAXOS4_FLIGHTS.")
-    ] = None,
+    recordings: Annotated[Path | None, typer.Option(help="Folder of real flights; by default $JAXOS4_FLIGHTS.")] = None,
     out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Fit the same flights by each tool."""
@@ -203,7 +201,7 @@ def main(
     trials = ({"flight": name, "tool": tool} for name in recorded if name in REAL for tool in compared)
 
     def real_row(flight: str, tool: str) -> Row:
-        return measured(folder, flight, peers.get(tool), chosen(tool, "gusts") if tool in peers else {})
+        return measured(recordings, flight, peers.get(tool), chosen(tool, "gusts") if tool in peers else {})
 
     fill(out, report, report["real"], trials, real_row)
     report["rows"].sort(key=lambda row: wanted.index(row["case"]))
