@@ -7,6 +7,7 @@ decision variables are scaled, and multiple shooting begins at the measured stat
 import multiprocessing
 import time
 from collections.abc import Callable
+from typing import Any
 
 import casadi
 import numpy as np
@@ -31,7 +32,7 @@ def single(case: Case, compiled: bool = False, cores: int = 1) -> Callable[[], d
     following = _one_step(case).mapaccum("trajectory", steps)(first, case.forcing.T, casadi.repmat(alpha, 1, steps))
     errors = casadi.vec((casadi.horzcat(first, following) - measured)[:, case.begin :] / _tiled(case, steps + 1))
     unknowns, data = casadi.vertcat(scaled, offset), casadi.vertcat(start, casadi.vec(measured))
-    solver = _gauss_newton(errors, unknowns, data, compiled)
+    solver = gauss_newton(errors, unknowns, data, COMPILED if compiled else None)
     zero = np.zeros(8 + offset.numel())
     begin = case.first_states()
 
@@ -63,7 +64,7 @@ def multiple(case: Case) -> Callable[[], dict]:
     following = _one_step(case).map(steps)(states[:, :-1], case.forcing.T, casadi.repmat(alpha, 1, steps))
     gaps = casadi.vec((following - states[:, 1:]) / casadi.repmat(casadi.DM(case.sigma), 1, steps))
     unknowns, data = casadi.veccat(scaled, offsets), casadi.vertcat(start, casadi.vec(measured))
-    solver = _gauss_newton(casadi.vec(offsets), unknowns, data, gaps=gaps)
+    solver = gauss_newton(casadi.vec(offsets), unknowns, data, gaps=gaps)
     zero = np.zeros(unknowns.numel())
 
     def run() -> dict:
@@ -109,10 +110,15 @@ def _tiled(case: Case, samples: int) -> casadi.DM:
     return casadi.repmat(casadi.DM(case.sigma), 1, samples - case.begin)
 
 
-def _gauss_newton(
-    errors: casadi.MX, unknowns: casadi.MX, data: casadi.MX, compiled: bool = False, gaps: casadi.MX | None = None
+def gauss_newton(
+    errors: casadi.MX,
+    unknowns: casadi.MX,
+    data: casadi.MX,
+    how: dict[str, Any] | None = None,
+    gaps: casadi.MX | None = None,
+    iterations: int = 3000,
 ):
-    """IPOPT with the Hessian J^T J of the residuals."""
+    """IPOPT with the Hessian J^T J of the residuals. `how`: options of the compiler. `iterations`: at most."""
     slope = casadi.jacobian(errors, unknowns)
     factor, multipliers = casadi.MX.sym("factor"), casadi.MX.sym("multipliers", 0 if gaps is None else gaps.numel())
     hessian = casadi.Function(
@@ -126,9 +132,10 @@ def _gauss_newton(
         },
         ["x", "p", "lam_f", "lam_g"],
         ["triu_hess_gamma_x_x"],
-        COMPILED if compiled else {},
+        how or {},
     )
     problem = {"x": unknowns, "p": data, "f": casadi.dot(errors, errors) / 2}
     if gaps is not None:
         problem["g"] = gaps
-    return casadi.nlpsol("solver", "ipopt", problem, {**OPTIONS, **(COMPILED if compiled else {}), "hess_lag": hessian})
+    options = {**OPTIONS, **(how or {}), "ipopt.max_iter": iterations, "hess_lag": hessian}
+    return casadi.nlpsol("solver", "ipopt", problem, options)
