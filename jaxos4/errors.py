@@ -1,6 +1,7 @@
 """Errors that the user can fix. The message says in one line what is wrong, where, and what to do."""
 
 import contextlib
+import re
 from collections.abc import Iterator
 
 
@@ -30,7 +31,8 @@ def shortened(text: str, most: int) -> str:
 
 def percent(share: float, digits: int = 2) -> str:
     """A share in percent with `digits` significant digits, and never as a power of ten above 1: "0.36 %", "110 %"."""
-    return f"{float(f'{100 * share:.{digits}g}'):g} %"
+    value = float(f"{100 * share:.{digits}g}")
+    return f"{value:.0f} %" if abs(value) >= 10**digits else f"{value:g} %"
 
 
 def in_words(error: Exception, most: int = 120) -> str:
@@ -42,9 +44,12 @@ def of_schema(error: Exception) -> str:
     """A message of msgspec with the place first, and types in plain words."""
     complaint, _, place = " ".join(str(error).split()).partition(" - at `$")
     words = {"object": "a table", "array": "a list", "int": "a whole number", "null": "nothing"}
-    for kind, word in (words | {"float": "a number", "str": "a string", "bool": "true or false"}).items():
-        complaint = complaint.replace(f"`{kind}`", word)
-    return f"`{place.strip('.`')}`: {complaint[:1].lower()}{complaint[1:]}" if place.strip(".`") else complaint
+    words |= {"float": "a number", "str": "a string", "bool": "true or false"}
+    types = "|".join(words)  # one, or several with bars between them
+    for found in re.findall(rf"`((?:{types})(?: \| (?:{types}))*)`", complaint):
+        complaint = complaint.replace(f"`{found}`", " or ".join(words[each] for each in found.split(" | ")))
+    complaint = f"{complaint[:1].lower()}{complaint[1:]}"
+    return f"`{place.strip('.`')}`: {complaint}" if place.strip(".`") else complaint
 
 
 @contextlib.contextmanager

@@ -268,7 +268,7 @@ PIPES = {
     "result": jaxos4.read_result,
     "airframe": load_airframe,
     "log": read_log,
-    "columns": lambda path: read_log("log.csv", columns=path),
+    "columns": lambda path: read_log(path.parent / "log.csv", columns=path),
     "network": load_network,
 }
 
@@ -278,7 +278,8 @@ PIPES = {
 def test_a_pipe_that_nobody_writes_is_refused(door, tmp_path):
     """To open it would wait for ever."""
     os.mkfifo(pipe := tmp_path / "pipe")
-    with pytest.raises(InputError):
+    (tmp_path / "log.csv").write_text("t,gyro\n0,1\n1,2\n", encoding="utf-8")
+    with pytest.raises(InputError, match="pipe: "):
         PIPES[door](pipe)
 
 

@@ -43,7 +43,7 @@ RECORDINGS = 4  # from twice this many on, there are more segments
 MIN_SEGMENT = 1.25  # s
 TOLERANCE = 1e-3  # of `FilterError`: it stops within 0.05 standard deviations of the minimum
 # Up to this sample time [s], torque hardly answers what is measured in its own sample, if that is an instant or if
-# motors follow commands.
+# motors follow commands. These need the innovations of the samples before, too (`lagged`).
 UNANSWERED = 0.005
 SIGMA = 0.5  # rad/s; the scale of the errors of a simulation, for networks
 GUESS_REACH = 4.0  # alpha8 may be this many times a guess too small or too large: published drag torques differ as much

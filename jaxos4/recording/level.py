@@ -37,7 +37,7 @@ def force_level(
 
 
 GAINED = 1.0  # m/s over a stretch, at the most
-CARRIED = 0.003  # share of the weight that forces do not carry together
+UNCARRIED = 0.003  # share of the weight that the mean force may miss
 UPRIGHT = 0.5  # the least mean cosine of the tilt
 
 
@@ -59,4 +59,4 @@ def _by_flight(
     if cosine < UPRIGHT or force[known, 2].mean() < 0:  # the second: the z axis points down
         return None
     drift = GAINED * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
-    return (along - gravity) / cosine, math.hypot(drift, CARRIED * gravity, along - other) / cosine
+    return (along - gravity) / cosine, math.hypot(drift, UNCARRIED * gravity, along - other) / cosine

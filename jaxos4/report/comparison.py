@@ -11,6 +11,7 @@ from .._files import check_writable, write_file
 from ..airframe import INERTIAS
 from ..comparison import ComparedQuantity, Comparison
 from ..identification.verdict import ADVICE, RESERVED, STATUSES, headline
+from ..logs.table import counted
 from .page import Folded, Part, Picture, Row, Section, Table, Text, number, page, span
 from .panels import Band, Figure, Line, Panel, Scale, across
 from .style import BOUND_DASHES, FAINT, INK, Style, style
@@ -41,8 +42,8 @@ def print_comparison(console: Console, found: Comparison) -> None:
                 *judged(found, each),
             )
         )
-    headings = ("quantity", "results", "pooled", "95 % interval", "unit", "p", "results", "pooled value")
-    Listing(headings, rows, ("results", "pooled", "p")).print_on(console)
+    headings = ("quantity", "used", "pooled", "95 % interval", "unit", "p", "agreement", "pooled value")
+    Listing(headings, rows, ("used", "pooled", "p")).print_on(console)
     shown = [each for each in found.quantities if each.unit == "kg m^2" or each in found.different]
     for each in shown:
         rows = list(quantity_cells(found, each))
@@ -54,7 +55,8 @@ def print_comparison(console: Console, found: Comparison) -> None:
     for reason in of_inertias:
         say(console, f"{reason}.")
     if len(of_inertias) < len(found.reasons):
-        say(console, f"{len(found.reasons) - len(of_inertias)} reasons about other quantities: on the page of --report")
+        others = counted(len(found.reasons) - len(of_inertias), "reason")
+        say(console, f"{others} about other quantities: on the page of --report")
     for note in found.notes:
         say(console, f"note: {note}")
     say(console, f"p: the probability that results of one value scatter this much or more. {SHARED}")
@@ -183,7 +185,7 @@ def _pooled(found: Comparison) -> Part:
         "is widened to fit. All quantities are tested together: one of them is said to differ by chance in "
         f"{100 * found.level:g} % of comparisons. {SHARED}"
     )
-    headings = ("quantity", "unit", "results", "pooled", "95 % interval", "chi²", "p", "results", "pooled value")
+    headings = ("quantity", "unit", "used", "pooled", "95 % interval", "chi²", "p", "agreement", "pooled value")
     return Table("pooled-table", "Pooled value of each quantity", headings, [("", rows)], [note], wide=True)
 
 

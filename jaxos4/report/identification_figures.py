@@ -197,7 +197,8 @@ def _response(
 
 def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     """Gain, phase and coherence of each axis with 95 % bands, faint where they are not clear; dashed: the model."""
-    top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
+    top = min(HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 2.0 for axis in found))
+    top = max(top, 2.0)  # [Hz]; an axis has two ends
     x, panels = Scale("log", (1.0, top), {at: f"{at}" for at in (1, 2, 5, 10, 20, 40)}, "frequency [Hz]"), []
     turns = Scale(ends=(-180, 180), ticks={at: f"{at}" for at in range(-180, 181, 90)})
     for name, axis in found._asdict().items():

@@ -105,7 +105,7 @@ class Scale(NamedTuple):
     def labelled(self, least: int = 3) -> tuple[dict[float, str], int]:
         """The ticks in sight with their labels, and the power of ten by which labels are multiplied.
 
-        `least`: there are as many, but at most 8.
+        `least`: there are as many on a linear axis.
         """
         low, high = sorted(self.ends or (0.0, 1.0))
         if self.ticks is not None:
@@ -119,13 +119,15 @@ class Scale(NamedTuple):
         ticks = round_numbers(low, high, least)
         power = math.floor(math.log10(max(map(abs, ticks), default=1.0) or 1.0))
         power = power if power < -3 or power > 4 else 0
-        return {at: f"{at / 10.0**power:.6g}" for at in ticks}, power
+        steps = max(map(abs, ticks), default=1.0) / (ticks[1] - ticks[0]) if len(ticks) > 1 else 1.0
+        digits = max(6, math.ceil(math.log10(max(steps, 1.0))) + 1)  # so that no two labels are alike
+        return {at: f"{at / 10.0**power:.{digits}g}" for at in ticks}, power
 
 
 def round_numbers(low: float, high: float, least: int) -> list[float]:
     """The numbers from `low` to `high` that are multiples of 1, 2 or 5 times a power of ten, `least` or more."""
     power = 10.0 ** math.ceil(math.log10(max(high - low, 1e-300)))
-    for step in (power, power / 2, power / 5, power / 10, power / 20):
+    for step in (power, power / 2, power / 5, power / 10, power / 20, power / 50):
         first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
         if last - first + 1 >= least:
             break

@@ -90,6 +90,9 @@ def write_report(dataset: xr.Dataset, directory: Path, *, pdf: bool = False) -> 
         from .matplotlib_figures import as_pdf  # a second
 
         files |= {folder / f"{figure.stem}.pdf": as_pdf(figure) for figure in drawn}
+    else:  # those of another run would not be of these figures
+        for figure in drawn:
+            (folder / f"{figure.stem}.pdf").unlink(missing_ok=True)
     for path, content in files.items():
         write_file(path, content)
     write_file(target, text)
@@ -195,6 +198,8 @@ def draw(scenario: ScenarioData, *, several: bool = False) -> dict[str, Figure]:
 def errors(data: xr.Dataset) -> Figure | None:
     """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
     data = positive_scales(data)
+    if not data.sizes["scale"]:
+        return None
     found, best, x, panels = metrics.estimator_error(data), metrics.bound_error(data), data["scale"].values, []
     seen_by, dots = bounds(data), {"marker": "" if len(x) > 1 else "s", "size": 4}
     for place, name in enumerate(names(data, "parameter")):
@@ -213,6 +218,8 @@ def errors(data: xr.Dataset) -> Figure | None:
 def efficiency(data: xr.Dataset) -> Figure | None:
     """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
     data = positive_scales(data)
+    if not data.sizes["scale"]:
+        return None
     found, scales, panels = metrics.efficiency(data), data["scale"].values, []
     values, low, high = (_by(found[each], "parameter", "estimator", "scale") for each in ("efficiency", "low", "high"))
     for place, name in enumerate(names(data, "parameter")):
@@ -238,6 +245,8 @@ def _if_known(stem: str, panels: list[Panel], values: xr.DataArray) -> Figure | 
 def coverage(data: xr.Dataset) -> Figure | None:
     """Share of intervals that contain the truth against the level that they claim, at each noise scale."""
     found, panels = metrics.mean_coverage(data), []
+    if not found["coverage"].notnull().any():
+        return None
     estimators, levels = names(data, "estimator"), data["level"].values
     share, low, high = (_by(found[each], "scale", "estimator", "level") for each in ("coverage", "low", "high"))
     lowest, places = min(float(np.nanmin(low)), float(levels.min())) - 0.04, np.arange(len(levels))
@@ -251,7 +260,7 @@ def coverage(data: xr.Dataset) -> Figure | None:
             marks += [spread(x_of, low[at], high[at], color=look.color, width=1.3, group=i)]
             marks += [Line(x_of, share[at], look.color, 0, marker=look.marker, size=6, group=i, name=estimators[i])]
         panels.append(Panel(f"noise scale {scale:g}", marks, x, y, 270, 240))
-    return _if_known("coverage", panels, found["coverage"])
+    return Figure("coverage", panels, columns=4)
 
 
 def overview(data: xr.Dataset) -> Figure | None:
