@@ -285,7 +285,7 @@ def test_a_range_of_a_log_is_ready_to_copy_and_a_finger_moves_it(opened):
     before = page.locator("#range").text_content()
     page.get_by_role("button", name="Zoom in").click()
     zoomed = page.locator("#range").text_content()
-    assert re.fullmatch(r"--from \d+\.\d\d --to \d+\.\d\d", zoomed)
+    assert re.fullmatch(r"--begin \d+\.\d\d --end \d+\.\d\d", zoomed)
     assert zoomed != before
     finger = """how => document.querySelector("#timeline .u-over").dispatchEvent(new PointerEvent(how[0],
         {bubbles: true, pointerType: "touch", pointerId: 1, clientX: how[1]}))"""

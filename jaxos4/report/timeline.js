@@ -48,7 +48,7 @@
     const begin = Math.min(Math.max(low, whole[0]), whole[1] - length);
     shown = [begin, begin + length];
     for (const plot of plots) plot.setScale("x", { min: shown[0], max: shown[1] });
-    if (range) range.textContent = `--from ${own(shown[0]).toFixed(2)} --to ${own(shown[1]).toFixed(2)}`;
+    if (range) range.textContent = `--begin ${own(shown[0]).toFixed(2)} --end ${own(shown[1]).toFixed(2)}`;
   }
 
   // A part was chosen in one panel. A panel tells what it shows later than it was told to.
