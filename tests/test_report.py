@@ -97,6 +97,13 @@ def test_figures_as_pdf_are_beside_those_as_svg_if_wanted(study, tmp_path, run):
     refused(run("report", str(tmp_path / "found.json"), "--pdf"), "--pdf:", "leave it out")
 
 
+def test_figures_of_an_earlier_run_do_not_stay_as_pdf(study, tmp_path):
+    write_report(study, tmp_path, pdf=True)
+    assert [*(tmp_path / "figures").glob("*.pdf")]
+    write_report(study, tmp_path)
+    assert not [*(tmp_path / "figures").glob("*.pdf")]
+
+
 def test_the_csv_has_every_number(study):
     rows = list(csv.DictReader(io.StringIO(error_csv(study))))
     data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
@@ -251,6 +258,14 @@ def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypa
     assert {"error-1", "error-2"} <= tables(text).keys()
     for said in ("The first 1 scenarios have figures; all 2 have tables.", "corrected model"):
         assert said in words(text)
+
+
+def test_a_study_without_noise_has_a_page_without_figures_of_noise(tmp_path):
+    """A logarithmic axis has no place for a scale of 0."""
+    study = synthetic_study(flights=4, scales=(1.0,), spoiled=False).assign_coords(scale=[0.0])
+    files = write_report(study, tmp_path)
+    assert not {"error.svg", "efficiency.svg"} & {file.name for file in files}
+    stands_alone((tmp_path / "report.html").read_text(encoding="utf-8"))
 
 
 def test_names_cannot_break_out_of_the_page(tmp_path):

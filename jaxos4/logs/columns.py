@@ -108,6 +108,8 @@ def column_map(given: ColumnsGiven) -> ColumnMap:
             table = read_toml(preset or given)
         except FileNotFoundError:
             refuse(name, f"neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}")
+        if not table:
+            refuse(name, "names no column; a column map has a table [columns]")
     return _checked(name, table, needed=name not in PRESETS)
 
 
