@@ -122,7 +122,8 @@ def train(
         if not np.less(history[-1], DIVERGED).all():
             loss = next(each for each in (current, value) if not each < DIVERGED)
             raise TrainingError(
-                f"training diverged within {first + count} steps (loss {loss:g}): narrow the bracket; in Python, lower `learning_rate`."
+                f"training diverged within {first + count} steps (loss {loss:g}): narrow the bracket; in Python, "
+                "lower `learning_rate`."
             )
         without_improvement += 1
         if current < lowest - IMPROVEMENT * abs(current):
