@@ -28,14 +28,13 @@ from . import task
 from .envelope import Envelope, Uses, hover_squares
 from .task import Coefficients, Designed, Flown, Series
 
-# The center of the bracket and vehicles drawn from it, which keep the limits; the criterion is the mean of the first.
-_VEHICLES, _AVERAGED = 200, 4
+# The vehicles that keep the limits: the last are corners of the bracket. The criterion is the mean of the first.
+_VEHICLES, _CORNERS, _AVERAGED = 200, 100, 4
 # The vehicles that keep the limits in a stage of the search: those that used the most after the stages before.
 _WATCHED = 40
 # The share of a limit that an input uses at most, because other vehicles from the bracket may need a little more.
 _TARGET = 0.95
-# In the end, vehicles are flown with this many steps in a sample.
-_FINER = 10
+_FINER = 10  # steps in a sample of the flights that must keep the limits
 # Tones of a lower frequency [Hz] have the amplitude of this one: angles would allow almost none.
 _SLOWEST_TONE = 0.3
 # Squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
@@ -56,14 +55,13 @@ class RotorSpeedTask(task.AbstractTask):
     bandwidth, so only amplitudes are searched: a phase follows from neighbouring tones.
 
     - `scale`: the half-widths of the bracket. `unexcited`: those of the model's default bracket.
-    - `tones`: each tone at each sample.
+    - `tones`: each tone at each sample. `weights`: 1 / sigma of each channel, in cascade order.
     - `amplitudes`: of each tone for a coefficient of 1, about as large as the envelope allows: for roll, pitch, yaw
       [rad/s^2] and vertical acceleration [m/s^2].
     - `hover`: squared rotor speeds that carry the weight [rad^2/s^2]. `action`: their change by a unit of each
       acceleration.
     - `fleet`: the parameters of the vehicles that must stay within the envelope, of which the first are averaged over.
       `watched`: of those that do so in the search.
-    - `weights`: 1 / sigma of each channel, in cascade order.
     """
 
     kind: ClassVar[str] = "rotor speeds"
@@ -328,7 +326,9 @@ def design_input(
     progress("envelope")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
-    vehicles = jnp.concatenate([np.asarray(bracket.center)[None], drawn(bracket, key, _VEHICLES - 1)])
+    above = drawn(bracket, jax.random.fold_in(key, 1), _CORNERS) > bracket.center
+    inside = drawn(bracket, key, _VEHICLES - _CORNERS - 1)
+    vehicles = jnp.concatenate([bracket.center[None], inside, jnp.where(above, bracket.upper, bracket.lower)])
     envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
     rotor_speeds = RotorSpeedTask(
         **_tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth),
