@@ -294,6 +294,8 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
         (result(), ("--sample-time", "0.001"), ("`sample_time` 0.001", "one sample every 0.01 s")),
         (result(), ("--horizon", "nan"), ("`horizon`", "positive")),
         (result(), ("--spacing", "-1"), ("`spacing`", "at least 0")),
+        (result(), ("--horizon", "1e-300"), ("log.csv", "`horizon`", "give at least that")),
+        (result(), ("--spacing", "1e-300"), ("log.csv", "`spacing`", "give at least that")),
         (result(), ("--seed", "-1"), ("--seed",)),
         (result(), ("--out", "out.xlsx"), ("out.xlsx", ".nc or .csv")),
         (result(), ("--figure", "out.gif"), ("out.gif", ".svg")),

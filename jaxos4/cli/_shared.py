@@ -183,7 +183,7 @@ InitialState = Literal["free", "known"]
 Simulator = Literal["mujoco", "rotorpy", "sdf", "drone-models", "urdf"]
 Features = Literal["score", "raw"]
 Architecture = Literal["mlp", "cmac"]
-Criterion = Literal["D", "A", "worst"]
+Criterion = Literal["A", "D", "worst"]
 
 
 def check_sizes(asked: dict[str, Any], *, most: float = 1e9) -> None:

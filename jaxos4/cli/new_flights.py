@@ -45,12 +45,14 @@ SensorsOption = Annotated[
 
 # The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
 _OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": None, "noise": 0.0, "method": "euler"}
-_OPEN |= {"model": "published", "excitation": "multisine", "channels": "all", "initial_state": "free"}
+_OPEN |= {"model": "published", "excitation": "multisine", "channels": "all", "initial_state": "free", "criterion": "A"}
 _PRESET = "os4"
 _CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
-_CLOSED |= {"sensors": None, "references": None}
+_CLOSED |= {"sensors": None, "references": None, "criterion": "D"}
 _CLOSED |= {"load_sag": None, "gyro_cutoff": None, "gyro_delay": None, "log_every": None}
 _RANGES = {"gust": (0, 1e6), "lag": (0, 1), "delay": (0, 1), "noise": (0, 1e6), "accuracy": (1e-6, 1e6)}
+_RANGES |= {"angle": (1e-3, 10), "rate": (1e-3, 1e3), "velocity": (1e-3, 1e3), "distance": (1e-3, 1e5)}
+_RANGES |= {"slowest": (1e-3, 1e5), "fastest": (1e-3, 1e5), "slew": (1e-3, 1e8), "bandwidth": (1e-3, 1e3)}
 _RANGES |= {"load_sag": (0, 0.5), "gyro_cutoff": (0.1, 1e6), "gyro_delay": (0, 1), "log_every": (1, 100)}
 
 
@@ -173,9 +175,12 @@ def design(
         options.InitialState | None, Option(help="free: estimated too; known: as the first sample. Default: free.")
     ] = None,
     criterion: Annotated[
-        options.Criterion,
-        Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound."),
-    ] = "D",
+        options.Criterion | None,
+        Option(
+            help="A: the mean squared bound; D: the volume of the confidence ellipsoid; worst: the largest bound. "
+            "Default: A; with --closed-loop: D."
+        ),
+    ] = None,
     accuracy: AccuracyOption = None,
     gust: GustOption = None,
     lag: LagOption = None,
@@ -210,7 +215,7 @@ def design(
     print_design(Console(highlight=False), found, asked["accuracy"] / 100)
     samples = f"{found.designed.inputs.shape[0]} samples of {asked['dt']:g} s"
     kind, seconds = found.task.kind if closed_loop else f"{asked['model']} model", time.perf_counter() - begin
-    typer.echo(f"{out}: {samples}, {kind}, {seconds:.0f} s")
+    typer.echo(f"{out}: {samples}, {kind}, criterion {found.task.criterion}, {seconds:.0f} s")
 
 
 def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "jaxos4.Design":

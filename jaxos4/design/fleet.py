@@ -1,7 +1,7 @@
 """Vehicles in closed loop that fly references through gusts, and what filter error can learn from their flights."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, as_float
+from .._xla import quick_jit
 from ..airframe import INERTIAS, INVERSES, MOTIONS
 from ..bracket import Bracket
 from ..closed_loop import ClosedLoop, References, fly_closed_loop
@@ -27,6 +28,14 @@ from .task import Series
 
 LANES = 64
 """The number of flights in a batch. All batches share one program."""
+# This many vehicles fly in still air, and show velocity and distance: gusts carry the others away.
+_STILL = 16
+# Disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2].
+_LEAST_GUST = 1e-3
+# Rotors turn at least with this share of the speed in hover, and at most with this multiple if no maximum is known.
+_SLOWEST, _FASTEST = 0.1, 2.0
+# Gusts alone use at most this share of a limit that is not given.
+_GUST_SHARE = 0.8
 
 
 def model_of(loop: ClosedLoop) -> FlightModel:
@@ -55,18 +64,16 @@ def batch_of(loop: ClosedLoop, in_gusts: np.ndarray | None = None, **values: Flo
     return copies
 
 
-@eqx.filter_jit
-def fly_batch(
-    loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt: Scalar, key: Key, substeps: int = 8
-) -> Flight:
+@quick_jit
+def fly_batch(loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt: Scalar, key: Key) -> Flight:
     """Fly a batch. Velocity and position are integrals of measured attitude and specific force.
 
-    `substeps`: of the physics in a sample. Sensors measure along the body's axes: no design depends on this.
+    Sensors measure along the body's axes: no design depends on this.
     """
 
     def one(loop: ClosedLoop, references: References, key: Key) -> Flight:
         loop = eqx.tree_at(lambda each: each.airframe.sensor_rotation, loop, jnp.zeros(3))
-        flight = fly_closed_loop(loop, references, dt=dt, key=key, substeps=substeps)
+        flight = fly_closed_loop(loop, references, dt=dt, key=key)
         vertical = flight.channels[:, -1]
         nothing = jnp.zeros_like(vertical)
         force = jnp.stack(
@@ -85,21 +92,7 @@ class Fleet(eqx.Module):
     - `loop`: the vehicle of the airframe. `loops`: the drawn ones, as a batch, all with its controller.
     - `model`, `parameters`: of the filters, which know the true parameters, gusts and noise of `loop`.
     - `prior`: the information of the bracket, of which the half-widths are standard deviations.
-
-    The same for all fleets:
-
-    - `still`: this many vehicles fly in still air, and show velocity and distance: gusts carry the others away.
-    - `least_gust`: disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2].
-    - `slowest`: rotors turn at least with this share of the speed in hover. `fastest`: and at most with this multiple,
-      if no maximum is known.
-    - `gust_share`: gusts alone use at most this share of a limit that is not given.
     """
-
-    still: ClassVar[int] = 16
-    least_gust: ClassVar[float] = 1e-3
-    slowest: ClassVar[float] = 0.1
-    fastest: ClassVar[float] = 2.0
-    gust_share: ClassVar[float] = 0.8
 
     loop: ClosedLoop
     loops: ClosedLoop
@@ -115,7 +108,7 @@ class Fleet(eqx.Module):
         inertia = 1 / np.asarray(drawn(bracket, key, LANES))[:, INVERSES]
         if not (np.isfinite(inertia).all() and (inertia > 0).all()):
             raise InputError("`bracket`: alpha3, alpha6 and alpha8 must be positive.")
-        loops = batch_of(loop, np.arange(LANES) >= cls.still, inertia=inertia, force_noise=np.zeros(LANES))
+        loops = batch_of(loop, np.arange(LANES) >= _STILL, inertia=inertia, force_noise=np.zeros(LANES))
         model, prior = model_of(loop), jnp.asarray(1 / np.square(np.asarray(bracket.half_width)))
         delay = loop.rotor_delay if loop.logged == "commands" else 0.0
         known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": delay}
@@ -152,7 +145,7 @@ class Fleet(eqx.Module):
         unit = np.append(np.asarray(self.model.airframe.inertia), np.ones(count - len(INERTIAS)))
         return relative[:count] * unit
 
-    @eqx.filter_jit
+    @quick_jit
     def informations(
         self, flights: Flight
     ) -> tuple[Float[Array, "flights n n"], Float[Array, "flights channels parameters parameters"]]:
@@ -161,7 +154,7 @@ class Fleet(eqx.Module):
         **Returns:** that about parameters and noise, with its weak prior; that of each channel about the parameters.
         """
         loop, count = self.loop, self.parameters.shape[0]
-        strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), self.least_gust)
+        strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), _LEAST_GUST)
 
         def one(omega: Array, states: Array, force: Array | None) -> tuple[Array, Array]:
             flight = Flight(flights.time[0], omega, states, specific_force=force, commanded=flights.commanded)
@@ -183,14 +176,14 @@ class Fleet(eqx.Module):
         flights = fly_batch(self.loops, every, as_float(self.dt), self.key)
         states = np.array(flights.states)
         if np.isfinite(states).all():  # no vehicle turned over
-            states[self.still :, :, [*POSITION, *VELOCITY]] = 0
+            states[_STILL:, :, [*POSITION, *VELOCITY]] = 0
         return np.asarray(flights.omega), states, self.dt
 
     def envelope(self, references: Series, limits: Mapping[str, float]) -> Envelope:
         """The limits that these references need, with rotors by the airframe and some replaced. Raises `InputError`."""
         airframe, hover = self.loop.airframe, float(self.loop.airframe.hover_speed)
-        slowest = self.slowest * hover
-        fastest = float(airframe.max_rotor_speed) if airframe.has_full_scale else self.fastest * hover
+        slowest = _SLOWEST * hover
+        fastest = float(airframe.max_rotor_speed) if airframe.has_full_scale else _FASTEST * hover
         rotors = {"slowest": slowest, "fastest": fastest, "slew": (fastest - slowest) / self.dt}
         unknown = Envelope(**rotors, **dict.fromkeys(("angle", "rate", "velocity", "distance"), 1.0))
         hover_squares(airframe, unknown.limited(limits))
@@ -201,7 +194,7 @@ class Fleet(eqx.Module):
         needed, still = (Envelope.of(*flown) for flown in flights)
         own = {}
         for name in ("angle", "rate"):  # roll and pitch may do the same
-            alone = np.asarray(getattr(still, name)) / self.gust_share
+            alone = np.asarray(getattr(still, name)) / _GUST_SHARE
             roll, pitch, yaw = np.maximum(np.asarray(getattr(needed, name)), alone)
             own[name] = np.array([max(roll, pitch), max(roll, pitch), yaw])
         return needed.limited(rotors | own | dict(limits))

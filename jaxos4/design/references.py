@@ -19,12 +19,17 @@ from ..flight import ANGLES, RATES
 from . import task
 from .envelope import Envelope, Uses
 from .fleet import LANES, Fleet, batch_of, fly_batch, model_of
-from .task import Coefficients, Designed, Flown, Search
+from .task import Coefficients, Designed, Flown
 
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
 _SMALL = np.array([0.02, 0.02, 0.02, 0.2])
 # Times in periods at which the search looks, about eight for each cycle of the fastest tone.
 _POINTS = np.arange(200) / 200
+# References that need too much are reduced to about this share of a limit, with at most this many reductions, each by
+# a factor that is at least the last.
+_TARGET, _REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
+# A parameter counts as excited if its bound is below this share of the bracket's standard deviation.
+_LITTLE = 0.9
 
 
 class Tones(NamedTuple):
@@ -98,21 +103,12 @@ class ReferenceTask(task.AbstractTask):
     - `signals`: the angles and rates of an axis by a unit of the coefficients of its reference, cosines first, as a
       share of the part of the limit that gusts leave; by the name of the limit.
     - `largest`: the largest value of each reference. `basis`: the tones at the points of a period.
-
-    The same for all tasks:
-
-    - `target`: references that need too much are reduced to about this share of a limit, with at most this many
-      `reductions`, each by a factor that is at least `least_step`.
-    - `little`: a parameter counts as excited if its bound is below this share of the bracket's standard deviation.
     """
 
     kind: ClassVar[str] = "references"
     vehicles: ClassVar[int] = LANES
-    target: ClassVar[float] = 0.995
-    reductions: ClassVar[int] = 8
-    least_step: ClassVar[float] = 0.7
-    little: ClassVar[float] = 0.9
-    search: ClassVar[Search] = Search(starts=8, first=0.85, steps=80)
+    starts: ClassVar[int] = 8
+    first: ClassVar[float] = 0.85
 
     envelope: Envelope
     scale: Float[Numeric, "3"]
@@ -123,13 +119,21 @@ class ReferenceTask(task.AbstractTask):
     signals: dict[str, Float[Numeric, "axes points coefficients"]]
     largest: Float[Numeric, "4"]
     basis: Float[Array, "points coefficients"]
-    names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
     tones: Tones = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_references)
+
+    @property
+    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
+        """Ix, Iy and Iz, and the model's other parameters."""
+        return self.fleet.inertias_first(INERTIAS, self.fleet.model.parameter_names)
+
+    @property
+    def units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
+        """Of `names`."""
+        return self.fleet.inertias_first(("kg m^2",) * len(INERTIAS), self.fleet.model.parameter_units)
 
     @property
     def size(self) -> int:
@@ -153,7 +157,7 @@ class ReferenceTask(task.AbstractTask):
         basis = _parts(self.tones.turns(np.arange(self.samples) / self.tones.period))
         inputs = with_largest(basis @ coefficients.reshape(4, -1).T, np.asarray(self.largest))
         uses, factor, still = self.fleet.uses(inputs, self.envelope), 1.0, None
-        for _ in range(self.reductions):
+        for _ in range(_REDUCTIONS):
             if max(uses.values()) <= 1:
                 break
             still = still or self.fleet.uses(0 * inputs, self.envelope)
@@ -162,8 +166,8 @@ class ReferenceTask(task.AbstractTask):
                 if still[name] >= 1:
                     raise _too_gusty(name)
                 if share > 1:  # the share beyond that of gusts grows about linearly with the references
-                    steps.append((self.target - still[name]) / (share - still[name]))
-            factor *= max(min(steps), self.least_step)
+                    steps.append((_TARGET - still[name]) / (share - still[name]))
+            factor *= max(min(steps), _LEAST_STEP)
             uses = self.fleet.uses(factor * inputs, self.envelope)
         if max(uses.values()) > 1:
             raise InputError("no references keep the limits; give weaker gusts, or wider limits.")
@@ -228,10 +232,8 @@ def design_references(
     progress("flying tones")
     references = ReferenceTask(
         envelope=envelope,
-        names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
-        units=fleet.inertias_first(("kg m^2",) * 3, fleet.model.parameter_units),
         scale=np.asarray(loop.airframe.inertia),
-        unexcited=ReferenceTask.little * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
+        unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
         largest=largest,
         basis=as_float(_parts(tones.turns(_POINTS))),
@@ -240,7 +242,7 @@ def design_references(
         criterion=criterion,
         **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )
-    return task.solve(references, references.search, compare=compare, key=key, progress=progress)
+    return task.design(references, compare=compare, key=key, progress=progress)
 
 
 def _too_gusty(name: str) -> InputError:

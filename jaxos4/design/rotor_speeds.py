@@ -1,6 +1,6 @@
 """The design of rotor speeds for an OS4 without feedback: a multisine that all vehicles of a bracket can fly."""
 
-import functools
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -13,6 +13,7 @@ import scipy.optimize
 from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Parameters, RotorSpeeds, Scalar, as_float
+from .._xla import quick_jit
 from ..airframe import Airframe
 from ..bracket import Bracket
 from ..errors import InputError, named
@@ -20,15 +21,31 @@ from ..excitation import EXCITATIONS, multisine
 from ..flight import Inputs
 from ..linalg import covariance_of_shared
 from ..models.abstract import AbstractModel
-from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State, unstack
+from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State, stack, unstack
 from ..noise import SENSOR_SIGMA
 from ..simulation import euler_step, simulate
 from . import task
 from .envelope import Envelope, Uses, hover_squares
-from .task import Coefficients, Designed, Flown, Search, Series
+from .task import Coefficients, Designed, Flown, Series
 
-# At the end, vehicles are flown with this many steps in a sample.
-_FINER = 10
+# The vehicles that keep the limits: the last are corners of the bracket. The criterion is the mean of the first.
+_VEHICLES, _CORNERS, _AVERAGED = 200, 100, 4
+# The vehicles that keep the limits in a stage of the search: those that used the most after the stages before.
+_WATCHED = 40
+# The share of a limit that an input uses at most, because other vehicles from the bracket may need a little more.
+_TARGET = 0.95
+_FINER = 10  # steps in a sample of the flights that must keep the limits
+# Tones of a lower frequency [Hz] have the amplitude of this one: angles would allow almost none.
+_SLOWEST_TONE = 0.3
+# Squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
+_LEAST = 1e-6
+# A standard input is multiplied by at most about this; one that needs a larger share of a limit than the last counts
+# as if it needed this; the factor is found to this share of it.
+_AMPLIFIED, _FAR, _PRECISION = 100.0, 10.0, 1e-3
+# An amplitude is reduced in steps of this factor until the limits are kept, at most to this.
+_REDUCED, _SMALLEST = 0.9, 1e-3
+# A margin is widened at most this many times, until the limits are kept between samples too.
+_CORRECTIONS = 5
 
 
 class RotorSpeedTask(task.AbstractTask):
@@ -38,40 +55,19 @@ class RotorSpeedTask(task.AbstractTask):
     bandwidth, so only amplitudes are searched: a phase follows from neighbouring tones.
 
     - `scale`: the half-widths of the bracket. `unexcited`: those of the model's default bracket.
-    - `tones`: each tone at each sample.
+    - `tones`: each tone at each sample. `weights`: 1 / sigma of each channel, in cascade order.
     - `amplitudes`: of each tone for a coefficient of 1, about as large as the envelope allows: for roll, pitch, yaw
       [rad/s^2] and vertical acceleration [m/s^2].
     - `hover`: squared rotor speeds that carry the weight [rad^2/s^2]. `action`: their change by a unit of each
       acceleration.
-    - `fleet`: the parameters of the vehicles that must stay within the envelope. `draws`: of those over which the
-      criterion is averaged.
-    - `weights`: 1 / sigma of each channel, in cascade order.
-    - `start_is_known`: whether the flight starts exactly at rest.
-
-    The same for all tasks:
-
-    - `limited`: the number of vehicles that keep the limits during the search; at the end all of them do.
-    - `averaged`: the number of vehicles over which the criterion is averaged.
-    - `target`: the share of a limit that an input uses at most, because other vehicles from the bracket may need a
-      little more. It is met to the relative `precision` of the amplitude, with at most this many `corrections`.
-    - `amplified`: an input is multiplied by at most about this. `far`: the largest share of a limit that counts.
-    - `slowest_tone`: tones of a lower frequency [Hz] have the amplitude of this one: angles would allow almost none.
-    - `least`: squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
-    - `search`: begins with about half of the envelope, because a coefficient of 1 alone uses all of it.
+    - `fleet`: the parameters of the vehicles that must stay within the envelope, of which the first are averaged over.
+      `watched`: of those that do so in the search.
     """
 
     kind: ClassVar[str] = "rotor speeds"
-    vehicles: ClassVar[int] = 200
-    limited: ClassVar[int] = 64
-    averaged: ClassVar[int] = 4
-    target: ClassVar[float] = 0.95
-    precision: ClassVar[float] = 1e-3
-    corrections: ClassVar[int] = 5
-    amplified: ClassVar[float] = 100.0
-    far: ClassVar[float] = 10.0
-    slowest_tone: ClassVar[float] = 0.3
-    least: ClassVar[float] = 1e-6
-    search: ClassVar[Search] = Search(starts=4, first=0.17, steps=40)
+    vehicles: ClassVar[int] = _VEHICLES
+    starts: ClassVar[int] = 2
+    first: ClassVar[float] = 0.1  # a coefficient of 1 alone uses the whole envelope
 
     envelope: Envelope
     scale: Float[Numeric, " parameters"]
@@ -82,15 +78,23 @@ class RotorSpeedTask(task.AbstractTask):
     hover: Float[Array, "4"] = eqx.field(converter=as_float)
     action: Float[Array, "4 4"] = eqx.field(converter=as_float)
     fleet: Float[Array, "vehicles parameters"]
-    draws: Float[Array, "draws parameters"]
+    watched: Float[Array, "watched parameters"]
     weights: Float[Array, " sensors"]
     dt: Scalar
-    names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
     start_is_known: bool = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_input)
+
+    @property
+    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
+        """Of the model's parameters."""
+        return self.model.parameter_names
+
+    @property
+    def units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
+        """Of the model's parameters."""
+        return self.model.parameter_units
 
     @property
     def size(self) -> int:
@@ -100,7 +104,7 @@ class RotorSpeedTask(task.AbstractTask):
     def _omega(self, coefficients: Coefficients) -> RotorSpeeds:
         """The rotor speeds [rad/s]."""
         acceleration = self.tones @ (self.amplitudes * coefficients.reshape(self.amplitudes.shape)).T
-        return jnp.sqrt(jnp.maximum(self.hover + acceleration @ self.action.T, self.least))
+        return jnp.sqrt(jnp.maximum(self.hover + acceleration @ self.action.T, _LEAST))
 
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
@@ -111,45 +115,61 @@ class RotorSpeedTask(task.AbstractTask):
             information = jnp.einsum("tsu,tsv->uv", slopes, slopes)
             return task.criterion_of(information, jnp.asarray(self.scale), self.criterion)
 
-        return jax.vmap(one)(self.draws).mean()
+        return jax.vmap(one)(self.fleet[:_AVERAGED]).mean()
 
     def uses(self, coefficients: Coefficients) -> Uses:
         """See `AbstractTask`."""
         omega = self._omega(coefficients)
-        fly = jax.vmap(lambda a: simulate(self.model, a, omega, dt=self.dt).states)
-        return self.envelope.uses(omega, fly(self.fleet[: self.limited]), self.dt)
+        states = jax.vmap(lambda parameters: self._fly(omega, parameters))(self.watched)
+        return {name: use / _TARGET for name, use in self.envelope.uses(omega, states, self.dt).items()}
+
+    def watching(self, coefficients: Coefficients) -> "RotorSpeedTask":
+        """See `AbstractTask`. Some make room for those that now use the most of a limit, between samples too."""
+        omega = self._omega(coefficients)
+        states = np.asarray(fly_finely(self.model, self.fleet, omega, self.dt))
+        uses = jax.tree.map(np.asarray, self.envelope).uses(np.asarray(omega), states, float(self.dt))
+        largest = [np.nan_to_num(np.abs(use).max(axis=1), nan=np.inf) for use in uses.values() if use.ndim == 3]
+        most = self.fleet[np.concatenate(largest, axis=1).argmax(axis=0)]
+        return dataclasses.replace(self, watched=jnp.concatenate([most, self.watched[: -len(most)]]))
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`."""
-        return self._within_limits(np.asarray(self._omega(as_float(coefficients))))
+        omega = np.asarray(self._omega(as_float(coefficients)))
+        found = self._amplified(omega, 1.0, _FINER)
+        return found if max(found[1].values()) <= 1 else self._within_limits(omega)
+
+    def _amplified(self, inputs: Series, factor: float, finer: int = 1) -> Flown:
+        """The input with all accelerations multiplied, and the largest share of each limit of all vehicles."""
+        hover = np.asarray(self.hover)
+        omega = np.sqrt(np.maximum(hover + factor * (np.square(inputs) - hover), 0.0))
+        states = fly_finely(self.model, self.fleet, as_float(omega), self.dt, finer)
+        return omega, dict(sorted(self.envelope.shares(omega, states, float(self.dt)).items()))
 
     def _within_limits(self, inputs: Series) -> Flown:
-        """The input with the largest amplitude that all vehicles can fly, also with finer steps than samples."""
-        hover = np.asarray(self.hover)
+        """The input with the largest amplitude that all vehicles can fly, also with finer steps than samples.
 
-        def flown(factor: float, finer: int = 1) -> Flown:
-            """The input with all accelerations multiplied."""
-            omega = np.sqrt(np.maximum(hover + factor * (np.square(inputs) - hover), 0.0))
-            states = fly_finely(self.model, self.fleet, as_float(omega), self.dt, finer)
-            return omega, dict(sorted(self.envelope.shares(omega, states, float(self.dt)).items()))
+        A smaller amplitude may need more of a limit, so the one next to that of `inputs` is taken.
+        """
 
         def excess(factor: float, target: float) -> float:
-            return min(max(flown(factor)[1].values()), self.far) - target
+            return min(max(self._amplified(inputs, factor)[1].values()), _FAR) - target
 
-        target = self.target
-        for _ in range(self.corrections):
-            high = 1.0
-            while high < self.amplified and excess(high, target) < 0:
-                high *= 2
-            if excess(0.0, target) >= 0:
-                high = 0.0
-            elif excess(high, target) > 0:
-                high = float(scipy.optimize.brentq(excess, 0.0, high, (target,), self.precision * high))  # type: ignore[arg-type]
-            found = flown(high, _FINER)
+        target = _TARGET
+        for _ in range(_CORRECTIONS):
+            low, high = 1.0, 1.0
+            while high < _AMPLIFIED and excess(high, target) < 0:
+                low, high = high, 2 * high
+            while low > _SMALLEST and excess(low, target) >= 0:
+                low, high = _REDUCED * low, low
+            if low <= _SMALLEST:
+                break
+            if excess(high, target) > 0:
+                low = float(scipy.optimize.brentq(excess, low, high, (target,), _PRECISION * high))  # type: ignore[arg-type]
+            found = self._amplified(inputs, low, _FINER)
             if max(found[1].values()) <= 1:
                 return found
-            target *= self.target / max(found[1].values())
-        return flown(0.0, _FINER)
+            target *= _TARGET / max(found[1].values())
+        return self._amplified(inputs, 0.0, _FINER)
 
     def standard(self) -> dict[str, Flown]:
         """See `AbstractTask`. Each has the largest amplitude that all vehicles can fly."""
@@ -170,7 +190,7 @@ class RotorSpeedTask(task.AbstractTask):
             judged[name] = Designed(omega, dt, history[-1], uses, dt * (omega.shape[0] - 1), history)
         return judged
 
-    @eqx.filter_jit
+    @quick_jit
     def _history(self, omega: RotorSpeeds) -> Float[Array, "samples parameters"]:
         """The bounds after each sample of a flight of the airframe's vehicle."""
         parameters = self.model.alpha
@@ -181,6 +201,17 @@ class RotorSpeedTask(task.AbstractTask):
             return total, jnp.sqrt(jnp.diagonal(covariance_of_shared(total[None], parameters.shape[0])))
 
         return jax.lax.scan(add, jnp.zeros((slopes.shape[-1],) * 2, dtype=float), slopes)[1]
+
+    def _fly(self, omega: RotorSpeeds, parameters: Parameters) -> Float[Array, "samples 12"]:
+        """The states of a flight from rest, without an end at a failure, which would have no slopes."""
+
+        def step(state: State, forcing: Forcing) -> tuple[State, State]:
+            following = euler_step(self.model, state, forcing, tuple(parameters), self.dt)
+            return following, following
+
+        forcing = jax.tree.map(lambda leaf: leaf[:-1], self.model.forcing(Inputs(omega, self.dt), parameters))
+        states = stack(jax.lax.scan(step, unstack(jnp.zeros(12, dtype=float)), forcing)[1])
+        return jnp.concatenate([jnp.zeros((1, 12), dtype=float), states[:, CASCADE_ORDER.argsort()]])
 
     def _sense(self, omega: RotorSpeeds, parameters: Parameters) -> Float[Array, "samples sensors unknowns"]:
         """The derivatives of the weighted outputs of a flight from rest, in the parameters and an unknown start."""
@@ -204,14 +235,14 @@ class RotorSpeedTask(task.AbstractTask):
         return self.weights[:, None] * rows
 
 
-@functools.partial(jax.jit, static_argnums=2)
+@quick_jit
 def drawn(bracket: Bracket, key: Key, count: int) -> Float[Array, "count parameters"]:
     """Vehicles drawn uniformly from the bracket."""
     lower, upper = bracket.lower, bracket.upper
     return lower + (upper - lower) * jax.random.uniform(key, (count, lower.shape[0]), dtype=float)
 
 
-@eqx.filter_jit
+@quick_jit
 def fly_finely(
     model: AbstractModel,
     vehicles: Float[Array, "vehicles parameters"],
@@ -224,7 +255,7 @@ def fly_finely(
     return jax.vmap(lambda a: simulate(model, a, held, dt=dt / finer).states)(vehicles)
 
 
-def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, bandwidth: float) -> dict[str, np.ndarray]:
+def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, bandwidth: float) -> dict[str, Any]:
     """The fields `tones`, `amplitudes`, `hover` and `action` of `RotorSpeedTask`, with tones up to `bandwidth` [Hz]."""
     duration = (samples - 1) * dt
     frequency = np.arange(math.floor(2 * duration * bandwidth + 1e-9) + 1) / (2 * duration)
@@ -232,7 +263,7 @@ def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, band
     action = np.linalg.solve(np.asarray(airframe.mixer), np.diag(np.append(airframe.inertia, airframe.mass)))
     speed, limits = np.sqrt(hover), np.asarray([envelope.slowest, envelope.fastest])
     change = (np.abs(action) / (2 * speed)[:, None]).max(axis=0)[:, None]  # of rotor speed, by one unit
-    angular = 2 * math.pi * np.maximum(frequency, RotorSpeedTask.slowest_tone)
+    angular = 2 * math.pi * np.maximum(frequency, _SLOWEST_TONE)
     uses = (
         change / np.abs(speed[:, None] - limits).min(),
         change * angular / np.asarray(envelope.slew),
@@ -242,19 +273,6 @@ def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, band
     tones = np.cos(2 * math.pi * frequency * dt * np.arange(samples)[:, None])
     amplitudes = 1 / np.linalg.norm(np.broadcast_arrays(*uses), axis=0)
     return {"tones": tones, "amplitudes": amplitudes, "hover": hover, "action": action}
-
-
-def _of_bracket(model: AbstractModel, bracket: Bracket, key: Key) -> dict[str, Any]:
-    """The fields of `RotorSpeedTask` that model and bracket decide."""
-    others = drawn(bracket, jax.random.fold_in(key, 1), RotorSpeedTask.averaged - 1)
-    return {
-        "model": model,
-        "names": model.parameter_names,
-        "units": model.parameter_units,
-        "scale": np.asarray(bracket.half_width),
-        "unexcited": np.asarray(model.half_width),
-        "draws": jnp.concatenate([np.asarray(bracket.center)[None], others]),
-    }
 
 
 def _standard_envelope(model: AbstractModel, vehicles: Array, duration: float, dt: float) -> Envelope:
@@ -275,7 +293,7 @@ def design_input(
     dt: float = 0.01,
     channels: str = "all",
     start_is_known: bool = False,
-    criterion: str = "D",
+    criterion: str = "A",
     bandwidth: float = 4.0,
     compare: bool = False,
     key: Key | int,
@@ -283,17 +301,17 @@ def design_input(
 ) -> task.Design:
     """Design the rotor speeds that identify a vehicle's parameters most accurately within an envelope.
 
-    The input is a multisine. Its amplitudes are searched from random starts, by the gradient of the simulator, for the
-    mean criterion over vehicles from the bracket. At the end 200 vehicles fly the input with a tenth of the step, and
-    its amplitude is reduced until all of them stay within the envelope.
+    The input is a multisine. Its amplitudes are searched from two random starts, by the gradient of the simulator, for
+    the mean criterion over vehicles from the bracket. After each stage of the search, and at the end, 200 vehicles fly
+    the input with a tenth of the step. If one of them leaves the envelope at the end, the amplitude is reduced.
 
     - `limits`: some limits of an `Envelope`, by name. The others are those that the standard multisine needs, for all
       vehicles of the `bracket`, which is by default the model's.
     - `duration`, `dt`: length and sample time [s]. `bandwidth`: the highest frequency [Hz].
     - `channels`: what will be measured, with the noise of the standard sensors: `"rates"`, `"attitude"` or `"all"`.
     - `start_is_known`: whether the flight starts exactly at rest. If not, the initial state will be estimated too.
-    - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
-      bound. Bounds are shares of the bracket's half-widths.
+    - `criterion`: `"A"`: the mean squared bound; `"D"`: the volume of the confidence ellipsoid, in which bounds may be
+      larger if the parameters correlate; `"worst"`: the largest bound. Bounds are shares of the bracket's half-widths.
     - `compare`: whether to judge the standard inputs in the envelope too.
     - `key`: for the draws and the starts, or a seed. `progress`: called with the name of each stage.
 
@@ -308,19 +326,24 @@ def design_input(
     progress("envelope")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
-    vehicles = drawn(bracket, key, RotorSpeedTask.vehicles)
+    above = drawn(bracket, jax.random.fold_in(key, 1), _CORNERS) > bracket.center
+    inside = drawn(bracket, key, _VEHICLES - _CORNERS - 1)
+    vehicles = jnp.concatenate([bracket.center[None], inside, jnp.where(above, bracket.upper, bracket.lower)])
     envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
     rotor_speeds = RotorSpeedTask(
         **_tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth),
-        **_of_bracket(model, bracket, key),
+        model=model,
+        scale=np.asarray(bracket.half_width),
+        unexcited=np.asarray(model.half_width),
         envelope=envelope,
         fleet=vehicles,
+        watched=vehicles[:_WATCHED],
         weights=as_float(1 / SENSOR_SIGMA[CASCADE_ORDER[: CHANNELS[channels]]]),
         dt=as_float(dt),
         start_is_known=start_is_known,
         criterion=criterion,
     )
-    found = task.solve(rotor_speeds, rotor_speeds.search, compare=compare, key=key, progress=progress)
+    found = task.design(rotor_speeds, compare=compare, key=key, progress=progress)
     if not (found.designed.bounds < rotor_speeds.unexcited).any():
         raise InputError("the limits are too narrow: no input within them excites a parameter; widen them.")
     return found

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float
 from .._files import write_atomically
+from .._xla import quick_jit
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..linalg import gram, joint_factor
@@ -35,22 +36,16 @@ Series = Float[np.ndarray, "samples 4"]
 Flown = tuple[Series, dict[str, float]]
 Progress = Callable[[str], None]
 
-CRITERIA = ("D", "A", "worst")
+CRITERIA = ("A", "D", "worst")
+# The weight of the penalty in each stage of a search. The last ones let other vehicles keep the limits too.
+_PENALTIES = (10.0, 50.0, 250.0, 1250.0, 6000.0, 6000.0, 6000.0, 6000.0)
+# The usual size of a coefficient: the moves of the first stage.
+_UNIT = 0.1
+# A stage ends after this many steps, or if a step changes neither the cost nor a coefficient by this share.
+_STEPS, _TOLERANCE = 100, 1e-6
 _REFERENCE_NAMES = ("roll_reference", "pitch_reference", "yaw_reference", "az_reference")
 # The largest error of a sample time in a file, as a share of it.
 _PRECISION = 1e-3
-
-
-class Search(NamedTuple):
-    """Settings of the search for the coefficients of a task.
-
-    - `starts`: the number of searches. `first`: the length of their first coefficients, which are random.
-    - `steps`: the most steps of BFGS in a stage.
-    """
-
-    starts: int
-    first: float
-    steps: int
 
 
 class Designed(NamedTuple):
@@ -93,18 +88,24 @@ class AbstractTask(eqx.Module):
     """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
+    - `starts`: the number of searches, of which the best goes on after two stages. `first`: the length of their first
+      coefficients, which are random.
     - `names`, `units`: of each parameter, the targets first.
     - `scale`: for each target, a size of which accuracies are shares. `unexcited`: a parameter whose bound is not below
       this counts as not excited.
+    - `criterion`: of the accuracy of all targets, see `design_input`.
     """
 
     kind: ClassVar[str]
     vehicles: ClassVar[int]
+    starts: ClassVar[int]
+    first: ClassVar[float]
     envelope: eqx.AbstractVar[Envelope]
     names: eqx.AbstractVar[tuple[str, ...]]
     units: eqx.AbstractVar[tuple[str, ...]]
     scale: eqx.AbstractVar[Float[Numeric, " targets"]]
     unexcited: eqx.AbstractVar[Float[Numeric, " parameters"]]
+    criterion: eqx.AbstractVar[str]
 
     @property
     @abc.abstractmethod
@@ -118,6 +119,11 @@ class AbstractTask(eqx.Module):
     @abc.abstractmethod
     def uses(self, coefficients: Coefficients) -> Uses:
         """The shares of the limits at each sample, which should be at most 1; samples are the last axis but one."""
+
+    def watching(self, coefficients: Coefficients) -> "AbstractTask":
+        """The task of the next stage, which may watch the limits of other vehicles. By default the same."""
+        del coefficients
+        return self
 
     @abc.abstractmethod
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
@@ -157,47 +163,55 @@ class Design(NamedTuple):
         return mean, int(excited.sum())
 
 
-PENALTIES = 10.0, 50.0, 250.0, 1250.0, 6000.0  # of each stage
-TOLERANCE = 1e-6  # of BFGS, in its unknowns and in its cost
-# The usual size of a coefficient. BFGS starts with a unit matrix as second derivative, so its unknowns are coefficients
-# over this size.
-UNIT = 0.1
-
-
-def solve(task: AbstractTask, search: Search, *, compare: bool, key: Key, progress: Progress) -> Design:
+def design(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -> Design:
     """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`."""
     progress("compiling the search")
-    directions = jax.random.normal(jax.random.fold_in(key, 2), (search.starts, task.size), dtype=float)
-    starts, costs = search.first / math.sqrt(task.size) * directions, np.zeros(search.starts)
-    for number, penalty in enumerate(PENALTIES, start=1):
-        starts, costs = jax.block_until_ready(_minimise(task, starts, as_float(penalty), search))
-        progress(f"search, stage {number} of {len(PENALTIES)}")
-    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    searched, searches = task, _started(jax.random.fold_in(key, 2), task)
+    for stage, penalty in enumerate(_PENALTIES):
+        if stage == 2:
+            searches = [min(searches, key=lambda search: search.cost)]
+        searches = [_minimise(searched, search, as_float(penalty)) for search in searches]
+        progress(f"search, stage {stage + 1} of {len(_PENALTIES)}")
+        if stage:
+            searched = searched.watching(min(searches, key=lambda search: search.cost).coefficients)
     progress(f"flying {task.vehicles} vehicles")
-    flown = {"designed": task.flown(np.asarray(starts)[best])}
+    flown = {"designed": task.flown(np.asarray(searches[0].coefficients))}
     progress("bounds")
     judged = task.judged(flown | (task.standard() if compare else {}))
     return Design(task, judged.pop("designed"), judged)
 
 
-@eqx.filter_jit
-def _minimise(
-    task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar, search: Search
-) -> tuple[Float[Array, "starts coefficients"], Float[Array, " starts"]]:
-    """One stage of all searches: their last coefficients and costs. A trial whose simulation fails is rejected."""
+class _Search(NamedTuple):
+    """The state of a search. `basis`: moves along which the cost is about equally curved, as BFGS found."""
 
-    def cost(scaled: Coefficients, penalty: Scalar) -> Scalar:
-        uses = jax.tree.leaves(task.uses(UNIT * scaled))
+    coefficients: Coefficients
+    basis: Float[Array, "coefficients coefficients"]
+    cost: Scalar
+
+
+@quick_jit
+def _started(key: Key, task: AbstractTask) -> list[_Search]:
+    starts = task.first / math.sqrt(task.size) * jax.random.normal(key, (task.starts, task.size), dtype=float)
+    return [_Search(start, _UNIT * jnp.eye(task.size), jnp.zeros(())) for start in starts]
+
+
+@quick_jit
+def _minimise(task: AbstractTask, search: _Search, penalty: Scalar) -> _Search:
+    """One stage of a search. BFGS begins with a unit matrix, so its unknowns are moves along the basis found before."""
+
+    def moved(moves: Coefficients) -> Coefficients:
+        return search.coefficients + search.basis @ moves
+
+    def cost(moves: Coefficients, _: None) -> Scalar:
+        uses = jax.tree.leaves(task.uses(moved(moves)))
         excess = sum(jnp.square(jnp.maximum(jnp.square(use) - 1, 0)).sum() / use.shape[-2] for use in uses)
-        return task.objective(UNIT * scaled) + penalty / 2 * excess
+        return task.objective(moved(moves)) + penalty / 2 * excess
 
-    def one(start: Coefficients) -> tuple[Coefficients, Scalar]:
-        solver = optimistix.BFGS(TOLERANCE, TOLERANCE)
-        first = start / UNIT
-        found = optimistix.minimise(cost, solver, first, penalty, max_steps=search.steps, throw=False)
-        return UNIT * found.value, found.state.f_info.f
-
-    return jax.vmap(one)(starts)
+    solver, still = optimistix.BFGS(_TOLERANCE, _TOLERANCE), jnp.zeros(task.size)
+    found = optimistix.minimise(cost, solver, still, max_steps=_STEPS, throw=False)
+    end = found.state.f_info
+    basis = search.basis @ jnp.linalg.cholesky(end.hessian_inv.as_matrix())
+    return _Search(moved(found.value), basis, jnp.where(jnp.isnan(end.f), jnp.inf, end.f))
 
 
 def criterion_of(

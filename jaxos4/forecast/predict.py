@@ -181,6 +181,9 @@ def _predicted(
     """The prediction of a flight of this name. The regression is fitted to `trained`, or to the flight's first half."""
     measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
+    for option, value in (("horizon", horizon), ("spacing", spacing)):
+        if 0 < value < dt / 2:
+            raise InputError(f"`{option}` {value:g}: {name} is predicted in samples of {dt:.4g} s; give at least that.")
     missing = tuple(part for part in ("position", "velocity") if not measured.has(part))
     start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
