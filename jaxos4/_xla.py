@@ -1,4 +1,4 @@
-"""How XLA compiles for a CPU: loops as native functions, with whole vectors, and hardly optimised if they run once.
+"""XLA on a CPU: loops become native functions with full vectors; programs that run once are hardly optimised.
 
 By default, XLA calls a function for every few operations of a loop, which takes ten times as long. JAX reads
 `XLA_FLAGS` when it starts to compute. An unknown flag ends the process, so `pyproject.toml` allows only versions of JAX

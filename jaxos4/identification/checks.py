@@ -35,7 +35,7 @@ _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
 def _identified(
     data: Data, answer: Answer, estimator: str, model: str, notes: Sequence[str] = (), **checked: Any
 ) -> Identification:
-    """The fields of a result that need no check, and those that were `checked`. `notes`: what could not be checked."""
+    """The result of an answer, with the fields that were `checked`. `notes`: what could not be checked."""
     free, sigma = answer.free, np.asarray(answer.problem.sigma)
     covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
     return Identification(

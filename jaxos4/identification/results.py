@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..report import Plots
 
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
-LATE = 0.005  # s; motors that act earlier than they are recorded by more are recorded late
+LATE = 0.005  # s; with a `rotor_delay` below minus this, motors are recorded late
 
 
 def has_answer(estimate: Estimate) -> bool:

@@ -29,9 +29,9 @@ ADVICE = {
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 
 
-# A doubt that moves a quantity by more than this share (errors of discretisation reach 3 %), and by more than these
-# standard deviations, contradicts it, unless it is a mere `reservation` that moves it by less than its own size; by
-# more than one of them makes a reservation, by less is a note. Moves of reservations add up; see `judge`.
+# A doubt that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. By
+# more than one of them, it makes a reservation; by neither, it is a note. A mere `reservation` contradicts only if it
+# moves the quantity by more than its own size. Errors of discretisation reach 3 %. Moves add up; see `judge`.
 MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
 # Half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a reservation, or is not
 # identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.

@@ -155,7 +155,7 @@ def _ground(share: Float[np.ndarray, " samples"], dt: float) -> Samples:
 
 MOMENT = 0.1  # s; a rotor may rest or be at its limit for this long: about its lag
 SAME = 1e-3  # share of a rotor's largest speed; smaller differences count as none
-FULL = 0.995  # share of the airframe's `max_rotor_speed` from which a rotor is at full speed
+FULL = 0.995  # share of the airframe's `max_rotor_speed` from which a rotor is at full speed, also if speeds are noisy
 
 
 def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dict[str, Bool[np.ndarray, "samples 4"]]:
@@ -194,8 +194,10 @@ def _lost(states: np.ndarray, dt: float) -> Samples:
 
 
 IMPACT_FORCE = 50.0  # m/s^2
-IMPACT_RATE, IMPACT_TIME = 15.0, 0.02  # rad/s within s
-BEFORE_IMPACT, AFTER_IMPACT = 0.5, 1.0  # s; not trusted; an impact ends a flight if the rotors stop within this time
+IMPACT_RATE = 15.0  # rad/s; the change within `IMPACT_TIME`
+IMPACT_TIME = 0.02  # s
+BEFORE_IMPACT = 0.5  # s before an impact that are not trusted
+AFTER_IMPACT = 1.0  # s within which the rotors stop after a crash
 
 
 def _crashed(rates: np.ndarray, force: np.ndarray | None, share: np.ndarray, ground: Samples, dt: float) -> Samples:

@@ -46,6 +46,7 @@ def draw(panel: Panel, axes: Axes) -> None:
         labels = [f"{text}e{power}" if power and at else text for at, text in ticks.items()]
         axis.set_ticks(list(ticks), labels=labels)
         axis.set_ticks([], minor=True)
+        axis.grid(scale.lines)
     for mark in panel.marks:
         if isinstance(mark, Words):
             axes.text(mark.x, mark.y, mark.text, ha={"start": "left", "middle": "center", "end": "right"}[mark.anchor])
@@ -56,6 +57,10 @@ def draw(panel: Panel, axes: Axes) -> None:
             axes.fill_between(x, low, high, color=mark.color, alpha=mark.opacity, linewidth=0)
         else:
             axes.plot(x, panel.y.inside(mark.y), **_look(mark))
+    if panel.equal:
+        axes.set_aspect("equal")
+    if panel.bare:
+        axes.set_axis_off()
     axes.set_title(f"{panel.title}\n{panel.subtitle}" if panel.subtitle else panel.title)
 
 

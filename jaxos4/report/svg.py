@@ -14,7 +14,7 @@ _LETTERS, _LINE = 12.0, 18.0  # the size of letters, and the height of a line of
 _LETTER = 0.62 * _LETTERS  # the width of a letter [px], of a wide font, so that labels do not overlap
 _TOP, _RIGHT = 8.0, 12.0  # room around the axes [px]
 _SHORT = 120.0  # axes below this height [px] have two labels or more, others three
-_BEYOND = 9.0  # coordinates end so many panels outside of their panel, which cuts them off anyway
+_BEYOND = 9.0  # coordinates are clipped this many panel sizes outside of the panel
 # Marks: the number of their corners, the angle of the first one [degrees], and the radii of corners in turn.
 _MARKS = {"o": (20, 0, (1.0,)), "s": (4, 45, (1.25,)), "D": (4, 90, (1.25,)), "^": (3, 90, (1.35,))}
 _MARKS |= {"v": (3, -90, (1.35,)), "<": (3, 180, (1.35,)), "p": (5, 90, (1.15,)), "*": (10, 90, (1.4, 0.6))}

@@ -56,8 +56,9 @@ class Turns(msgspec.Struct, frozen=True):
     explained: Float[np.ndarray, "3"]
 
 
-MIN_BATCHES, MIN_BATCH = 4, 0.5  # of a flight; s
-TILTS = 2.0  # s; about as long are batches in which rotations about several axes are compared
+MIN_BATCHES = 4  # of a flight
+MIN_BATCH = 0.5  # s
+TILTS = 2.0  # s; the length of a batch in which rotations about several axes are compared
 
 
 def attitude_turns(stretches: Sequence[Recording]) -> Turns | None:

@@ -57,7 +57,8 @@ STANDARD_ERRORS = 5.0
 # The first one counts for the sum of roll and pitch before axes are judged.
 EXPLAINED = 0.02, 0.03
 MOVES = 0.05  # rad/s; standard deviation of the rates of a vehicle that moves
-REST, STILL = 0.25, 0.1  # s; standard deviation of force and rates of a vehicle at rest in this time [gravity, rad/s]
+REST = 0.25  # s; a vehicle at rest is still for this long
+STILL = 0.1  # the largest standard deviation at rest, of force [gravity] and of rates [rad/s]
 HELD = 0.015  # s; motors may keep their value for half of the shortest lag of rotors
 
 
