@@ -132,7 +132,7 @@ def test_nothing_is_kept_without_a_home_folder(inspect, tmp_path, monkeypatch):
         "predict r.json f.csv --spacing 1e300",
         "design --out i.csv --slowest 1e300",
         "simulate --out f.csv --duration 1e300",
-        "estimate f.csv --to -1e300",
+        "estimate f.csv --end -1e300",
         "train f.csv --out n.npz --noise 1 inf",
         "export r.json --to urdf --samples 10000000000",
     ],
