@@ -1,7 +1,7 @@
 """Simulation of a flight from rotor speeds: forward Euler, Runge-Kutta 4, or diffrax's adaptive Tsit5."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -32,12 +32,17 @@ def midpoint_step(model: AbstractModel, state: State, forcing: Forcing, paramete
     return _advance(state, model.cascade(middle, forcing, parameters), dt)
 
 
-def rk4_step(model: Any, state: S, forcing: Any, parameters: Any, dt: Scalar) -> S:
-    """The classical Runge-Kutta step, of order 4, with a constant forcing; `model.cascade` has the derivative."""
-    k1 = model.cascade(state, forcing, parameters)
-    k2 = model.cascade(_advance(state, k1, dt / 2), forcing, parameters)
-    k3 = model.cascade(_advance(state, k2, dt / 2), forcing, parameters)
-    k4 = model.cascade(_advance(state, k3, dt), forcing, parameters)
+def rk4_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
+    """A step by the classical Runge-Kutta method, of order 4, with a constant forcing."""
+    return runge_kutta(lambda state: model.cascade(state, forcing, parameters), state, dt)
+
+
+def runge_kutta(derivative: Callable[[S], S], state: S, dt: Scalar) -> S:
+    """The classical Runge-Kutta step, of order 4."""
+    k1 = derivative(state)
+    k2 = derivative(_advance(state, k1, dt / 2))
+    k3 = derivative(_advance(state, k2, dt / 2))
+    k4 = derivative(_advance(state, k3, dt))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
     return _advance(state, mean, dt)
 

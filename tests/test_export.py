@@ -114,7 +114,7 @@ def test_recordings_share_the_mean_offset_and_negative_damping_is_0(write):
     found = read_result(write(vehicle_result(values)))
     assert found.vehicle.torque[0] == pytest.approx(1.5 / 6.1e4)
     assert found.vehicle.damping[0] == 0
-    assert "roll_damping" not in found.spread.names
+    assert "roll_damping" not in found.gaussian
     stranger = "roll_flapping: not carried: an exported vehicle of this version has no such parameters"
     for note in ("mean of the recordings", "roll_damping: came out negative", stranger):
         assert any(note in line for line in found.notes), note
@@ -154,7 +154,7 @@ def test_the_thrust_curve_is_noted_in_the_words_of_the_file(write):
         assert note.format("(2 u / (1.2 + sqrt(1.44 - 0.8 u)))^2") in export_vehicle(steep, target).notes
         assert "thrust_curve" not in " ".join(export_vehicle(found, target).notes)
     assert found.vehicle.thrust_curve == 1
-    assert "thrust_curve" not in found.spread.names
+    assert "thrust_curve" not in found.gaussian
 
 
 def test_the_parameters_of_drone_models_make_the_forces_of_the_vehicle(write):

@@ -36,7 +36,7 @@ def doubt(quantity, share=None, deviations=2.0, result="successful"):
 
 
 def stds(found):
-    return dict(zip(found.spread.names, found.spread.std, strict=True))
+    return {name: row["std"] for name, row in found.gaussian.items()}
 
 
 def agree(drawn, mean, covariance):
@@ -94,7 +94,8 @@ def test_reservations_widen_the_quantity_that_they_concern(write):
     expected |= {"roll_damping": 0.25, "pitch_damping": 0.25, "yaw_damping": 0.04}
     for name, variance in added.items():
         assert variance == pytest.approx(expected.get(name, 0.0), abs=1e-9 * plain[name] ** 2), name
-    assert set(found.spread.widened) == expected.keys()  # the doubt about Iz is a mere note
+    widened = {name for name, row in found.gaussian.items() if row["origin"] != "the estimate"}
+    assert widened == expected.keys()  # the doubt about Iz is a mere note
     assert all(f"{name}: varies by" in " ".join(found.notes_on_draws) for name in expected)
     # The bracket of the estimate counts.
     result = vehicle_result(doubts=doubts)
@@ -110,7 +111,7 @@ def test_refused_quantities_are_as_wide_as_a_guess(write):
     std, (ix, iy, _) = stds(found), found.vehicle.inertia
     assert (std["Ix"], std["Iy"], std["roll_damping"]) == pytest.approx((0.4 * ix, 0.4 * iy, 5.0))
     assert std["Iz"] < 0.03 * found.vehicle.inertia[2]
-    assert "refuses it" in found.spread.widened["Ix"]
+    assert "refuses it" in found.gaussian["Ix"]["origin"]
     # A verdict can refuse without a doubt: an interval that is too long, or reservations that contradict together.
     std = stds(read_result(write(vehicle_result(verdicts={"Iy": {"status": "not identified"}}))))
     assert std["Iy"] == pytest.approx(0.4 * iy)

@@ -1,5 +1,6 @@
 """A flight in closed loop: the true vehicle, its controller, and what its sensors log."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from ..linalg import invert
 from ..models.os4 import CorrectedOS4
 from ..models.state import Attitude, Forcing, Orientation, Rates, Vector, attitude_rates
 from ..noise import coloured
-from ..simulation import rk4_step
+from ..simulation import runge_kutta
 from .sensors import BodyMotion, Sense, Signals, log
 from .settings import ClosedLoop, PerAxis
 
@@ -67,7 +68,7 @@ def fly_standard(
 
 
 class _Acting(NamedTuple):
-    """Rotors, Omega_r', gusts of p', q', r' and the vertical force, and wind along the body's axes during a step."""
+    """Rotors with the vertical gust, Omega_r', gusts of p', q', r', and wind along the body's axes during a step."""
 
     rotors: Forcing
     spin_up: Scalar
@@ -75,55 +76,46 @@ class _Acting(NamedTuple):
     wind: Vector | None
 
 
-class _Vehicle(NamedTuple):
-    """The true vehicle. Its constants are scalars, because a batch of scalars vectorises."""
+def _physics(loop: ClosedLoop) -> tuple[Callable[[BodyMotion, _Acting], BodyMotion], Callable[..., Vector]]:
+    """The derivative of the motion in the body's axes, and the specific force along them [m/s^2].
 
-    alpha: tuple[Scalar, ...]
-    reaction: Scalar
-    gravity: Scalar
-    damping: tuple[Scalar, ...]
-    drag: tuple[Scalar, ...]
-    flapping: tuple[Scalar, ...]
+    Constants are scalars, because a batch of scalars vectorises.
+    """
+    airframe, air = loop.airframe, loop.air
+    ix, iy, iz = jnp.asarray(airframe.inertia)
+    rotor, gravity = jnp.asarray(airframe.rotor_inertia), jnp.asarray(airframe.gravity)
+    alpha, reaction, damping = alpha_scalars(ix, iy, iz, rotor), rotor / iz, tuple(loop.damping)
 
-    @classmethod
-    def of(cls, loop: ClosedLoop) -> "_Vehicle":
-        """Drag along x and y, and inflow along z."""
-        airframe, air = loop.airframe, loop.air
-        ix, iy, iz = jnp.asarray(airframe.inertia)
-        rotor, gravity = jnp.asarray(airframe.rotor_inertia), jnp.asarray(airframe.gravity)
-        drag, flapping = ((), ()) if air is None else ((*air.drag, air.inflow), tuple(air.flapping))
-        return cls(alpha_scalars(ix, iy, iz, rotor), rotor / iz, gravity, tuple(loop.damping), drag, flapping)
+    def specific_force(velocity: Vector | None, acting: _Acting) -> Vector:
+        thrust = acting.rotors.thrust
+        if air is None or velocity is None or acting.wind is None:
+            return jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust
+        each = zip((*air.drag, air.inflow), velocity, acting.wind, strict=True)
+        x, y, z = (drag * (wind - v) for drag, v, wind in each)
+        return x, y, thrust + z
 
-    def cascade(self, state: BodyMotion, forcing: _Acting, parameters: None) -> BodyMotion:
-        """The derivative of the motion: Newton and Euler in the body's axes."""
-        p, q, r = state.rates
-        turning = CorrectedOS4().angular_acceleration(state.rates, forcing.rotors, self.alpha)
-        each = zip(turning, forcing.gust[:3], self.damping, state.rates, strict=True)
-        turning = Rates(*(total + gust - damping * rate for total, gust, damping, rate in each))
-        turning = turning._replace(r=turning.r - self.reaction * forcing.spin_up)
-        orientation = Orientation.of(state.attitude)
-        attitude = attitude_rates(state.rates, orientation)
-        if state.velocity is None or forcing.wind is None:
+    def derivative(motion: BodyMotion, acting: _Acting) -> BodyMotion:
+        p, q, r = motion.rates
+        turning = CorrectedOS4().angular_acceleration(motion.rates, acting.rotors, alpha)
+        each = zip(turning, acting.gust, damping, motion.rates, strict=True)
+        turning = Rates(*(total + gust - share * rate for total, gust, share, rate in each))
+        turning = turning._replace(r=turning.r - reaction * acting.spin_up)
+        orientation = Orientation.of(motion.attitude)
+        attitude = attitude_rates(motion.rates, orientation)
+        if air is None or motion.velocity is None or acting.wind is None:
             return BodyMotion(turning, attitude, None)
-        (u, v, w), (wind_x, wind_y, _) = state.velocity, forcing.wind
-        along = Rates(self.flapping[0] * (v - wind_y), self.flapping[1] * (u - wind_x), jnp.zeros_like(u))
-        turning = jax.tree.map(jnp.add, turning, along)
+        (u, v, w), (wind_x, wind_y, _), (roll, pitch) = motion.velocity, acting.wind, air.flapping
+        turning = jax.tree.map(jnp.add, turning, Rates(roll * (v - wind_y), pitch * (u - wind_x), jnp.zeros_like(u)))
         sin_phi, cos_phi, sin_theta, cos_theta, _, _ = orientation
-        x, y, z = self.specific_force(state.velocity, forcing)
+        x, y, z = specific_force(motion.velocity, acting)
         moving = (
-            x + self.gravity * sin_theta - q * w + r * v,
-            y - self.gravity * cos_theta * sin_phi - r * u + p * w,
-            z - self.gravity * cos_theta * cos_phi - p * v + q * u,
+            x + gravity * sin_theta - q * w + r * v,
+            y - gravity * cos_theta * sin_phi - r * u + p * w,
+            z - gravity * cos_theta * cos_phi - p * v + q * u,
         )
         return BodyMotion(turning, attitude, moving)
 
-    def specific_force(self, velocity: Vector | None, forcing: _Acting) -> Vector:
-        """The specific force along the body's axes [m/s^2]: thrust, gust, and drag through the air."""
-        thrust = forcing.rotors.thrust + forcing.gust[3]
-        if velocity is None or forcing.wind is None:
-            return jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust
-        x, y, z = (drag * (wind - v) for drag, v, wind in zip(self.drag, velocity, forcing.wind, strict=True))
-        return x, y, thrust + z
+    return derivative, specific_force
 
 
 class _Drawn(NamedTuple):
@@ -166,7 +158,7 @@ def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Draw
 def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substeps: int) -> Flight:
     samples, steps = references.shape[0], substeps // loop.log_every
     runs, period = samples * loop.log_every, dt / loop.log_every
-    h, vehicle, airframe = period / steps, _Vehicle.of(loop), loop.airframe
+    h, airframe, (derivative, specific_force) = period / steps, loop.airframe, _physics(loop)
     sense_key, log_key = jax.random.split(jax.random.fold_in(key, 1))
     sense = loop.sensors and Sense.of(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
     mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
@@ -178,15 +170,16 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
 
     def acting(weak, squares, residual, spin_up, gust, wind) -> _Acting:
         roll, pitch, yaw, thrust = weak * (mixer @ squares)
-        rotors = Forcing(roll, pitch, yaw, thrust / airframe.mass, residual)
-        return _Acting(rotors, spin_up, tuple(gust), None if wind is None else tuple(wind))
+        *turning, pushing = gust
+        rotors = Forcing(roll, pitch, yaw, thrust / airframe.mass + pushing, residual)
+        return _Acting(rotors, spin_up, tuple(turning), None if wind is None else tuple(wind))
 
     def run(carry: _Carry, row):
         (motion, speeds, integral, commands, signals), (k, reference, drawn) = carry, row
         blown, error = (drawn.gusts, drawn.winds), drawn.noise
         weak, nothing = 1 - loop.sag * k / (runs - 1), jnp.zeros(())
         now = acting(weak, jnp.square(speeds), nothing, nothing, *jax.tree.map(lambda ends: ends[0], blown))
-        specific = jnp.stack(vehicle.specific_force(motion.velocity, now)) + error[6:]
+        specific = jnp.stack(specific_force(motion.velocity, now)) + error[6:]
         rates, attitude = jnp.stack(motion.rates), jnp.stack(motion.attitude) + error[3:6]
         seen = gyro = rates + error[:3]
         if sense is not None and signals is not None:
@@ -206,7 +199,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
             squares = (speeds * speeds + speeds * after + after * after) / 3
             residual, spin_up = (speeds + after) @ spins / 2, (after - speeds) @ spins / h
             forcing = acting(weak, squares, residual, spin_up, *gust_and_wind)
-            return (rk4_step(vehicle, motion, forcing, None, h), after), (speeds + after) / 2
+            return (runge_kutta(lambda motion: derivative(motion, forcing), motion, h), after), (speeds + after) / 2
 
         middle = jax.tree.map(lambda ends: (ends[:-1] + ends[1:]) / 2, blown)
         (later, speeds), means = jax.lax.scan(step, (motion, speeds), (jnp.arange(steps), *middle))

@@ -7,6 +7,5 @@ from .formats import (
     export_vehicle as export_vehicle,
     sample_vehicles as sample_vehicles,
 )
-from .loop import found_loop as found_loop
-from .result import Identified as Identified, read_result as read_result
+from .result import Identified as Identified, found_loop as found_loop, read_result as read_result
 from .vehicle import RigidVehicle as RigidVehicle

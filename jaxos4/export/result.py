@@ -6,14 +6,19 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
+from .._custom_types import as_constant
 from ..airframe import AXES, INERTIAS, YAW, Airframe
+from ..closed_loop import ClosedLoop
 from ..errors import InputError, named, printable
+from ..flight import RATES, STATE_NAMES
 from ..identification.results import Identification
 from ..models.flight_model import without_recording
 from ..result_file import vehicle_result
-from .spread import DRAG, Spread, spread_of
+from .spread import DRAG, ESTIMATE, spread_of
 from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # Why some parameters are not carried; notes on the rotors' inertia name alpha2 and alpha5. All others have one note.
@@ -25,7 +30,14 @@ _NOT_CARRIED = {
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
 
+# What of a vehicle and of its motors flies in closed loop.
+_FOUND = ("inertia", "rotor_inertia", "thrust_coefficient", "drag_coefficient")
+_MOTOR = ("rotor_lag", "rotor_delay", "thrust_curve", "motor_braking")
 _MAY_BE_POSITIVE = 2.0  # standard deviations below 0: one draw in 44 is positive
+_BLOCK = 32  # draws made together: the usual vehicle needs one, and one with several dampings near 0 some dozens
+# After so many draws, or so many that only lack a possible vehicle, an estimate counts as too uncertain.
+_MAX_DRAWS, _MAX_IMPOSSIBLE = 1_000_000, 1000
+_SIGNIFICANT = 3.0  # standard deviations of an inertia of the rotors from 0, and of a thrust curve from 1
 
 
 class Identified(NamedTuple):
@@ -36,11 +48,11 @@ class Identified(NamedTuple):
     - `airframe`: the constants that were not estimated.
     - `values`: all parameters by name, estimated or fixed.
     - `identifies_iz`: whether the flights show Iz, if the airframe's drag coefficient is right.
-    - `spread`: how far drawn vehicles differ.
     - `doubts`: why the estimate cannot be trusted, or only with care, and what to do; one line each. Empty if the
       result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.
     - `inertia_z`: the moment of inertia Iz [kg m^2] that the user gave in the place of the estimate.
+    - `varying`, `root`: the Gaussian of the constants that differ in drawn vehicles, see `spread_of`.
     """
 
     source: str
@@ -48,10 +60,11 @@ class Identified(NamedTuple):
     airframe: Airframe
     values: dict[str, float]
     identifies_iz: bool
-    spread: Spread
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
     inertia_z: float | None = None
+    varying: dict[str, dict[str, Any]] = {}
+    root: Float[np.ndarray, "n n"] = np.zeros((0, 0))
 
     @property
     def successful(self) -> bool:
@@ -76,16 +89,24 @@ class Identified(NamedTuple):
         # Flights show the yaw torque over Iz: another Iz means another drag coefficient.
         return vehicle._replace(drag_coefficient=vehicle.drag_coefficient * allowed / iz)
 
-    def draw(self, number: int, *, seed: int, most: int = 1000) -> tuple[RigidVehicle, int]:
-        """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
+    def draw(self, number: int, *, seed: int) -> tuple[RigidVehicle, int]:
+        """A vehicle drawn from the uncertainty of the estimate, and how many draws were repeated before it.
 
-        It depends on its `number` and the seed alone. Raises `InputError` if `most` draws without a negative parameter
-        are impossible.
+        Draws are repeated if a lag, delay, damping or drag is negative, or if no vehicle can be like them. The vehicle
+        depends on its `number` and the seed alone. Raises `InputError` if hardly any draw is possible.
         """
-        for impossible, drawn in itertools.islice(self.spread.draws(number, seed=seed), most):
-            vehicle = self._made(self.values | drawn)
-            if not vehicle.impossible:
-                return vehicle, impossible
+        generator, names = np.random.default_rng([seed, number]), list(self.varying)
+        positive = [place for place, name in enumerate(names) if name in NOT_NEGATIVE]
+        mean, impossible = np.array([row["mean"] for row in self.varying.values()]), 0
+        for before in range(0, _MAX_DRAWS, _BLOCK):
+            rows = mean + generator.standard_normal((_BLOCK, len(names))) @ self.root.T
+            for place in np.flatnonzero((rows[:, positive] >= 0).all(axis=1)).tolist():
+                vehicle = self._made(self.values | dict(zip(names, rows[place].tolist(), strict=True)))
+                if not vehicle.impossible:
+                    return vehicle, before + place
+                impossible += 1
+            if impossible >= _MAX_IMPOSSIBLE:
+                break
         raise InputError(
             "`samples`: the estimate is too uncertain: hardly any draw is a possible vehicle; export without samples, "
             "or fly with more excitation."
@@ -98,19 +119,12 @@ class Identified(NamedTuple):
         Without Iz and what follows from it, if Iz was given.
         """
         given = () if self.inertia_z is None else (YAW.inertia, DRAG)
-        rows = zip(
-            self.spread.names, self.spread.mean.tolist(), self.spread.std.tolist(), self.spread.units, strict=True
-        )
-        return {
-            name: {"mean": mean, "std": std, "unit": unit, "origin": self.spread.widened.get(name, "the estimate")}
-            for name, mean, std, unit in rows
-            if name not in given
-        }
+        return {name: row for name, row in self.varying.items() if name not in given}
 
     @property
     def notes_on_draws(self) -> tuple[str, ...]:
         """Why drawn vehicles differ by more than the estimate's uncertainty; one line each."""
-        rows = {name: row for name, row in self.gaussian.items() if name in self.spread.widened}
+        rows = {name: row for name, row in self.gaussian.items() if row["origin"] != ESTIMATE}
         sizes = {name: f"{row['std']:.3g} {row['unit']}".strip().removesuffix(" 1") for name, row in rows.items()}
         return tuple(f"{name}: varies by {sizes[name]} (std): {row['origin']}" for name, row in rows.items())
 
@@ -142,7 +156,6 @@ def read_result(found: Identification | str | os.PathLike[str], *, inertia_z: fl
             airframe=file.airframe,
             values=values | dict.fromkeys(negative, 0.0),
             identifies_iz=YAW.inverse in estimated,
-            spread=Spread(),
             doubts=file.warnings,
             notes=tuple(notes),
             inertia_z=inertia_z,
@@ -157,7 +170,8 @@ def read_result(found: Identification | str | os.PathLike[str], *, inertia_z: fl
                 f"no vehicle is like this: {why}{guess}; correct the airframe, or fly with more excitation."
             )
         drawn = [name for name in estimated if name not in never]
-        return exported._replace(spread=spread_of(file, values, drawn, rigid_vehicle(file.airframe, values)))
+        varying, root = spread_of(file, values, drawn, rigid_vehicle(file.airframe, values))
+        return exported._replace(varying=varying, root=root)
 
 
 def _given_note(found: Identified, inertia_z: float) -> str:
@@ -172,23 +186,19 @@ def _given_note(found: Identified, inertia_z: float) -> str:
     return note
 
 
-def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str, float], list[str], list[str]]:
-    """Values by name, the names of those that were estimated, and notes.
-
-    `significant`: by how many standard deviations an inertia of the rotors must differ from 0, and a thrust curve from
-    1, to be exported.
-    """
+def _parts(file: Identification) -> tuple[dict[str, float], list[str], list[str]]:
+    """Values by name, the names of those that were estimated, and notes."""
     rows, constants, notes = file.parameters, file.rigid_body.constants, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
     for axis in AXES:
         if constants and axis.inertia not in constants:
             found.pop(axis.inverse, None)  # the estimate says that this one is not to be trusted
-    if "rotor_reaction" in found and not found["rotor_reaction"][0] > significant * found["rotor_reaction"][1]:
+    if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SIGNIFICANT * found["rotor_reaction"][1]:
         del found["rotor_reaction"]
     if "rotor_reaction" not in found and "rotor_reaction" in (*rows, *file.held):
         notes.append("rotor_reaction: below noise; the inertia of the rotors is the airframe's")
     curve, error = found.get("thrust_curve", (1.0, 0.0))
-    if abs(curve - 1) < significant * error:
+    if abs(curve - 1) < _SIGNIFICANT * error:
         del found["thrust_curve"]
     values = {name: value for name, (value, _) in found.items()}
     values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values
@@ -212,3 +222,26 @@ def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str,
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")
     return values, list(found), notes
+
+
+def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:
+    """The vehicle of a file of `jaxos4 estimate --out`, with its rotors, damping and gusts, and a controller.
+
+    `settings`: of a `ClosedLoop`, instead of those that were found. Raises as `read_result` does.
+    """
+    found = read_result(path)
+    vehicle, gusts = found.vehicle, vehicle_result(path).disturbances
+    airframe = eqx.tree_at(
+        lambda airframe: tuple(getattr(airframe, name) for name in _FOUND),
+        found.airframe,
+        tuple(as_constant(getattr(vehicle, name)) for name in _FOUND),
+    )
+    known: dict[str, Any] = {name: found.values[name] for name in _MOTOR if found.values.get(name, 0.0) > 0}
+    if not airframe.has_full_scale:
+        known = {name: value for name, value in known.items() if name.startswith("rotor_")}
+    rates = [gusts[name] for name in (STATE_NAMES[column] for column in RATES) if name in gusts]
+    if len(rates) == 3:
+        known |= {"gust": [each.strength for each in rates], "gust_time": np.mean([x.time_constant for x in rates])}
+    known |= {"damping": vehicle.damping / vehicle.inertia}
+    known |= {"logged": "commands" if "rotor_lag" in found.values and airframe.has_full_scale else "speeds"}
+    return ClosedLoop(airframe, **known | settings)

@@ -5,8 +5,8 @@ to the width of the quantity that it concerns, independently of the others.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,55 +18,25 @@ from ..identification.verdict import CONTRADICTED, IDENTIFIED, MAX_SHARE, RESERV
 from ..linalg import covariance_root
 from ..models.flight_model import without_recording
 from ..models.terms import TERMS
-from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle
+from .vehicle import CARRIED, RigidVehicle
 
 DRAG, ROTOR_INERTIA, GAIN, REACTION = "drag_coefficient", "rotor_inertia", "thrust_gain", "rotor_reaction"
 _GUESS = GUESSED_DRAG  # of a moment of inertia too
 _RESERVED, _REFUSED = "widened by the reservations of its verdict", "as wide as a guess: its verdict refuses it"
-_MISSING = "a guess: it was not identified"
-_BLOCK = 32  # draws made together: the usual vehicle needs one, and one with several dampings near 0 some dozens
-
-
-class Spread(NamedTuple):
-    """The joint Gaussian from which vehicles are drawn.
-
-    - `names`: Ix, Iy, Iz, parameters, and constants of the airframe that are uncertain. `units`: theirs.
-    - `mean`: the estimate. `root`: a matrix B; the covariance is B B^T.
-    - `widened`: why a standard deviation is not the estimate's, by name.
-    """
-
-    names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
-    mean: Float[np.ndarray, " n"] = np.zeros(0)
-    root: Float[np.ndarray, "n n"] = np.zeros((0, 0))
-    widened: dict[str, str] = {}
-
-    @property
-    def std(self) -> Float[np.ndarray, " n"]:
-        """The standard deviations, before draws that no vehicle can have are repeated."""
-        return np.sqrt(np.square(self.root).sum(axis=1))
-
-    def draws(self, number: int, *, seed: int) -> Iterator[tuple[int, dict[str, float]]]:
-        """Draws by name whose lags, delays, dampings and drags are not negative.
-
-        Each comes with the number of draws before it, those that were left out too; there are at most a million.
-        """
-        generator = np.random.default_rng([seed, number])
-        positive = [place for place, name in enumerate(self.names) if name in NOT_NEGATIVE]
-        for begin in range(0, 1_000_000, _BLOCK):
-            rows = self.mean + generator.standard_normal((_BLOCK, len(self.names))) @ self.root.T
-            for place in np.flatnonzero((rows[:, positive] >= 0).all(axis=1)):
-                yield begin + int(place), dict(zip(self.names, rows[place].tolist(), strict=True))
+ESTIMATE, _MISSING = "the estimate", "a guess: it was not identified"
 
 
 @np.errstate(all="ignore")  # what is not finite gives no possible vehicle
 def spread_of(
     file: Identification, values: Mapping[str, float], estimated: Sequence[str], vehicle: RigidVehicle
-) -> Spread:
-    """The Gaussian of a result.
+) -> tuple[dict[str, dict[str, Any]], Float[np.ndarray, "n n"]]:
+    """The Gaussian of a result, before draws that no vehicle can have are repeated.
 
     **Arguments:** `values` of all parameters, the names of those that were `estimated`, and the `vehicle` with these
     values.
+
+    **Returns:** mean, standard deviation, unit and origin of Ix, Iy, Iz, parameters, and uncertain constants of the
+    airframe; and a matrix B, with the covariance B B^T.
     """
     inverses = [axis.inverse for axis in AXES]
     known = [name for name in estimated if without_recording(name) in CARRIED]
@@ -77,8 +47,8 @@ def spread_of(
     names = [*mean, *constants]
     mean |= {name: float(getattr(file.airframe, name)) for name in constants}
     slopes = _slopes(names, known, mean, values)
-    rows = [list(file.parameters).index(name) for name in known]
-    covariance, widened = slopes @ np.array(file.covariance)[np.ix_(rows, rows)] @ slopes.T, {}
+    places = [list(file.parameters).index(name) for name in known]
+    covariance, widened = slopes @ np.array(file.covariance)[np.ix_(places, places)] @ slopes.T, {}
     if GAIN in known:  # the scale of the accelerometer is one factor of thrust and moments of inertia
         scale = SCALE_ERROR * values[GAIN] * slopes[:, known.index(GAIN)]
         covariance += np.outer(scale, scale)
@@ -104,7 +74,12 @@ def spread_of(
     units = {name: row.unit for name, row in (*file.held.items(), *file.parameters.items())}
     units |= dict.fromkeys((*INERTIAS, ROTOR_INERTIA), UNIT) | {DRAG: "N m s^2/rad^2"}
     root = covariance_root(covariance) if np.isfinite(covariance).all() else np.full_like(covariance, np.nan)
-    return Spread(tuple(names), tuple(units[each] for each in names), np.array(list(mean.values())), root, widened)
+    stds = np.sqrt(np.square(root).sum(axis=1)).tolist()
+    rows = {
+        name: {"mean": mean[name], "std": std, "unit": units[name], "origin": widened.get(name, ESTIMATE)}
+        for name, std in zip(names, stds, strict=True)
+    }
+    return rows, root
 
 
 def _guessed_constants(airframe: Airframe, values: Mapping[str, float]) -> tuple[dict[str, float], float]:

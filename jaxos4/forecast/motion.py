@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Numeric, Scalar
-from ..analysis.open_loop import Filtered, filtered, gyro_bias, open_loop
+from ..analysis.prediction import Filtered, filtered, gyro_bias, open_loop
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
 from ..shooting import FASTEST
 from ..shooting.gains import Covariance, LogNoise, Transition, first_covariance, is_rate, next_gains, step_of
-from ..simulation import rk4_step
+from ..simulation import runge_kutta
 
 _Samples = Float[Numeric, "*samples"]
 Vector = tuple[_Samples, _Samples, _Samples]
@@ -71,28 +71,6 @@ class Futures(NamedTuple):
     errors: Filtered
     off: Float[Array, "futures 2 6"]
     gusts: Filtered
-
-
-class _Free(NamedTuple):
-    """A `FlightModel` whose attitude is a quaternion, and whose velocity is that of the motion.
-
-    `turning`, `pushing`: disturbances of p', q', r' [rad/s^2], and along the body's axes [m/s^2].
-    """
-
-    model: FlightModel
-    turning: Vector
-    pushing: Vector
-
-    @jax.jit  # traced once for the four stages of a step
-    def cascade(self, state: Motion, forcing: Forcing, parameters) -> Motion:
-        """The time derivative of the motion."""
-        forcing = forcing._replace(velocity=turned(inverse(state.attitude), state.velocity))
-        turning = self.model.angular_acceleration(state.rates, forcing, parameters)
-        force = self.model.specific_force(forcing.thrust, forcing, parameters)
-        x, y, z = turned(state.attitude, _sum(force, self.pushing))
-        spin = product(state.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in state.rates)))
-        falling = x, y, z - self.model.airframe.gravity
-        return Motion(state.velocity, falling, spin, Rates(*_sum(turning, self.turning)))
 
 
 def product(a, b) -> Quaternion:
@@ -157,7 +135,17 @@ def _fly(
         motion, feasible = carry
         turning = offset[:3] + added[:3] / dt
         pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(added[3:])
-        moved = rk4_step(_Free(model, tuple(turning), tuple(pushing)), motion, forcing, scalars, dt)
+
+        @jax.jit  # traced once for the four stages of a step
+        def derivative(motion: Motion) -> Motion:
+            row = forcing._replace(velocity=turned(inverse(motion.attitude), motion.velocity))
+            accelerations = _sum(model.angular_acceleration(motion.rates, row, scalars), turning)
+            force = _sum(model.specific_force(row.thrust, row, scalars), pushing)
+            x, y, z = turned(motion.attitude, force)
+            spin = product(motion.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in motion.rates)))
+            return Motion(motion.velocity, (x, y, z - model.airframe.gravity), spin, Rates(*accelerations))
+
+        moved = runge_kutta(derivative, motion, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
         finite = jnp.isfinite(jnp.stack(jax.tree.leaves(moved))).all()
         feasible = feasible & finite & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import Parameters, as_float
-from ..analysis.open_loop import Filtered
+from ..analysis.prediction import Filtered
 from ..errors import InputError, named, printable, shortened
-from ..flight import FORCE_NAMES
+from ..flight import FORCE_NAMES, Flight
 from ..identification import Identification
 from ..linalg import covariance_root
 from ..logs import Recording, Source, as_recording
@@ -23,7 +23,7 @@ from ..models.flight_model import FlightModel, without_recording
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording.prepared import Prepared, prepare
 from ..result_file import vehicle_result
-from ..shooting import ShootingProblem, padded
+from ..shooting import capacity_of, pad_flight
 from ..shooting.gains import Covariance, LogNoise
 from .flight_prediction import FlightPrediction
 from .measured import Measured, constant_rates, regressed
@@ -59,11 +59,6 @@ class Vehicle(NamedTuple):
     result: str
     notes: tuple[str, ...]
 
-    def draw(self, count: int, generator: np.random.Generator) -> Float[np.ndarray, "count parameters"]:
-        """Parameters drawn from the estimate's uncertainty."""
-        root = covariance_root(self.covariance)
-        return self.parameters + generator.standard_normal((count, len(root))) @ root.T
-
 
 def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     """The vehicle of an identification or a file of `jaxos4 estimate --out`. Raises `InputError` or `OSError`."""
@@ -79,23 +74,17 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
         model = FlightModel(file.airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
         known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
         known |= {row: each.value for row, each in file.held.items()}
-        alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))
-        center, width = (dict(zip(model.parameter_names, each, strict=True)) for each in (alpha, half_width))
-        listed, rows, covariance = [*file.parameters, *file.held], list(file.parameters), np.array(file.covariance)
-        # Each parameter is the mean of its rows: one, or one for each recording.
-        shares, values, missing, guessed = np.zeros((len(center), len(rows))), [], [], []
-        for place, each in enumerate(center):
-            own = [row for row in listed if without_recording(row) == each]
-            estimated = [row for row in own if row in known]
-            if not own:
-                missing.append(each)
-            elif not estimated:
-                guessed.append(each)
-            values.append(np.mean([known[row] for row in estimated]) if estimated else center[each])
-            shares[place, [rows.index(row) for row in estimated if row in file.parameters]] = 1 / max(len(estimated), 1)
-        if missing:
+        center, half_width = (np.asarray(each).tolist() for each in _bracket(model))
+        names, listed = model.parameter_names, [*file.parameters, *file.held]
+        if missing := [name for name in names if name not in map(without_recording, listed)]:
             raise InputError(f"has no {', '.join(missing)}; run `jaxos4 estimate` again.")
+        # Each parameter is the mean of its rows: one, or one for each recording.
+        rows = [[row for row in listed if row in known and without_recording(row) == name] for name in names]
+        values = [np.mean([known[row] for row in own]) if own else each for own, each in zip(rows, center, strict=True)]
+        shares = np.array([[(row in own) / max(len(own), 1) for row in file.parameters] for own in rows])
+        guessed = [name for name, own in zip(names, rows, strict=True) if not own]
         notes = [f"not identified, and predicted with the centre of the bracket: {', '.join(guessed)}"] * bool(guessed)
+        width = dict(zip(names, half_width, strict=True))
         channels = (*"pqr", *(FORCE_NAMES[axis] for axis in model.force_axes))
         if lacking := [each for each in channels if each not in file.disturbances]:
             raise InputError(f"does not say the disturbance of {lacking[0]}; run `jaxos4 estimate` again.")
@@ -105,7 +94,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
             name,
             model,
             np.array(values),
-            shares @ covariance @ shares.T,
+            shares @ np.array(file.covariance) @ shares.T,
             np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
             LogNoise(*np.log(np.maximum(table, 1e-9)).T),  # finite
             used.sample_time,
@@ -179,7 +168,7 @@ def _predicted(
     seed: int,
 ) -> FlightPrediction:
     """The prediction of a flight of this name. The regression is fitted to `trained`, or to the flight's first half."""
-    measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
+    measured, flight = Measured.of(prepared.fitted), _padded(prepared.fitted)
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     for option, value in (("horizon", horizon), ("spacing", spacing)):
         if 0 < value < dt / 2:
@@ -188,7 +177,7 @@ def _predicted(
     start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed)
+    begin, states, spread = _fly(vehicle, flight, measured, start, missing, noise, steps, seed)
     ahead, trained = start[:, None] + np.arange(1, steps + 1), measured.first_half if trained is None else trained
     gravity = float(vehicle.model.airframe.gravity)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
@@ -226,13 +215,12 @@ def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) 
     return prepared
 
 
-def _problem(vehicle: Vehicle, prepared: Prepared) -> ShootingProblem:
-    """The flight, with what the model's forcing needs."""
-    flight, recordings = prepared.fitted, (0,) * len(prepared.recordings)
+def _padded(flight: Flight) -> Flight:
+    """The flight with the velocity that the model's forcing has, with room for more samples."""
     if flight.body_velocity is None:
         flight = dataclasses.replace(flight, body_velocity=np.zeros((flight.time.size, 3)))
-    model = dataclasses.replace(vehicle.model, recordings=recordings)
-    return ShootingProblem(model, flight, sigma=np.ones(12), channels="rates", method="rk4")
+    capacity = capacity_of(flight.time.size)
+    return flight if capacity == flight.time.size else pad_flight(flight, capacity)
 
 
 def _starts(
@@ -252,8 +240,8 @@ def _starts(
 
 
 def _fly(
-    problem: ShootingProblem,
     vehicle: Vehicle,
+    flight: Flight,
     measured: Measured,
     start: Int[np.ndarray, " starts"],
     missing: tuple[str, ...],
@@ -267,21 +255,22 @@ def _fly(
 
     A position that was not measured is 0, a velocity that of dead reckoning, without an offset of the force.
     """
-    generator, channels, dt = np.random.default_rng(seed), noise.strength.size, problem.flight.dt
-    parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(DRAWS, generator)]))
-    model = dataclasses.replace(vehicle.model, recordings=(0,) * (int(measured.stretch.max()) + 1))
+    generator, channels, dt = np.random.default_rng(seed), noise.strength.size, flight.dt
+    root = covariance_root(vehicle.covariance)
+    drawn = vehicle.parameters + generator.standard_normal((DRAWS, len(root))) @ root.T
+    parameters = as_float(np.concatenate([[vehicle.parameters] * 2, drawn]))
     state, samples, noise = measured.states.copy(), len(measured.stretch), jax.tree.map(as_float, noise)
     if "velocity" in missing:
-        reckoned = np.asarray(problem.flight.body_velocity)[:samples].T
+        reckoned = np.asarray(flight.body_velocity)[:samples].T
         state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
     if "position" in missing:
         state[:, PARTS["position"]] = 0.0
     accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
-    padding = ((0, problem.flight.time.size - samples), (0, 0))
+    padding = ((0, flight.time.size - samples), (0, 0))
     rows, changes = (as_float(np.pad(x, padding, constant_values=np.nan)) for x in (state, accelerations))
     prior = as_float(np.append(vehicle.offset, [PUSH * ("velocity" not in missing)] * 3))
     seen, length = (rows, changes, as_float(measured.noise[3:6])), jax.device_put(np.asarray(samples))
-    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, seen, noise, prior)
+    known, forcing, offset = known_at_samples(vehicle.model, flight, length, parameters, seen, noise, prior)
 
     after, added, absorbed = jax.tree.map(np.asarray, settled(noise, dt, SETTLED))
     errors = _pairs(after, generator.standard_normal((DRAWS, channels, 2)))

@@ -3,17 +3,18 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._custom_types import Numeric, as_float
 from .._xla import compiled_cheaply
 from ..analysis.diagnostics import Correlations, residual_correlations, residual_diagnostics
 from ..analysis.evaluation import evaluate
-from ..analysis.open_loop import Traced, traced
-from ..analysis.prediction import HORIZONS, Predictions, predictions, skill, trajectory_horizons
+from ..analysis.frequency_response import modelled_acceleration
+from ..analysis.prediction import HORIZONS, Predictions, filtered, predictions, skill, trajectory_horizons
 from ..analysis.traces import Traces, position_of
 from ..estimate import fit_start
 from ..estimators import EquationError
@@ -50,7 +51,7 @@ def predict_held_out(
             parameters = np.array([values[shared == name].mean() for name in problem.unknowns.names])
         known = None
         if noise is not None:
-            known = _traced(data, _together(data, held_out), parameters, noise).disturbance
+            known, _ = _disturbances(data, _together(data, held_out), parameters, noise)
         return predictions(problem, as_float(parameters), horizons=horizons, disturbance=known, noise=noise)
 
     every = predicted_by(values, noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
@@ -74,11 +75,21 @@ def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
     return eqx.tree_at(lambda p: p.flight.states, held_out.problem, both)
 
 
-def _traced(data: Data, problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise) -> Traced:
-    """The disturbances and innovations of all samples of a flight."""
+def _disturbances(
+    data: Data, problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise
+) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
+    """The disturbance of each body rate [rad/s^2] and its innovation [rad/s; NaN: not measured] at each sample.
+
+    Filters know the disturbance from the measurements until the sample. An innovation is a measured rate less its
+    prediction from the sample before. The model is evaluated at the measured rates.
+    """
     samples = problem.flight.time.shape[0]
-    found = traced(with_room(problem, max(samples, data.room)), as_float(parameters), noise)
-    return Traced(*(each[:samples] for each in found))
+    problem = with_room(problem, max(samples, data.room))
+    flight, rates = problem.flight, np.asarray(problem.flight.states)[:, RATES]
+    modelled = np.pad(modelled_acceleration(problem, as_float(parameters)), ((0, 1), (0, 0)))
+    of_rates = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
+    known, innovation = filtered(of_rates, rates, modelled, flight.stretch_numbers, flight.dt)
+    return np.asarray(known.disturbance)[:samples], np.asarray(innovation)[:samples]
 
 
 def vehicle_traces(
@@ -91,15 +102,16 @@ def vehicle_traces(
     other = data.held_out
     problem = answer.problem if other is None or other.recording is not None else _together(data, other)
     values = np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count]
-    found, flight = _traced(data, problem, values, optimum.noise), answer.problem.flight
+    disturbance, innovation = _disturbances(data, problem, values, optimum.noise)
+    flight = answer.problem.flight
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
     position = position_of(np.asarray(problem.flight.states, float))
     start = np.zeros(0, int) if predicted is None else predicted.start
     clock = data.clock if other is None or other.recording is None else other.clock
-    signals = omega, states[:, RATES], states[:, :0], found.disturbance, position
+    signals = omega, states[:, RATES], states[:, :0], disturbance, position
     traces = Traces(data.clock.time, data.clock.log, *signals, clock.time[start], clock.log[start])
     torques = omega**2 @ np.asarray(answer.problem.model.airframe.mixer)[:3].T
-    crossed = residual_correlations(found.innovation, torques)
+    crossed = residual_correlations(innovation, torques)
     if (parts := optimum.estimate.parts) is not None:
         # Of the innovations of the likelihood itself, which is exact for means.
         products = np.asarray(parts.products).sum(axis=0)[:3]
