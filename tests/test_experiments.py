@@ -283,9 +283,14 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
 def test_public_flights(shared_flights, tmp_path):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    report = result_of(tmp_path, "public_flights", flights=shared_flights, end=15.0, batches=20, compared=[], **names)
+    small = {"end": 15.0, "batches": 20, "compared": [], "gusts": [0.0, 8.0], "simulations": 1}
+    report = result_of(tmp_path, "public_flights", flights=shared_flights, **small, **names)
     assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
     assert all(found[rate]["error"][9] < found[rate]["constant"][9] for rate in "pq")
     assert all(len(found[rate]["network"]) == 50 for rate in "pq")
+    # Without gusts the true vehicle predicts what is measured; with gusts the commands answer what it does not know.
+    calm, gusty = (report["simulated"][gust] for gust in ("0", "8"))
+    assert all(calm[rate]["share"][-1] > 0.9 and gusty[rate]["share"][-1] < 0.5 for rate in "pq")
+    plot(tmp_path, "public_flights")

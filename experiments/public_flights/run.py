@@ -10,6 +10,9 @@ Three flights are identified together, and all others are predicted: position, v
 steps of 10 ms ahead, open loop, with the recorded commands. The errors stand beside those of constant velocity and
 rates, of a regression that is fitted to the first half of the flight that it predicts, and of a small network for the
 rates that is trained on the identified flights. Each flight is predicted with the offsets that its own past shows.
+
+Commands answer what disturbs the vehicle after the start, which no prediction in open loop knows. How much that costs
+is simulated with the true vehicle (`gusts.py`).
 """
 
 import itertools
@@ -23,6 +26,7 @@ import typer
 import jaxos4
 from experiments.monte_carlo import Row, interval, print_table, write_report
 from experiments.public_flights.clocks import aligned
+from experiments.public_flights.gusts import measured_share, simulated
 from experiments.public_flights.rate_network import errors_of, trained
 from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
@@ -34,6 +38,7 @@ PREDICTED = ("B2_circle_fast_rep2", "B3_figure8_fast_rep1", "B3_figure8_fast_rep
 STEP = 0.01  # [s]
 INERTIAS = "Ix", "Iy"
 BOOTSTRAPS, SEEDS = 2000, 3
+SHOWN = 5, 10, 20, 30, 50  # steps ahead
 
 
 def alone(recordings: list[Recording], end: float | None) -> dict[str, Any]:
@@ -99,6 +104,21 @@ def print_errors(report: Row) -> None:
     print_table("mean absolute error: the sum over 50 steps of 10 ms, and 0.1 s ahead", headings, rows())
 
 
+def print_shares(report: Row) -> None:
+    """One line for each flight, or strength of the simulated gusts, and axis."""
+    flights = {name: found["quantities"] for name, found in report["flights"].items()}
+    flights |= {f"simulated, true vehicle, {gust} rad/s^2": found for gust, found in report["simulated"].items()}
+    rows = [
+        (name, axis, *(f"{found[axis][kind][n - 1]:.2g}" for kind in ("share", "error", "constant") for n in SHOWN))
+        for name, found in flights.items()
+        for axis in "pq"
+    ]
+    ahead = [f"{STEP * n:g}" for n in SHOWN]
+    headings = [x for kind in ("share", "error", "constant") for x in (f"{kind}, {ahead[0]} s", *ahead[1:])]
+    title = "share of a predicted rate that is measured, and mean absolute errors [rad/s]"
+    print_table(title, ("flight", "rate", *headings), rows, width=180)
+
+
 def main(
     out: Annotated[Path, typer.Option(help="JSON file for the results.")],
     flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
@@ -107,6 +127,8 @@ def main(
     compared: Annotated[list[str], typer.Option(help="The flights to identify alone.")] = (*FITTED, *PREDICTED),
     end: Annotated[float | None, typer.Option(help="Identify with the flights up to this time [s].")] = None,
     batches: Annotated[int, typer.Option(help="Batches of the network's training.")] = 300,
+    gusts: Annotated[list[float], typer.Option(help="Simulated gusts [rad/s^2].")] = (0.0, 2.0, 4.0, 8.0),
+    simulations: Annotated[int, typer.Option(help="Simulated flights through gusts of each strength.")] = 5,
 ) -> None:
     """Identify each flight and all together; identify some together, and predict the others."""
     names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
@@ -127,9 +149,13 @@ def main(
         for quantity, errors in errors_of(networks, recordings[name], prediction).items():
             row["quantities"][quantity] |= {"network": errors}
             row["quantities"][quantity]["sum"] |= {"network": sum(errors)}
+        for axis, share in measured_share([prediction]).items():
+            row["quantities"][axis] |= {"share": share}
         report["flights"][name] = row
         write_report(out, report)
     print_errors(report)
+    report["simulated"] = {f"{gust:g}": simulated(gust, simulations) for gust in gusts}
+    print_shares(report)
     report["alone"] = {name: alone([recordings[name]], end) for name in compared}
     trusted = {name: row for name, row in report["alone"].items() if row["result"] == "successful"}
     report["pairs"] = {"not refused": agreement(trusted), "all that have a number": agreement(report["alone"])}
