@@ -30,14 +30,9 @@ _NOT_CARRIED = {
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
 
-# What of a vehicle and of its motors flies in closed loop.
-_FOUND = ("inertia", "rotor_inertia", "thrust_coefficient", "drag_coefficient")
-_MOTOR = ("rotor_lag", "rotor_delay", "thrust_curve", "motor_braking")
-_MAY_BE_POSITIVE = 2.0  # standard deviations below 0: one draw in 44 is positive
 _BLOCK = 32  # draws made together: the usual vehicle needs one, and one with several dampings near 0 some dozens
 # After so many draws, or so many that only lack a possible vehicle, an estimate counts as too uncertain.
 _MAX_DRAWS, _MAX_IMPOSSIBLE = 1_000_000, 1000
-_SIGNIFICANT = 3.0  # standard deviations of an inertia of the rotors from 0, and of a thrust curve from 1
 
 
 class Identified(NamedTuple):
@@ -129,6 +124,9 @@ class Identified(NamedTuple):
         return tuple(f"{name}: varies by {sizes[name]} (std): {row['origin']}" for name, row in rows.items())
 
 
+_MAY_BE_POSITIVE = 2.0  # standard deviations below 0: one draw in 44 is positive
+
+
 def read_result(found: Identification | str | os.PathLike[str], *, inertia_z: float | None = None) -> Identified:
     """The vehicle of an identification, or of a file that `jaxos4 estimate --out` wrote.
 
@@ -186,6 +184,10 @@ def _given_note(found: Identified, inertia_z: float) -> str:
     return note
 
 
+# Standard deviations of an inertia of the rotors from 0, and of a thrust curve from 1, with which they are exported.
+_SIGNIFICANT = 3.0
+
+
 def _parts(file: Identification) -> tuple[dict[str, float], list[str], list[str]]:
     """Values by name, the names of those that were estimated, and notes."""
     rows, constants, notes = file.parameters, file.rigid_body.constants, []
@@ -222,6 +224,11 @@ def _parts(file: Identification) -> tuple[dict[str, float], list[str], list[str]
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")
     return values, list(found), notes
+
+
+# What of the vehicle and of its motors flies in closed loop.
+_FOUND = ("inertia", "rotor_inertia", "thrust_coefficient", "drag_coefficient")
+_MOTOR = ("rotor_lag", "rotor_delay", "thrust_curve", "motor_braking")
 
 
 def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:

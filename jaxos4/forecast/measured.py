@@ -120,7 +120,7 @@ def regressed(
         return None
     scale = np.maximum(np.abs(features[usable]).max(axis=0), 1e-12)
     weights = np.linalg.lstsq(features[usable] / scale, targets[usable])[0]
-    rates, velocities, now = [], [], begin
+    states, now = [], begin
     for speeds in np.moveaxis(omega, 1, 0):
         found = (_features(now, speeds, moves) / scale) @ weights
         rate, velocity = np.clip(now[:, 10:] + dt * found[:, :3], -1e3, 1e3), now[:, 3:6]
@@ -128,9 +128,8 @@ def regressed(
             push = np.stack(turned(now[:, 6:10].T, tuple(found[:, 3:].T)), axis=1)
             velocity = velocity + dt * (push - [0.0, 0.0, gravity])
         now = _moved(now, rate[:, None], velocity[:, None], dt)[:, 0]
-        rates.append(rate)
-        velocities.append(velocity)
-    return _moved(begin, np.stack(rates, axis=1), np.stack(velocities, axis=1), dt)
+        states.append(now)
+    return np.stack(states, axis=1)
 
 
 def _features(states: np.ndarray, omega: np.ndarray, moves: bool) -> np.ndarray:

@@ -114,7 +114,7 @@ def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-def _fly(
+def _fly_future(
     model: FlightModel, future: Futures, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
 ) -> Float[Array, "steps 13"]:
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
@@ -176,7 +176,7 @@ def fly_chunk(
 
     def every(first: Int[Array, ""]) -> tuple[Array, Array]:
         start = jax.tree.map(lambda leaf: leaf[first], known)
-        states = jax.vmap(lambda future: _fly(model, future, first, start, noise, dt))(futures)
+        states = jax.vmap(lambda future: _fly_future(model, future, first, start, noise, dt))(futures)
         off = departures(jnp.broadcast_to(states[0], states[2:].shape), states[2:])
         return states[:2], jnp.sqrt(jnp.square(off).mean(axis=0))
 

@@ -177,7 +177,7 @@ def _predicted(
     start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    begin, states, spread = _fly(vehicle, flight, measured, start, missing, noise, steps, seed)
+    begin, states, spread = _predict_states(vehicle, flight, measured, start, missing, noise, steps, seed)
     ahead, trained = start[:, None] + np.arange(1, steps + 1), measured.first_half if trained is None else trained
     gravity = float(vehicle.model.airframe.gravity)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
@@ -239,7 +239,7 @@ def _starts(
     return start
 
 
-def _fly(
+def _predict_states(
     vehicle: Vehicle,
     flight: Flight,
     measured: Measured,
