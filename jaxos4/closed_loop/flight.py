@@ -18,7 +18,7 @@ from ..models.os4 import CorrectedOS4
 from ..models.state import Attitude, Forcing, Orientation, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import runge_kutta
-from .sensors import BodyMotion, Sense, Signals, log
+from .sensors import BodyMotion, Signals, log, sensing
 from .settings import ClosedLoop, PerAxis
 
 
@@ -160,7 +160,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     runs, period = samples * loop.log_every, dt / loop.log_every
     h, airframe, (derivative, specific_force) = period / steps, loop.airframe, _physics(loop)
     sense_key, log_key = jax.random.split(jax.random.fold_in(key, 1))
-    sense = loop.sensors and Sense.of(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
+    sense = loop.sensors and sensing(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
     mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
     allocation = mixer.T @ invert(mixer @ mixer.T)  # the mixer's inverse, without a call of LAPACK
     hover_cube = jnp.asarray(airframe.hover_speed) ** 3

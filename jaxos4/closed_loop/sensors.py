@@ -1,11 +1,12 @@
 """The sensors of a flight in closed loop: vibration and filters, and what a recorder loses and confuses."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Scalar
 from ..flight import ANGLES, RATES, VELOCITY, Flight
@@ -35,50 +36,37 @@ class Signals(NamedTuple):
     gyros: Float[Array, "runs 3"]
 
 
-class Sense(NamedTuple):
-    """Vibration, first-order low-pass filters, y' = (x - y) / T, exact for signals linear in each run, and a delay.
+def sensing(
+    sensors: Sensors, hover_speed: Scalar, period: Scalar, key: Key
+) -> Callable[..., tuple[Signals, PerAxis, PerAxis]]:
+    """The sensors of a flight: vibration with random phases, low-pass filters, and a delay of the gyro.
 
-    `sine`, `cosine`: the amplitude of each rotor in hover in gyro and accelerometer. `decay`, `last`: of the filters of
-    `Signals`. `own`: whether the controller has a gyro of its own. `late`: delay of the log's gyro [runs].
+    Filters are of the first order, y' = (x - y) / T, and exact for signals that are linear in each run.
+
+    **Returns:** a function of the signals, the number of a run, and what is sensed in it. It gives the signals of the
+    next run, and the body rates that are logged, and that the controller answers.
     """
+    phases = jax.random.uniform(key, (4, 6), maxval=2 * np.pi)
+    amplitude = jnp.repeat(jnp.stack([sensors.gyro_vibration, sensors.force_vibration]), 3)
+    times = jnp.repeat(jnp.stack([sensors.gyro_filter, sensors.controller_gyro_filter, sensors.force_filter]), 3)
+    decay, has_own_gyro = jnp.exp(-period / times), ~jnp.isnan(sensors.controller_gyro_noise)
+    last = (1 - decay) * times / period
+    sine, cosine = amplitude * jnp.cos(phases), amplitude * jnp.sin(phases)
+    late = sensors.gyro_delay / period
 
-    hover_speed: Scalar
-    sine: Float[Array, "4 6"]
-    cosine: Float[Array, "4 6"]
-    decay: Float[Array, "9"]
-    last: Float[Array, "9"]
-    own: Bool[Array, ""]
-    late: Scalar
-
-    @classmethod
-    def of(cls, sensors: Sensors, hover_speed: Scalar, period: Scalar, key: Key) -> "Sense":
-        """The sensors of a flight, with random phases of the vibration."""
-        phases = jax.random.uniform(key, (4, 6), maxval=2 * np.pi)
-        amplitude = jnp.repeat(jnp.stack([sensors.gyro_vibration, sensors.force_vibration]), 3)
-        times = jnp.repeat(jnp.stack([sensors.gyro_filter, sensors.controller_gyro_filter, sensors.force_filter]), 3)
-        decay, own = jnp.exp(-period / times), ~jnp.isnan(sensors.controller_gyro_noise)
-        last = (1 - decay) * times / period
-        sine, cosine = amplitude * jnp.cos(phases), amplitude * jnp.sin(phases)
-        return cls(hover_speed, sine, cosine, decay, last, own, sensors.gyro_delay / period)
-
-    def __call__(
-        self,
-        signals: Signals,
-        k: Int[Array, ""],
-        speeds: Float[Array, "4"],
-        gyro: PerAxis,
-        own_gyro: PerAxis,
-        force: PerAxis,
+    def sense(
+        signals: Signals, k: Int[Array, ""], speeds: Float[Array, "4"], gyro: PerAxis, own_gyro: PerAxis, force: PerAxis
     ) -> tuple[Signals, PerAxis, PerAxis]:
-        """The signals of the run after run `k`, and the body rates that are logged, and that the controller answers."""
-        strength, (sin, cos) = jnp.square(speeds / self.hover_speed), sincos(signals.angles)
-        shaken = (strength * sin) @ self.sine + (strength * cos) @ self.cosine
+        strength, (sin, cos) = jnp.square(speeds / hover_speed), sincos(signals.angles)
+        shaken = (strength * sin) @ sine + (strength * cos) @ cosine
         raw = jnp.concatenate([gyro + shaken[:3], own_gyro, force + shaken[3:]])
-        filtered = self.decay * signals.filtered + (self.last - self.decay) * signals.raw + (1 - self.last) * raw
-        gyros, whole = signals.gyros.at[k].set(filtered[:3]), jnp.floor(self.late).astype(int)
+        filtered = decay * signals.filtered + (last - decay) * signals.raw + (1 - last) * raw
+        gyros, whole = signals.gyros.at[k].set(filtered[:3]), jnp.floor(late).astype(int)
         now, before = (gyros[jnp.maximum(k - whole - i, 0)] for i in (0, 1))
-        logged = now + (self.late - whole) * (before - now)
-        return Signals(raw, filtered, signals.angles, gyros), logged, jnp.where(self.own, filtered[3:6], logged)
+        logged = now + (late - whole) * (before - now)
+        return Signals(raw, filtered, signals.angles, gyros), logged, jnp.where(has_own_gyro, filtered[3:6], logged)
+
+    return sense
 
 
 def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Array, Array], key: Key) -> Flight:
