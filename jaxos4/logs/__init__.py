@@ -9,12 +9,10 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
-import numpy as np
-
 from .._registry import Registry
 from ..airframe import Airframe
 from ..errors import in_words, printable
-from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
+from ..flight import SIGNALS, Flight
 from .ardupilot import ARDUPILOT
 from .assemble import recording_of
 from .blackbox import BLACKBOX
@@ -31,6 +29,7 @@ from .table import (
     Table as Table,
     opened,
     refuse,
+    signals_of,
 )
 from .ulog import ULOG
 from .values import without_impossible
@@ -178,11 +177,9 @@ def as_recording(flight: Source, name: str = "flight", airframe: Airframe | None
     if not isinstance(flight, Flight):
         return read_recording(flight, airframe)
     found = Recording.of(flight, name)
-    columns = {"t": found.time, **dict(zip(CHANNEL_NAMES, found.channels.T, strict=True))}
+    columns = {"t": found.time, **found.columns(inputs=False)}
     table = without_impossible(Table(name, columns, first_row=None))
     if not table.impossible:
         return found
-    channels = np.stack([table.columns[each] for each in CHANNEL_NAMES], axis=1)
-    states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
-    specific = None if found.specific_force is None else force
-    return found._replace(states=states, specific_force=specific, notes=(table.impossible_note,))
+    inputs = {field: getattr(found, field) for field, signal in SIGNALS.items() if signal.is_input}
+    return found._replace(**signals_of(table.columns) | inputs, notes=(table.impossible_note,))

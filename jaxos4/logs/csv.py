@@ -11,10 +11,22 @@ import numpy as np
 
 from .._files import write_atomically
 from ..airframe import Airframe
-from ..flight import FORCE_NAMES, STATE_NAMES, Flight
-from .assemble import COLUMN_NAMES as COLUMN_NAMES
+from ..flight import Flight
 from .columns import ColumnMap, column_map, mapped_rows
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFormat, Path, Table, counted, opened, quoted, refuse
+from .table import (
+    COMMAND_NAMES,
+    MAX_ROWS,
+    SPEED_NAMES,
+    LogFormat,
+    Path,
+    Recording,
+    Table,
+    counted,
+    opened,
+    quoted,
+    refuse,
+)
+from .values import COLUMNS
 
 _LONGEST_LINE = 1 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # float() also reads "nan" and "1_0"
@@ -43,7 +55,7 @@ CSV = LogFormat(
     "CSV",
     "flight CSV",
     lambda begin: True,
-    lambda path: (read_table(path, COLUMN_NAMES), ()),
+    lambda path: (read_table(path, COLUMNS), ()),
     read_mapped,
     of_vehicles=False,
 )
@@ -87,7 +99,7 @@ def read_table(
 
 
 def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
-    """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of states, specific force and voltage.
+    """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of its signals.
 
     Reading the file gives back every bit of measured speeds and states; angles are unwrapped. If writing fails, an
     older file at `path` is unchanged.
@@ -104,9 +116,7 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
     if flight.commanded and airframe is not None and np.isfinite(airframe.max_rotor_speed):
         names, omega = COMMAND_NAMES, omega / np.asarray(airframe.max_rotor_speed)
     needed = {"t": np.asarray(flight.time), **dict(zip(names, omega.T, strict=True))}
-    measured: dict[str, np.ndarray] = dict(zip((*STATE_NAMES, *FORCE_NAMES), flight.recorded.T, strict=True))
-    if flight.voltage is not None:
-        measured["voltage"] = np.asarray(flight.voltage)
+    measured = Recording.of(flight).columns()
     for name, column in {**needed, **measured}.items():
         usable = np.isfinite(column) if name in needed else ~np.isinf(column)
         if not usable.all():

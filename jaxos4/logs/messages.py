@@ -159,8 +159,6 @@ class Messages:
         for names, series in others.items():
             if series is None:
                 continue
-            if names == ("voltage",):  # 0 is not measured
-                series = Series(series.t, np.where(series.values > 0, series.values, np.nan))
             if names == ANGLES:
                 phi, theta, psi = series.values.T
                 series = Series(series.t, np.column_stack([unwrap(phi)[0], theta, unwrap(psi)[0]]))

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._files import at_once
 from ..errors import InputError, printable, shortened
-from ..flight import Flight, with_force
+from ..flight import SIGNALS, Flight, with_force
 
 Path = str | os.PathLike[str]
 Found = TypeVar("Found")
@@ -132,7 +132,7 @@ class LogFormat(NamedTuple):
     of_vehicles: bool = True
 
 
-_ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocity", "stretch", "within")
+_ARRAYS = ("time", *SIGNALS)
 
 
 class Recording(NamedTuple):
@@ -182,6 +182,15 @@ class Recording(NamedTuple):
         """The sample time [s]."""
         return float((self.time[-1] - self.time[0]) / (self.time.size - 1))
 
+    def columns(self, *, inputs: bool = True) -> dict[str, Float[np.ndarray, " samples"]]:
+        """The columns of signals in a log, by name; without `inputs`, only those in which NaN marks a gap."""
+        return {
+            name: column
+            for field, signal in SIGNALS.items()
+            if signal.columns and (inputs or not signal.is_input) and (rows := getattr(self, field)) is not None
+            for name, column in zip(signal.columns, rows.reshape(len(rows), -1).T, strict=True)
+        }
+
     @property
     def channels(self) -> Float[np.ndarray, "samples 15"]:
         """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
@@ -209,6 +218,17 @@ class Recording(NamedTuple):
     def same_data(self, other: "Recording") -> bool:
         """Whether both hold the same samples: times, rotor speeds and states."""
         return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(self[:3], other[:3], strict=True))
+
+
+def signals_of(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The signals that columns of a log make, by name: NaN for missing columns, `None` for signals without any."""
+    nothing = np.full(len(next(iter(columns.values()))), np.nan)
+    signals: dict[str, Any] = dict.fromkeys(SIGNALS)
+    for field, signal in SIGNALS.items():
+        if signal.columns.keys() & columns.keys():
+            rows = np.column_stack([columns.get(name, nothing) for name in signal.columns])
+            signals[field] = rows.reshape(nothing.size, *(signal.shape or ()))
+    return signals
 
 
 def needed(path: Path, found: Found | None, what: str, remedy: str) -> Found:
