@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from ..airframe import Airframe
 from ..logs import Recording
@@ -49,6 +49,22 @@ def force_noise(recording: Recording) -> Float[np.ndarray, "3"]:
     return least
 
 
+def spectra(
+    signals: Float[np.ndarray, "samples *signals"], length: int
+) -> Complex[np.ndarray, "segments *signals frequencies"]:
+    """Spectra of segments of `length` samples that overlap by half, of each signal without its mean, in a Hann window.
+
+    A segment with NaN is NaN. The mean square of white noise is its variance. Reference: Welch 1967, IEEE Trans. Audio
+    Electroacoustics 15.
+    """
+    window = np.hanning(length + 1)[:-1]
+    window /= np.linalg.norm(window)
+    if len(signals) < length:
+        return np.empty((0, *signals.shape[1:], length // 2 + 1), dtype=complex)
+    segments = np.lib.stride_tricks.sliding_window_view(signals, length, axis=0)[:: max(length // 2, 1)]
+    return np.fft.rfft(window * (segments - segments.mean(axis=-1, keepdims=True)))
+
+
 NEGLIGIBLE = 1e-3  # share of the power of the changes; less noise changes no answer
 
 
@@ -80,15 +96,10 @@ NEIGHBOURS = 2  # frequencies to either side over which spectra are averaged
 def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float) -> Changes | None:
     """The mean power of the changes from sample to sample, by frequency; that of white changes is their variance."""
     length = 2 * (max(round(SPECTRUM / dt), MIN_SAMPLES) // 2)
-    weight, spectra = np.hanning(length + 1)[:-1, None], []
-    for signal in signals:
-        changes = np.diff(signal, axis=0)
-        for first in range(0, len(changes) - length + 1, length // 2):
-            own = changes[first : first + length]
-            spectra.append(np.abs(np.fft.rfft(weight * (own - own.mean(axis=0)), axis=0)) ** 2)
-    if not spectra:
+    found = np.concatenate([spectra(np.diff(signal, axis=0), length) for signal in signals])
+    if not len(found):
         return None
-    power = np.mean(spectra, axis=0) / np.square(weight).sum()
+    power = np.square(np.abs(found)).mean(axis=0).T
     around = np.pad(power, ((NEIGHBOURS, NEIGHBOURS), (0, 0)), mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(around, 2 * NEIGHBOURS + 1, axis=0)
     return windows.mean(axis=-1)

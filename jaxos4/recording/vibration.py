@@ -7,6 +7,7 @@ import numpy as np
 from ..airframe import AXES
 from ..flight import RATES
 from ..logs import Recording
+from .noise import spectra
 
 ABOVE = 25.0  # Hz; a rigid body that rotors turn moves below this frequency
 TIMES = 5.0  # a line has this many times the power of its surroundings: the median within an octave to both sides
@@ -22,22 +23,18 @@ def vibrating_rates(stretches: Sequence[Recording]) -> dict[str, float]:
 
     **Arguments:** `stretches`: as logged, not averaged, of one vehicle.
     """
-    step = max((each.dt for each in stretches), default=np.inf)
-    length = round(SPECTRUM / step) if np.isfinite(step) else 0
-    frequency = np.fft.rfftfreq(length, step) if length > 1 else np.zeros(1)
-    high = np.flatnonzero((frequency >= ABOVE) & (frequency < 0.98 * frequency[-1]))
-    found = {}
+    step = max((each.dt for each in stretches), default=SPECTRUM)
+    length = round(SPECTRUM / step)
+    frequency = np.fft.rfftfreq(max(length, 1), step)
+    high, found = np.flatnonzero((frequency >= ABOVE) & (frequency < 0.98 * frequency[-1])), {}
+    if not high.size:
+        return found
     for axis, column in zip(AXES, RATES, strict=True):
-        spectra = []
-        for each in stretches:
-            rate = each.states[:, column]
-            for begin in range(0, len(rate) - length, max(length // 2, 1)):
-                own = rate[begin : begin + length]
-                if np.isfinite(own).all():
-                    spectra.append(np.square(np.abs(np.fft.rfft(np.hanning(length) * (own - own.mean())))))
-        if len(spectra) < MIN_SPECTRA or not high.size:
+        every = np.concatenate([spectra(each.states[:, column], length) for each in stretches])
+        power = np.square(np.abs(every[np.isfinite(every).all(axis=-1)]))
+        if len(power) < MIN_SPECTRA:
             continue
-        power = np.convolve(np.mean(spectra, axis=0), np.full(3, 1 / 3), "same")  # speeds vary a little
+        power = np.convolve(power.mean(axis=0), np.full(3, 1 / 3), "same")  # speeds vary a little
         around = [
             np.median(power[(frequency > frequency[i] / OCTAVE) & (frequency < frequency[i] * OCTAVE)]) for i in high
         ]
