@@ -9,9 +9,10 @@ import math
 
 import numpy as np
 
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, motor_order
-from .sampling import HALF_TURN, Series, logged_rate
-from .table import LogFormat, Path, Table, counted, fast_enough, needed, order_note, read_bytes, refuse
+from ..rotations import HALF_TURN
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, motor_order
+from .sampling import Series, logged_rate
+from .table import LogFormat, Path, Table, counted, fast_enough, read_bytes, refuse
 
 _HEAD, _FMT, _FMT_LENGTH = b"\xa3\x95", 0x80, 89
 _TYPES = {  # by letter: the type, and the unit of its last digit, 0 for texts and arrays
@@ -49,14 +50,14 @@ def read_ardupilot(path: Path) -> tuple[Table, tuple[str, ...]]:
         refuse(path, "FRAME_CLASS or SERVO5_FUNCTION: this is no quadrotor; give the log of a quadrotor")
     outputs = motor_order(functions, _MOTORS) or [0, 1, 2, 3]
     setting = f"set LOG_BITMASK to {int(get('LOG_BITMASK', 0)) | _FAST} (with fast attitude and fast IMU)"
-    others = {columns: log.fastest(columns, sources) for columns, sources in _SOURCES.items()}
-    rates = needed(path, others.pop(RATES), "body rates", setting)
-    remedy = "add 1024 (RC output) to LOG_BITMASK, and use ESC telemetry by bidirectional DShot"
-    rotors = needed(path, _rotors(log, outputs), "rotor speeds or commands", remedy)
-    log.notes.append(order_note(log.names.get("omega1") or log.names["command1"]))
     dshot = "log rotor speeds at 100 Hz by ESC telemetry of bidirectional DShot (SERVO_BLH_BDMASK = 15)"
-    faster = f"{dshot}, because RCOU is always at 10 Hz, {setting}, and fly again"
-    return log.table(rates, rotors, others, faster=faster)[1], tuple(log.notes)
+    return log.table(
+        {columns: log.fastest(columns, sources) for columns, sources in _SOURCES.items()},
+        _rotors(log, outputs),
+        remedies=(setting, "add 1024 (RC output) to LOG_BITMASK, and use ESC telemetry by bidirectional DShot"),
+        is_ordered=True,
+        faster=f"{dshot}, because RCOU is always at 10 Hz, {setting}, and fly again",
+    )
 
 
 def _recognises(begin: bytes) -> bool:
@@ -67,8 +68,8 @@ def _recognises(begin: bytes) -> bool:
 ARDUPILOT = LogFormat("ArduPilot", "ArduPilot DataFlash log", _recognises, read_ardupilot)
 
 
-def _rotors(log: Messages, outputs: list[int]) -> Series | None:
-    """Speeds [rad/s], or commands [0..1] if they were not measured, or only rarely."""
+def _rotors(log: Messages, outputs: list[int]) -> Rotors | None:
+    """Measured speeds, or commands if there are none, or only rare ones."""
     every = {f"ESC.RPM of output {output + 1}": log.series("ESC", ("RPM",), output) for output in outputs}
     escs = {name: each for name, each in every.items() if each is not None and (each.values > 0).any()}
     commands = log.series("RCOU", [f"C{output + 1}" for output in outputs])
@@ -76,18 +77,17 @@ def _rotors(log: Messages, outputs: list[int]) -> Series | None:
         t = next(iter(escs.values())).t
         rate = logged_rate(t)
         if commands is None or fast_enough(rate) or rate >= logged_rate(commands.t):
-            log.names.update((f"omega{i}", name) for i, name in enumerate(escs, start=1))
             values = [log.speeds_at(t, each, name) * _RPM for name, each in escs.items()]
-            return Series(t, np.abs(np.column_stack(values)))
+            return Rotors(Series(t, np.abs(np.column_stack(values))), [*escs], is_measured=True)
         log.notes.append(f"measured speeds (ESC) were logged at {rate:.2g} Hz only: commands are used")
     if commands is None:
         return None
     get = log.parameters.get
     low, high = get("MOT_PWM_MIN") or 1000.0, get("MOT_PWM_MAX") or 2000.0  # [us]
     low, high = (low, high) if low < high else (1000.0, 2000.0)
-    log.names.update((f"command{i}", f"RCOU.C{output + 1}") for i, output in enumerate(outputs, start=1))
-    log.notes.append(f"commands are RCOU, PWM {low:g}..{high:g}, taken as fractions of full-scale rotor speed")
-    return Series(commands.t, np.clip((commands.values - low) / (high - low), 0.0, 1.0))
+    shares = Series(commands.t, np.clip((commands.values - low) / (high - low), 0.0, 1.0))
+    note = f"commands are RCOU, PWM {low:g}..{high:g}, taken as fractions of full-scale rotor speed"
+    return Rotors(shares, [f"RCOU.C{output + 1}" for output in outputs], is_measured=False, note=note)
 
 
 def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> Messages:

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
+from ..rotations import HALF_TURN, euler_angles
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
 from .messages import ANGLES, FORCES, RATES
-from .sampling import HALF_TURN, euler_angles, in_order
+from .sampling import in_order
 from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, opened, order_note, read_bytes, refuse
 
 _MAGIC = b"H Product:Blackbox"

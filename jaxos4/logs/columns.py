@@ -10,8 +10,8 @@ import numpy as np
 
 from .._files import check_plain, read_toml
 from ..flight import SIGNALS
+from ..rotations import euler_angles
 from .messages import ANGLES
-from .sampling import euler_angles
 from .table import SPEED_NAMES, Path, Table, listed, quoted, refuse
 from .values import COLUMNS, PWM, PWM_ZERO, Quantity
 

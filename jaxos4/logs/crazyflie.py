@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
-from .messages import ANGLES, FORCES, RATES, Fields, Messages
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors
 from .sampling import Series
-from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, needed, quoted, read_bytes, refuse
+from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, quoted, read_bytes, refuse
 
 _MAGIC = b"\xbc"
 _PAIR = re.compile(rb"(..)(..)", re.DOTALL)
@@ -23,8 +23,8 @@ _NAME = re.compile(rb"([^\0]{0,255})\0")
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
 _SETS = re.compile(rb"(.)(tick\(I\),(?:[\x20-\x27\x2a\x2b\x2d-\x7e]{1,80}\([bBhHiIqQefd]\),){1,255})", re.DOTALL)
 _DEGREE, _RPM, _FULL = math.pi / 180, 2 * math.pi / 60, 65535.0
-_RATES = [f"gyro.{axis}" for axis in "xyz"]
-_OTHERS = {
+_SOURCES = {
+    RATES: ([f"gyro.{axis}" for axis in "xyz"], _DEGREE),
     ANGLES: ([f"stateEstimate.{name}" for name in ("roll", "pitch", "yaw")], _DEGREE * np.array([1, -1, 1])),
     # Each of these is read by itself.
     **{(name,): ([f"acc.{name[1]}"], STANDARD_GRAVITY) for name in FORCES},
@@ -32,9 +32,9 @@ _OTHERS = {
     ("voltage",): (["pm.vbat"], 1.0),
 }
 _ROTORS = (
-    (SPEED_NAMES, "rpm.m{}", _RPM),
-    (COMMAND_NAMES, "motor.m{}", 1 / _FULL),
-    (COMMAND_NAMES, "pwm.m{}_pwm", 1 / _FULL),
+    ("rpm.m{}", True, _RPM),
+    ("motor.m{}", False, 1 / _FULL),
+    ("pwm.m{}_pwm", False, 1 / _FULL),
 )
 _AGAIN = "copy it again from the card"
 _REMEDY = f"the log is corrupt there: {_AGAIN}, or choose another"
@@ -53,15 +53,15 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     if not events:
         refuse(path, "holds no events; a flight needs at least two")
     log = Messages(path, events, _REMEDY, notes, prefixed=False)
-    rates = _logged(log, RATES, _RATES, _DEGREE)
-    rates = needed(path, rates, "body rates", "add gyro.x, gyro.y and gyro.z to the deck's config.txt")
-    remedy = "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt"
-    rotors = needed(path, _rotors(log), "rotor speeds or commands", remedy)
-    others = {columns: _logged(log, columns, *source) for columns, source in _OTHERS.items()}
-    if "command1" in log.names:
-        log.note_commands()
-    faster = "raise the frequency of these variables in the deck's config.txt, and fly again"
-    return log.table(rates, rotors, others, faster=faster)[1], tuple(notes)
+    return log.table(
+        {columns: _logged(log, columns, *source) for columns, source in _SOURCES.items()},
+        _rotors(log),
+        remedies=(
+            "add gyro.x, gyro.y and gyro.z to the deck's config.txt",
+            "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt",
+        ),
+        faster="raise the frequency of these variables in the deck's config.txt, and fly again",
+    )
 
 
 CRAZYFLIE = LogFormat(
@@ -79,18 +79,17 @@ def _logged(
     return log.fastest(columns, [(event, variables, factor) for event in log.fields])
 
 
-def _rotors(log: Messages) -> Series | None:
-    """Rotor speeds [rad/s] or commands [0..1]."""
-    for columns, variable, factor in _ROTORS:
-        series = _logged(log, columns, [variable.format(i) for i in range(1, 5)], factor)
-        if series is None:
+def _rotors(log: Messages) -> Rotors | None:
+    for variable, is_measured, factor in _ROTORS:
+        names = [variable.format(i) for i in range(1, 5)]
+        series = _logged(log, SPEED_NAMES if is_measured else COMMAND_NAMES, names, factor)
+        finite = np.zeros(0) if series is None else np.isfinite(series.values).all(axis=1)
+        if series is None or np.count_nonzero(finite) < 2:
             continue
-        measured, finite = columns == SPEED_NAMES, np.isfinite(series.values).all(axis=1)
-        if np.count_nonzero(finite) > 1 and not (measured and not (series.values > 0).any(axis=0).all()):
-            values = series.values[finite]
-            return Series(series.t[finite], values if measured else np.clip(values, 0.0, 1.0))
-        for column in columns:
-            del log.names[column]
+        if not is_measured:
+            return Rotors(Series(series.t[finite], np.clip(series.values[finite], 0.0, 1.0)), names, is_measured)
+        if (series.values > 0).any(axis=0).all():
+            return Rotors(Series(series.t[finite], series.values[finite]), names, is_measured)
     return None
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from .sampling import (
     root_mean_square,
     unwrap,
 )
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFacts, Path, Sampling, Table, refuse
+from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFacts, Path, Sampling, Table, order_note, refuse
 from .values import dropped, without_impossible
 
 RATES, ANGLES, FORCES = ("p", "q", "r"), ("phi", "theta", "psi"), ("ax", "ay", "az")
@@ -29,6 +29,18 @@ Names = tuple[str, ...]
 Fields = dict[str, np.ndarray]
 Source = tuple[str, Sequence[str], float | Float[np.ndarray, " fields"]]
 """A kind of messages, the fields that hold some of our columns, and the factors to our units and frame."""
+
+
+class Rotors(NamedTuple):
+    """Speeds [rad/s] or commands [0..1] of four rotors, and their names in the log.
+
+    - `is_measured`: whether they are speeds. `note`: what was assumed of commands.
+    """
+
+    series: Series
+    names: Sequence[str]
+    is_measured: bool
+    note: str = ""
 
 
 def motor_order(functions: Sequence[int], motors: Sequence[int]) -> list[int] | None:
@@ -113,31 +125,41 @@ class Messages:
         begin = f"{kind}." if self.prefixed else ""
         self.names.update((column, begin + field) for column, field in zip(columns, fields, strict=True))
 
-    def note_commands(self) -> None:
-        """Note that commands are taken as they are."""
-        self.notes.append(f"commands are {self.names['command1']}.., taken as fractions of full-scale rotor speed")
-
     def table(
-        self, rates: Series, rotors: Series, others: Mapping[Names, Series | None], **facts: Any
-    ) -> tuple[RowPositions, Table]:
-        """Rows at the times of the gyro, at most 1 kHz, with rotors and `others` brought to them.
+        self,
+        found: Mapping[Names, Series | None],
+        rotors: Rotors | None,
+        *,
+        remedies: tuple[str, str],
+        is_ordered: bool = False,
+        landed: Iterable[tuple[float, float]] = (),
+        **facts: Any,
+    ) -> tuple[Table, tuple[str, ...]]:
+        """Rows at the times of the gyro, at most 1 kHz, with rotors and other columns brought to them; and all notes.
 
-        Series are in our units and frame. Impossible samples are taken out before. Rotor speeds are measured if
-        `omega1` has a name, else commands [0..1]. `others`: by the names of their columns; `None`: not logged. `facts`:
-        more of `LogFacts`.
+        Series are in our units and frame. Impossible samples are taken out before.
 
-        **Returns:** the times of the rows [s], and the table; `t` is 0 in the first row.
+        - `found`: by the names of their columns, body rates among them; `None`: not logged.
+        - `remedies`: if the log has no body rates, and if it has no rotors.
+        - `is_ordered`: whether the log says which rotor is which.
+        - `landed`: from when to when the vehicle was on the ground [s], in the log's time.
+        - `facts`: more of `LogFacts`.
 
-        **Raises:** `InputError` if rates and rotors do not overlap, for too many rows or impossible samples.
+        **Raises:** `InputError` if rates or rotors are missing or do not overlap, for too many rows or impossible
+        samples.
         """
-        measured = "omega1" in self.names
-        rotor_names = SPEED_NAMES if measured else COMMAND_NAMES
-        sources = {name: self.names[name] for name in (rotor_names[0], "p")}
-        motors, gyro = (each.partition(".")[0] if self.prefixed else each for each in sources.values())
-        written = Sampling(motors, logged_rate(rotors.t)), Sampling(gyro, logged_rate(rates.t))
-        about = LogFacts(*written, **facts)
-        table = Table(self.path, {}, first_row=None, names=self.names, remedy=self.remedy, facts=about)
-        start = rates.t[min(np.count_nonzero(rates.t < rotors.t[0]), rates.t.size - 1)]
+        rates = found.get(RATES)
+        if rates is None:
+            refuse(self.path, f"holds no body rates; {remedies[0]}")
+        if rotors is None:
+            refuse(self.path, f"holds no rotor speeds or commands; {remedies[1]}")
+        speeds, rotor_names = rotors.series, SPEED_NAMES if rotors.is_measured else COMMAND_NAMES
+        self.names.update(zip(rotor_names, rotors.names, strict=True))
+        sources = [rotors.names[0], self.names["p"]]
+        motors, gyro = (each.partition(".")[0] if self.prefixed else each for each in sources)
+        written = Sampling(motors, logged_rate(speeds.t)), Sampling(gyro, logged_rate(rates.t))
+        table = Table(self.path, {}, first_row=None, names=self.names, remedy=self.remedy)
+        start = rates.t[min(np.count_nonzero(rates.t < speeds.t[0]), rates.t.size - 1)]
 
         def possible(names: Names, series: Series) -> Series:
             nonlocal table
@@ -145,22 +167,30 @@ class Messages:
             table = without_impossible(table._replace(columns=columns))
             return Series(series.t, np.column_stack([table.columns[name] for name in names]))
 
-        rates, rotors = at_most(possible(RATES, rates), _FASTEST_ROWS), possible(rotor_names, rotors)
-        turning = np.isfinite(rotors.values).all(axis=1)
-        rotors = Series(rotors.t[turning], rotors.values[turning])
-        inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + REACH * median_step(rotors.t))
+        rates, speeds = at_most(possible(RATES, rates), _FASTEST_ROWS), possible(rotor_names, speeds)
+        turning = np.isfinite(speeds.values).all(axis=1)
+        speeds = Series(speeds.t[turning], speeds.values[turning])
+        inside = (rates.t >= speeds.t[0]) & (rates.t <= speeds.t[-1] + REACH * median_step(speeds.t))
         if np.count_nonzero(inside) < 2:
             refuse(self.path, "rates and motors were not logged at the same time; record both in one flight")
         rows = rates.t[inside]
         if rows.size > MAX_ROWS:
             refuse(self.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
         columns = {"t": rows - rows[0]} | dict(zip(RATES, rates.values[inside].T, strict=True))
-        columns |= zip(rotor_names, root_mean_square(rotors, linear=measured)(rows).T, strict=True)
-        for names, series in others.items():
-            if series is None:
+        columns |= zip(rotor_names, root_mean_square(speeds, linear=rotors.is_measured)(rows).T, strict=True)
+        for names, series in found.items():
+            if series is None or names == RATES:
                 continue
             if names == ANGLES:
                 phi, theta, psi = series.values.T
                 series = Series(series.t, np.column_stack([unwrap(phi)[0], theta, unwrap(psi)[0]]))
             columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
-        return rows, table._replace(columns=columns, held=True)
+        first, last = float(rows[0]), float(rows[-1])
+        inside = [(max(begin, first) - first, min(end, last) - first) for begin, end in landed]
+        about = LogFacts(*written, landed=tuple(each for each in inside if each[0] <= each[1]), **facts)
+        if not rotors.is_measured:
+            plain = f"commands are {rotors.names[0]}.., taken as fractions of full-scale rotor speed"
+            self.notes.append(rotors.note or plain)
+        if is_ordered:
+            self.notes.append(order_note(rotors.names[0]))
+        return table._replace(columns=columns, held=True, facts=about), tuple(self.notes)

@@ -16,10 +16,11 @@ import numpy as np
 
 from .._files import reading
 from ..errors import shortened
+from ..rotations import euler_angles
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
 from .compression import check_parts, check_sizes
-from .messages import ANGLES, RATES, Fields, Messages, Names
-from .sampling import Series, euler_angles
+from .messages import ANGLES, RATES, Fields, Messages, Rotors
+from .sampling import Series
 from .table import (
     COMMAND_NAMES,
     MAX_ROWS,
@@ -28,7 +29,6 @@ from .table import (
     Path,
     Table,
     listed,
-    needed,
     opened,
     quoted,
     refuse,
@@ -150,7 +150,7 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
     chosen = columns.chosen(path, held, topics)
     found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
     log = Messages(path, found, _REMEDY, notes, prefixed=False)
-    return _table(log, columns, chosen), tuple(notes)
+    return _table(log, columns, chosen)
 
 
 def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
@@ -248,7 +248,7 @@ def _timed(
     return messages
 
 
-def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
+def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[Table, tuple[str, ...]]:
     """The table of the columns that a map has `chosen`. Raises `InputError` if body rates or rotors are missing."""
     found: dict[str, Series] = {}
     for topic in sorted({place.partition(".")[0] for place in chosen.values()}):
@@ -277,26 +277,24 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
 
         return Series(t, np.column_stack([at(name) for name in names]))
 
-    def turning(names: Sequence[str]) -> Series | None:
+    def turning(names: Sequence[str]) -> Rotors | None:
         """The samples with all four rotors; `None` if one of them never turns."""
         rotors = together(names)
         if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
             return None
         whole = np.isfinite(rotors.values).all(axis=1)
-        return Series(rotors.t[whole], rotors.values[whole]) if np.count_nonzero(whole) > 1 else None
+        if np.count_nonzero(whole) < 2:
+            return None
+        series = Series(rotors.t[whole], rotors.values[whole])
+        return Rotors(series, [chosen[name] for name in names], is_measured=names == SPEED_NAMES)
 
-    rates = needed(log.path, together(RATES), "body rates", f"name p, q and r in {columns.name}")
-    remedy = f"name omega1..4 or command1..4 in {columns.name}"
-    rotors = turning(SPEED_NAMES) or turning(COMMAND_NAMES)
-    rotors = needed(log.path, rotors, "rotor speeds or commands", remedy)
-    if "command1" in log.names:
-        for name in SPEED_NAMES:  # named, but at rest
-            log.names.pop(name, None)
-        log.note_commands()
     quaternion, angles = together(QUATERNION), together(ANGLES)
     if angles is None and quaternion is not None:
         angles = Series(quaternion.t, euler_angles(quaternion.values))
         log.names.update(dict.fromkeys(ANGLES, chosen["qw"]))
     single = found.keys() - {*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, *RATES, "t"}
-    others: dict[Names, Series | None] = {ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)}
-    return log.table(rates, rotors, others)[1]
+    return log.table(
+        {RATES: together(RATES), ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)},
+        turning(SPEED_NAMES) or turning(COMMAND_NAMES),
+        remedies=(f"name p, q and r in {columns.name}", f"name omega1..4 or command1..4 in {columns.name}"),
+    )

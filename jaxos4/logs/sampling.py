@@ -14,8 +14,6 @@ REACH = 1.5  # times the step: measured samples further apart have a gap between
 _ROUNDING = 1e-6  # of a step: a smaller difference from a grid is a rounding error
 _FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
 
-HALF_TURN = np.array([1.0, -1.0, -1.0])
-"""About x: from x forward, y right, z down to x forward, y left, z up."""
 Times = Float[np.ndarray, " samples"]
 Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]
@@ -201,15 +199,6 @@ def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"
     without_turns = np.unwrap(angle[measured])
     unwrapped[measured] = np.where(without_turns == angle[measured], angle[measured], without_turns)  # keeps -0.0
     return unwrapped, int(np.count_nonzero(np.abs(np.diff(angle[measured])) > math.pi))
-
-
-def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarray, "*samples 3"]:
-    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z) of any length, without unwrapping; of zeros, NaN."""
-    with np.errstate(all="ignore"):
-        w, x, y, z = np.moveaxis(quaternion / np.sqrt((quaternion**2).sum(axis=-1, keepdims=True)), -1, 0)
-    phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return np.stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
 
 
 def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"] | None:

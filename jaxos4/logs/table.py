@@ -4,7 +4,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import IO, Any, NamedTuple, NoReturn, TypeVar
+from typing import IO, Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
@@ -15,7 +15,6 @@ from ..errors import InputError, printable, shortened
 from ..flight import SIGNALS, Flight, with_force
 
 Path = str | os.PathLike[str]
-Found = TypeVar("Found")
 
 MAX_ROWS = 5_000_000  # 83 minutes at 1 kHz; a longer flight does not fit in the memory of an ordinary machine
 SLOWEST_RATE = 40.0
@@ -229,13 +228,6 @@ def signals_of(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
             rows = np.column_stack([columns.get(name, nothing) for name in signal.columns])
             signals[field] = rows.reshape(nothing.size, *(signal.shape or ()))
     return signals
-
-
-def needed(path: Path, found: Found | None, what: str, remedy: str) -> Found:
-    """Return `found`, or raise `InputError` if the reader found nothing."""
-    if found is None:
-        refuse(path, f"holds no {what}; {remedy}")
-    return found
 
 
 def order_note(first: str) -> str:

@@ -10,7 +10,7 @@ from ...airframe import GRAVITY
 from ...flight import ANGLES, RATES, VELOCITY
 from ...logs import Recording
 from ...logs.sampling import averages
-from ..motion import rotations_to_body
+from ...rotations import rotations_to_body
 
 BATCHES = 12
 """The batches of the jackknife."""
@@ -196,7 +196,7 @@ def velocity_slopes(stretches: Sequence[Recording]) -> Measured | None:
     """The horizontal acceleration along and across that of force and attitude, relative to it. `None`: not measured."""
 
     def vectors(angles: np.ndarray, force: np.ndarray, velocity: np.ndarray, step: float) -> Pair:
-        felt = np.einsum("tji,tj->ti", rotations_to_body(*angles.T), force) - [0.0, 0.0, GRAVITY]
+        felt = np.einsum("tji,tj->ti", rotations_to_body(angles), force) - [0.0, 0.0, GRAVITY]
         return (felt[1:, :2] + felt[:-1, :2]) / 2, np.diff(velocity[:, :2], axis=0) / step
 
     return _slopes(stretches, vectors, step=0.2)  # velocities are noisy
