@@ -60,6 +60,14 @@ _UNREAD = {
         "convert it to CSV by sdlog2_dump.py (of PX4 before version 1.10), and give a column map",
     ),
     rb".{16}BUILD|.{242}DJI": ("a log of DJI", "decode it by DatCon, and give its CSV with a column map"),
+    rb"(?:\xef\xbb\xbf)?\s*\{": (
+        "a JSON file",
+        "the result of `jaxos4 estimate` is read by `jaxos4 report`, `export` and `predict`; give a log here",
+    ),
+    rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[ \t]*(?:\[\w|[\w-]+[ \t]*=)": (
+        "a TOML file",
+        "give an airframe as `airframe`, a column map as `columns`, a study to `jaxos4 study`, and a log here",
+    ),
     rb"[^\n]{0,4000}[\0-\x08\x0e-\x1f]": ("of a kind that is not known", "export it as CSV, and give a column map"),
 }
 
