@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from ..rotations import HALF_TURN
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, motor_order
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, motor_order, records
 from .sampling import Series, logged_rate
 from .table import LogFormat, Path, Table, counted, fast_enough, read_bytes, refuse
 
@@ -115,17 +115,16 @@ def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> 
     if damaged:
         what = "what follows up to the next message is ignored"
         notes.append(f"the log is damaged in {counted(damaged, 'place')}; {what}")
-    data, messages, parameters = np.frombuffer(content, dtype=np.uint8), {}, {}
+    messages, parameters = {}, {}
     for kind, (name, layout, units) in layouts.items():
-        begin = np.asarray(places[kind], dtype=np.int64)
-        if layout is None or not begin.size or name not in _READ:
+        if layout is None or not places[kind] or name not in _READ:
             continue
-        records = data[begin[:, None] + np.arange(layout.itemsize)].reshape(-1).view(layout)
+        found = records(content, places[kind], layout)
         with np.errstate(all="ignore"):  # a damaged float need not be finite
-            fields = {f: records[f].astype(float) * unit for f, unit in units.items() if unit}
+            fields = {f: found[f].astype(float) * unit for f, unit in units.items() if unit}
         messages[name] = _instances(fields)
         if name == "PARM" and "Name" in units and "Value" in fields:  # a text is no field
-            names = (each.decode(errors="replace") for each in records["Name"].astype("S64").tolist())
+            names = (each.decode(errors="replace") for each in found["Name"].astype("S64").tolist())
             parameters = {n: x for n, x in zip(names, fields["Value"].tolist(), strict=True) if abs(x) < 1e9}
     return Messages(path, messages, _REMEDY, notes, parameters=parameters)
 

@@ -29,7 +29,7 @@ _TURNED = {"q", "r", "theta", "psi", "y", "z", "vy", "vz", "qy", "qz", *_ALONG_Y
 _REMEDY = "correct its unit or sign in the column map"
 
 
-class Source(NamedTuple):
+class ColumnSource(NamedTuple):
     """The source of a column: the first of `names` that a log holds. Its values: (value - `zero`) * `factor`."""
 
     names: tuple[str, ...]
@@ -47,7 +47,7 @@ class ColumnMap(NamedTuple):
     """
 
     name: str
-    sources: dict[str, Source]
+    sources: dict[str, ColumnSource]
     needed: frozenset[str] = frozenset()
     recorded: bool = False
 
@@ -79,7 +79,7 @@ class ColumnMap(NamedTuple):
 def column_map(given: ColumnsGiven) -> ColumnMap:
     """A checked column map; `None`: the columns of the flight CSV. Raises `InputError`, one line, or `OSError`."""
     if given is None:
-        return ColumnMap("flight CSV", {name: Source((name,)) for name in _COLUMNS})
+        return ColumnMap("flight CSV", {name: ColumnSource((name,)) for name in _COLUMNS})
     if isinstance(given, Mapping):
         name, table = "columns", dict(given)
         check_plain(name, table, "correct it")
@@ -113,7 +113,7 @@ def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
     return ColumnMap(quoted(name), sources, frozenset(columns) if needed else frozenset(), time == "recorded")
 
 
-def _source(name: str, column: str, value: Any) -> Source:
+def _source(name: str, column: str, value: Any) -> ColumnSource:
     """The source of one column, as it stands in the map. Raises `InputError`."""
     if column not in _COLUMNS:
         refuse(name, f"there is no column {quoted(str(column))}; the columns are {', '.join(_COLUMNS)}")
@@ -131,7 +131,7 @@ def _source(name: str, column: str, value: Any) -> Source:
         refuse(
             name, f"may have a source, a unit ({units}, or a factor) and a sign (1 or -1); correct it", column=column
         )
-    return Source(tuple(names), float(factor) * sign, PWM_ZERO if unit == PWM else 0.0)
+    return ColumnSource(tuple(names), float(factor) * sign, PWM_ZERO if unit == PWM else 0.0)
 
 
 def mapped_rows(table: Table, columns: ColumnMap) -> Table:

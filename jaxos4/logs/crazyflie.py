@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, records
 from .sampling import Series
 from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, quoted, read_bytes, refuse
 
@@ -83,13 +83,12 @@ def _rotors(log: Messages) -> Rotors | None:
     for variable, is_measured, factor in _ROTORS:
         names = [variable.format(i) for i in range(1, 5)]
         series = _logged(log, SPEED_NAMES if is_measured else COMMAND_NAMES, names, factor)
-        finite = np.zeros(0) if series is None else np.isfinite(series.values).all(axis=1)
-        if series is None or np.count_nonzero(finite) < 2:
+        if series is None:
             continue
-        if not is_measured:
-            return Rotors(Series(series.t[finite], np.clip(series.values[finite], 0.0, 1.0)), names, is_measured)
-        if (series.values > 0).any(axis=0).all():
-            return Rotors(Series(series.t[finite], series.values[finite]), names, is_measured)
+        finite = np.isfinite(series.values).all(axis=1)
+        if np.count_nonzero(finite) > 1 and not (is_measured and not (series.values > 0).any(axis=0).all()):
+            values = series.values[finite] if is_measured else np.clip(series.values[finite], 0.0, 1.0)
+            return Rotors(Series(series.t[finite], values), names, is_measured)
     return None
 
 
@@ -101,13 +100,12 @@ def _events(path: Path, content: bytes, notes: list[str]) -> Events:
     if not valid:
         cut = f"and its last {ignored} bytes are not a complete event" if ignored else "but ends with a complete event"
         notes.append(f"the log has no valid checksum, {cut}: it was cut while it was written, or is corrupt")
-    data, found = np.frombuffer(content, dtype=np.uint8), {}
+    found: Events = {}
     for number, (name, layout) in types.items():
-        at = np.asarray(places[number], dtype=np.int64)
-        if at.size > 1:
-            records = data[at[:, None] + np.arange(layout.itemsize)].reshape(-1).view(layout)
-            fields = {each: records[each] for each in layout.names or () if each[0] != " "}
-            found.setdefault(name, {})[number] = fields | {"t": records[" t"] * (1e-3 if version == 1 else 1e-6)}
+        if len(places[number]) > 1:
+            events = records(content, places[number], layout)
+            fields = {each: events[each] for each in layout.names or () if each[0] != " "}
+            found.setdefault(name, {})[number] = fields | {"t": events[" t"] * (1e-3 if version == 1 else 1e-6)}
     return found
 
 
@@ -127,9 +125,9 @@ def _sets(path: Path, content: bytes, notes: list[str]) -> Events:
         at = end + 4
     if bad:
         notes.append(f"{counted(bad, 'block')} of the log with a wrong checksum are ignored: they are cut or corrupt")
-    records = np.frombuffer(b"".join(good), layout)
-    sets = {name: records[name] for name, _ in fields} | {"t": records["tick"] * 1e-3}
-    return {"its data sets": {0: sets}} if records.size > 1 else {}
+    rows = np.frombuffer(b"".join(good), layout)
+    sets = {name: rows[name] for name, _ in fields} | {"t": rows["tick"] * 1e-3}
+    return {"its data sets": {0: sets}} if rows.size > 1 else {}
 
 
 def _field(variable: re.Match[bytes]) -> tuple[str, str]:

@@ -27,7 +27,7 @@ _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no
 
 Names = tuple[str, ...]
 Fields = dict[str, np.ndarray]
-Source = tuple[str, Sequence[str], float | Float[np.ndarray, " fields"]]
+MessageSource = tuple[str, Sequence[str], float | Float[np.ndarray, " fields"]]
 """A kind of messages, the fields that hold some of our columns, and the factors to our units and frame."""
 
 
@@ -46,6 +46,12 @@ class Rotors(NamedTuple):
 def motor_order(functions: Sequence[int], motors: Sequence[int]) -> list[int] | None:
     """The places of motors 1 to 4 among the outputs with these functions; `None` if one of them is missing."""
     return [functions.index(motor) for motor in motors] if {*motors} <= {*functions} else None
+
+
+def records(content: bytes, places: Sequence[int], layout: np.dtype) -> np.ndarray:
+    """The records of this layout that begin at these bytes."""
+    begin = np.asarray(places, dtype=np.int64)[:, None]
+    return np.frombuffer(content, np.uint8)[begin + np.arange(layout.itemsize)].reshape(-1).view(layout)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +103,9 @@ class Messages:
             values = np.column_stack([raw[name].astype(float)[kept] for name in fields])
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
 
-    def fastest(self, columns: Sequence[str], sources: Iterable[Source], *, faster: float = 1.1) -> Series | None:
+    def fastest(
+        self, columns: Sequence[str], sources: Iterable[MessageSource], *, faster: float = 1.1
+    ) -> Series | None:
         """The source that was logged most often in our units and frame; a later one must be `faster` by this factor."""
         best, found = 0.0, None
         for kind, fields, factor in sources:

@@ -15,7 +15,7 @@ import numpy as np
 from .._files import reading
 from ..rotations import HALF_TURN, euler_angles
 from .columns import column_map
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, Names, Rotors, Source, motor_order
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, MessageSource, Names, Rotors, motor_order
 from .sampling import Series, logged_rate
 from .table import LogFormat, Path, Table, fast_enough, read_bytes, refuse
 
@@ -86,7 +86,7 @@ ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(_MAGIC), rea
 
 
 @functools.cache
-def _sources(columns: Names) -> list[Source]:
+def _sources(columns: Names) -> list[MessageSource]:
     """The topics of some columns, their fields, and the factors to our units and frame."""
     preset, begin = _BRIDGE
     given = [column_map(preset).sources[name] for name in columns]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -43,7 +44,7 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
     whole = [stretch for stretch in whole if stretch.time.size]
     if not whole:
         raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
-    return joined(whole).flight
+    return concatenate(whole).flight
 
 
 def whole_windows(recording: Recording, length: int) -> Recording:
@@ -51,7 +52,7 @@ def whole_windows(recording: Recording, length: int) -> Recording:
     return recording.rows(slice(recording.time.size // length * length))
 
 
-def joined(stretches: Sequence[Recording]) -> Recording:
+def concatenate(stretches: Sequence[Recording]) -> Recording:
     """Stretches one after the other; time counts samples from 0. Raises `ValueError` if the sample times differ."""
     steps = [stretch.dt for stretch in stretches]
     if np.ptp(steps) > _SAME * steps[0]:
@@ -67,7 +68,7 @@ def joined(stretches: Sequence[Recording]) -> Recording:
         nothing = [np.full((size, *(signal.shape or ())), np.nan) for size in sizes]
         return np.concatenate([none if each is None else each for each, none in zip(rows, nothing, strict=True)])
 
-    signals = {name: whole(name, signal) for name, signal in SIGNALS.items()}
+    signals: dict[str, Any] = {name: whole(name, signal) for name, signal in SIGNALS.items()}
     signals["stretch"] = np.repeat(np.arange(len(sizes)), sizes)
     return Recording(
         time=steps[0] * np.arange(sum(sizes)),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..._custom_types import Numeric
 from ...airframe import GRAVITY, INERTIAS, YAW
 from ...rotations import angles_of, rotation
 from .estimates import BATCHES, Measured, batched
@@ -47,9 +48,9 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     return Finding("mounting", cause, ways, remedy, quantities, True)
 
 
-def _rotation_for(evidence: Evidence, turn: Float[np.ndarray, "3 3"]) -> str:
+def _rotation_for(evidence: Evidence, turn: Float[Numeric, "3 3"]) -> str:
     """The advice to give the rotation that turns the sensors further by the matrix `turn`."""
-    axes = turn if evidence.airframe is None else turn @ np.asarray(evidence.airframe.sensor_axes)
+    axes = np.asarray(turn if evidence.airframe is None else turn @ evidence.airframe.sensor_axes)
     degrees = ", ".join(f"{round(math.degrees(angle)) + 0}" for angle in angles_of(axes))
     return f"give `sensor_rotation = [{degrees}]` [deg] in the airframe's file"
 
