@@ -23,7 +23,7 @@ from .ros import ROS
 from .table import (
     LogFacts as LogFacts,
     LogFormat as LogFormat,
-    Path,
+    LogPath,
     Recording as Recording,
     Sampling as Sampling,
     Table as Table,
@@ -76,7 +76,7 @@ Source = Flight | Recording | str | os.PathLike[str] | Any
 
 
 def read_log(
-    log: Path | Any,
+    log: LogPath | Any,
     airframe: Airframe | None = None,
     *,
     full_scale: float | None = None,
@@ -100,7 +100,7 @@ def read_log(
 
 
 def read_recording(
-    log: Path | Any,
+    log: LogPath | Any,
     airframe: Airframe | None = None,
     *,
     full_scale: float | None = None,
@@ -120,7 +120,7 @@ def read_recording(
     return recording._replace(facts=recording.facts._replace(format=kind))
 
 
-def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
+def read_flight(path: LogPath, airframe: Airframe | None = None) -> Flight:
     """Read a flight from a CSV file. Its columns: docs/index.md.
 
     Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such a grid. Jumps of 2 pi in
@@ -132,7 +132,7 @@ def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
     return found.flight
 
 
-def log_format(path: Path) -> LogFormat:
+def log_format(path: LogPath) -> LogFormat:
     """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
 
     Formats of other packages are asked before the last; one that fails is a `UserWarning`. A pipe can be read only

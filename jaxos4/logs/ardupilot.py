@@ -12,7 +12,7 @@ import numpy as np
 from ..rotations import HALF_TURN
 from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, motor_order, records
 from .sampling import Series, logged_rate
-from .table import LogFormat, Path, Table, counted, fast_enough, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, counted, fast_enough, read_bytes, refuse
 
 _HEAD, _FMT, _FMT_LENGTH = b"\xa3\x95", 0x80, 89
 _TYPES = {  # by letter: the type, and the unit of its last digit, 0 for texts and arrays
@@ -41,7 +41,7 @@ _FAST = 1 | 1 << 18  # LOG_BITMASK: fast attitude, fast IMU
 _REMEDY = "the log is corrupt there: download it again, or choose another"
 
 
-def read_ardupilot(path: Path) -> tuple[Table, tuple[str, ...]]:
+def read_ardupilot(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a log of ArduPilot, and notes on what was assumed. Raises `InputError`."""
     log = _decoded(path)
     get = log.parameters.get
@@ -90,7 +90,7 @@ def _rotors(log: Messages, outputs: list[int]) -> Rotors | None:
     return Rotors(shares, [f"RCOU.C{output + 1}" for output in outputs], is_measured=False, note=note)
 
 
-def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> Messages:
+def _decoded(path: LogPath, *, largest: int = 1 << 30, most_damage: int = 1000) -> Messages:
     """The messages that are read. Raises `InputError` for more than `largest` bytes, or places of damage."""
     content, at, notes = read_bytes(path, largest), 0, []
     sizes, layouts = {_FMT: _FMT_LENGTH}, {}

@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,13 +12,13 @@ from .._files import check_plain, read_toml
 from ..flight import SIGNALS
 from ..rotations import euler_angles
 from .messages import ANGLES
-from .table import SPEED_NAMES, Path, Table, listed, quoted, refuse
+from .table import SPEED_NAMES, LogPath, Table, listed, quoted, refuse
 from .values import COLUMNS, PWM, PWM_ZERO, Quantity
 
-ColumnsGiven = Path | Mapping[str, Any] | None
+ColumnsGiven = LogPath | Mapping[str, Any] | None
 """A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
 
-PRESETS = {path.stem: path for path in sorted(FilePath(__file__).with_name("presets").glob("*.toml"))}
+PRESETS = {path.stem: path for path in sorted(Path(__file__).with_name("presets").glob("*.toml"))}
 QUATERNION = ("qw", "qx", "qy", "qz")
 _QUATERNION = Quantity("of a quaternion", -math.inf, math.inf, "")
 _COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
@@ -51,7 +51,7 @@ class ColumnMap(NamedTuple):
     needed: frozenset[str] = frozenset()
     recorded: bool = False
 
-    def chosen(self, path: Path, held: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
+    def chosen(self, path: LogPath, held: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
         """By column, its place in a log.
 
         - `held`: takes a source; returns its name in the log, or `None` if the log does not hold it.

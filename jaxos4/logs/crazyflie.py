@@ -14,7 +14,7 @@ import numpy as np
 from ..airframe import STANDARD_GRAVITY
 from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, records
 from .sampling import Series
-from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, quoted, read_bytes, refuse
+from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, LogPath, Table, counted, quoted, read_bytes, refuse
 
 _MAGIC = b"\xbc"
 _PAIR = re.compile(rb"(..)(..)", re.DOTALL)
@@ -45,7 +45,7 @@ Types = dict[int, tuple[str, np.dtype]]
 Events = dict[str, dict[int, Fields]]
 
 
-def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
+def read_crazyflie(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a Crazyflie's log, and notes on what was assumed. Raises `InputError`."""
     notes: list[str] = []
     content = read_bytes(path, 1 << 28)  # an hour at 1 kHz
@@ -92,7 +92,7 @@ def _rotors(log: Messages) -> Rotors | None:
     return None
 
 
-def _events(path: Path, content: bytes, notes: list[str]) -> Events:
+def _events(path: LogPath, content: bytes, notes: list[str]) -> Events:
     """The events of versions 1 and 2, by the names of their types."""
     types, version, at = _types(path, content)
     valid = len(content) >= at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
@@ -109,7 +109,7 @@ def _events(path: Path, content: bytes, notes: list[str]) -> Events:
     return found
 
 
-def _sets(path: Path, content: bytes, notes: list[str]) -> Events:
+def _sets(path: LogPath, content: bytes, notes: list[str]) -> Events:
     """The one event of the format of 2019: names, then blocks of data sets, each with the inverse of its CRC-32."""
     match = _SETS.match(content)
     found = [] if match is None else [_VARIABLE.fullmatch(text.strip()) for text in match[2].split(b",")[:-1]]
@@ -135,7 +135,7 @@ def _field(variable: re.Match[bytes]) -> tuple[str, str]:
     return variable[1].decode(), "<f2" if variable[2] == b"e" else f"<{variable[2].decode()}"
 
 
-def _types(path: Path, content: bytes, *, most_types: int = 64, most_variables: int = 256) -> tuple[Types, int, int]:
+def _types(path: LogPath, content: bytes, *, most_types: int = 64, most_variables: int = 256) -> tuple[Types, int, int]:
     """The types of events, the version, and the number of bytes of the header. Raises `InputError`."""
     at = 1
 
@@ -172,7 +172,7 @@ def _types(path: Path, content: bytes, *, most_types: int = 64, most_variables: 
     return types, version, at
 
 
-def _places(path: Path, content: bytes, types: Types, at: int, *, valid: bool) -> tuple[dict[int, array.array], int]:
+def _places(path: LogPath, content: bytes, types: Types, at: int, *, valid: bool) -> tuple[dict[int, array.array], int]:
     """The position of each event by its type, and the number of bytes after the last complete event."""
     places, end = {number: array.array("q") for number in types}, len(content)
     sizes = {number: layout.itemsize for number, (_, layout) in types.items()}

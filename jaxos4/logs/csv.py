@@ -18,7 +18,7 @@ from .table import (
     MAX_ROWS,
     SPEED_NAMES,
     LogFormat,
-    Path,
+    LogPath,
     Recording,
     Table,
     counted,
@@ -34,7 +34,7 @@ _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", 
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
 
-def read_mapped(path: Path, columns: ColumnMap) -> tuple[Table, tuple[str, ...]]:
+def read_mapped(path: LogPath, columns: ColumnMap) -> tuple[Table, tuple[str, ...]]:
     """Read a CSV file by a column map. Raises `InputError`."""
     known = {name for source in columns.sources.values() for name in source.names}
     return mapped_rows(read_table(path, known, missing=("NaN", "nan")), columns), ()
@@ -59,7 +59,7 @@ CSV = LogFormat(
 
 
 def read_table(
-    path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = (), lines_at_once: int = 10_000
+    path: LogPath, known: Collection[str], *, skip: int = 0, missing: Collection[str] = (), lines_at_once: int = 10_000
 ) -> Table:
     """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
 
@@ -91,7 +91,7 @@ def read_table(
     return Table(path, columns, tuple(name for name in header if name not in known), skip + 2)
 
 
-def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
+def write_flight(flight: Flight, path: LogPath, airframe: Airframe | None = None) -> None:
     """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of its signals.
 
     Reading the file gives back every bit of measured speeds and states; angles are unwrapped. If writing fails, an
@@ -124,7 +124,7 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
         writer.writerows(["" if math.isnan(x) else x for x in row.tolist()] for row in rows)
 
 
-def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str]:
+def _header(path: LogPath, line: str, known: Collection[str], row: int) -> list[str]:
     """The names of the columns."""
     if not _readable(line):
         refuse(path, _NOT_UTF8, row=row)
@@ -146,7 +146,7 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
     return names
 
 
-def _rows(path: Path, file: IO[str], width: int, first: int) -> Iterator[list[str]]:
+def _rows(path: LogPath, file: IO[str], width: int, first: int) -> Iterator[list[str]]:
     """The cells of each line, from row `first` on, without the blank lines at the end of the file."""
     blank = None
     for row in itertools.count(first):
@@ -165,7 +165,7 @@ def _rows(path: Path, file: IO[str], width: int, first: int) -> Iterator[list[st
         yield cells
 
 
-def _cells(path: Path, line: str, row: int) -> list[str]:
+def _cells(path: LogPath, line: str, row: int) -> list[str]:
     """The cells of one line: an open quote ends with its line."""
     if len(line) >= _LONGEST_LINE - 1:
         refuse(path, "is longer than a million characters; export the log as CSV with a header row", row=row)
@@ -178,7 +178,7 @@ def _cells(path: Path, line: str, row: int) -> list[str]:
 
 
 def _numbers(
-    path: Path, columns: Mapping[str, Sequence[str]], missing: Collection[str], first: int
+    path: LogPath, columns: Mapping[str, Sequence[str]], missing: Collection[str], first: int
 ) -> dict[str, np.ndarray]:
     """The numbers in columns of cells, from row `first` on; NaN for cells without one."""
     found, faults = {}, []

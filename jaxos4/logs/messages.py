@@ -19,7 +19,7 @@ from .sampling import (
     root_mean_square,
     unwrap,
 )
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFacts, Path, Sampling, Table, order_note, refuse
+from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFacts, LogPath, Sampling, Table, order_note, refuse
 from .values import dropped, without_impossible
 
 RATES, ANGLES, FORCES = ("p", "q", "r"), ("phi", "theta", "psi"), ("ax", "ay", "az")
@@ -66,7 +66,7 @@ class Messages:
     - `prefixed`: whether the name of a field begins with that of its kind and a dot.
     """
 
-    path: Path
+    path: LogPath
     fields: Mapping[str, Mapping[int, Fields]]
     remedy: str
     notes: list[str] = dataclasses.field(default_factory=list)

@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ from .table import (
     MAX_ROWS,
     SPEED_NAMES,
     LogFormat,
-    Path,
+    LogPath,
     Table,
     listed,
     opened,
@@ -52,7 +52,7 @@ class _Topic(NamedTuple):
     fields: dict[str, list[float]]
 
 
-def read_ros(path: Path, columns: ColumnMap | None = None) -> tuple[Table, tuple[str, ...]]:
+def read_ros(path: LogPath, columns: ColumnMap | None = None) -> tuple[Table, tuple[str, ...]]:
     """Read columns of a bag by a column map, or by the first preset that fits. Raises `InputError`."""
     try:
         import rosbags  # noqa: F401
@@ -76,14 +76,14 @@ ROS = LogFormat(
 )
 
 
-def _reader(path: Path) -> Any:
+def _reader(path: LogPath) -> Any:
     """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for what is far too large."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2.storage_mcap import McapReader
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-    place, begin = FilePath(path), b""
+    place, begin = Path(path), b""
     if not place.is_dir():
         with opened(path, "rb") as file:
             begin = file.read(len(_FOLDER))
@@ -96,7 +96,7 @@ def _reader(path: Path) -> Any:
 
 
 @contextlib.contextmanager
-def _only_tables(path: Path) -> Iterator[None]:
+def _only_tables(path: LogPath) -> Iterator[None]:
     """Databases that are opened inside must consist of tables, and answer in a time that their size explains.
 
     A view can have rows without end, and so can damaged pages. A sound bag takes less than two steps for a byte.
@@ -124,11 +124,11 @@ def _only_tables(path: Path) -> Iterator[None]:
         apsw.connection_hooks.remove(check)
 
 
-def _damage(path: Path) -> contextlib.AbstractContextManager[None]:
+def _damage(path: LogPath) -> contextlib.AbstractContextManager[None]:
     return reading(path, "cannot be decoded", _REPAIR, Exception)  # of a damaged file, rosbags raises any
 
 
-def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
+def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
     topics = sorted({each.topic for each in reader.connections})
 
     def held(source: str) -> str | None:
@@ -153,7 +153,7 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
     return _table(log, columns, chosen)
 
 
-def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
+def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, _Topic]:
     """The fields at these places, by topic. Raises `InputError`."""
     found: dict[str, _Topic] = {}
     for topic, field in sorted(each.split(".", 1) for each in places):
@@ -176,7 +176,7 @@ def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
     return found
 
 
-def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
+def _decoder(path: LogPath, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
     """A function that decodes messages of these connections, by their definitions in the file, or by ROS 2's own."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -196,7 +196,7 @@ def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[byt
     return store.deserialize_ros1 if ros1 else store.deserialize_cdr
 
 
-def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
+def _getter(path: LogPath, topic: str, field: str) -> Callable[[Any], float]:
     """A function that takes a number out of a message; NaN if an array is shorter. It raises `InputError`."""
     steps = [int(each) if each.isdecimal() and len(each) < 10 else each for each in _FIELD.findall(field)]
     wrong = functools.partial(refuse, path, column=f"{topic}.{field}", kind="field")

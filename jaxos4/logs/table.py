@@ -14,7 +14,7 @@ from .._files import at_once
 from ..errors import InputError, printable, shortened
 from ..flight import SIGNALS, Flight, with_force
 
-Path = str | os.PathLike[str]
+LogPath = str | os.PathLike[str]
 
 MAX_ROWS = 5_000_000  # 83 minutes at 1 kHz; a longer flight does not fit in the memory of an ordinary machine
 SLOWEST_RATE = 40.0
@@ -82,7 +82,7 @@ class Table(NamedTuple):
     - `impossible`: by column, how many values `jaxos4.logs.values` took out, and the first of them.
     """
 
-    path: Path
+    path: LogPath
     columns: dict[str, np.ndarray]
     unknown: tuple[str, ...] = ()
     first_row: int | None = 2
@@ -126,8 +126,8 @@ class LogFormat(NamedTuple):
     name: str
     label: str
     recognises: Callable[[bytes], bool]
-    read: Callable[[Path], tuple[Table, tuple[str, ...]]]
-    mapped: Callable[[Path, Any], tuple[Table, tuple[str, ...]]] | None = None
+    read: Callable[[LogPath], tuple[Table, tuple[str, ...]]]
+    mapped: Callable[[LogPath, Any], tuple[Table, tuple[str, ...]]] | None = None
     of_vehicles: bool = True
 
 
@@ -244,7 +244,7 @@ _UNREADABLE = {
 
 
 @contextlib.contextmanager
-def opened(path: Path, mode: str = "r") -> Iterator[IO]:
+def opened(path: LogPath, mode: str = "r") -> Iterator[IO]:
     """Open a log as UTF-8 text with other bytes escaped, or in mode `rb`. Raises `InputError` if it cannot be read."""
     if "\0" in os.fspath(path):
         refuse(path, "is not a file name, because it contains a null character; give the path of a log")
@@ -257,7 +257,7 @@ def opened(path: Path, mode: str = "r") -> Iterator[IO]:
         refuse(path, _UNREADABLE.get(type(error), f"cannot be read ({reason}); give the path of a log"))
 
 
-def read_bytes(path: Path, most: int) -> bytes:
+def read_bytes(path: LogPath, most: int) -> bytes:
     """The content of a log. Raises `InputError` if it has more than `most` bytes."""
     content = bytearray()
     with opened(path, "rb") as file:
@@ -269,7 +269,7 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def refuse(
-    path: Path, what: str, *, row: int | None = None, column: str | None = None, kind: str = "column"
+    path: LogPath, what: str, *, row: int | None = None, column: str | None = None, kind: str = "column"
 ) -> NoReturn:
     """Raise an `InputError` of one line: the place, `what` is wrong and what to do, without its full stop."""
     places = [f"row {row}"] * (row is not None) + [f"{kind} {column}"] * (column is not None)

@@ -17,7 +17,7 @@ from ..rotations import HALF_TURN, euler_angles
 from .columns import column_map
 from .messages import ANGLES, FORCES, RATES, Fields, Messages, MessageSource, Names, Rotors, motor_order
 from .sampling import Series, logged_rate
-from .table import LogFormat, Path, Table, fast_enough, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, fast_enough, read_bytes, refuse
 
 _MAGIC = b"ULog"
 _MOVING = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
@@ -60,7 +60,7 @@ _DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TI
 _LINKS = {4: _UAVCAN, 5: _DSHOT}  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
 
 
-def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
+def read_ulog(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a PX4 log, and notes on what was assumed. Raises `InputError`."""
     log = _decoded(path)
     _check_vehicle(log)
@@ -264,7 +264,7 @@ def _limits(log: Messages, values: np.ndarray, bank: str, channels: list[int]) -
     return kind.name, *np.where(low < high, [low, high], np.array(kind.ends)[:, None])
 
 
-def _decoded(path: Path) -> Messages:
+def _decoded(path: LogPath) -> Messages:
     """The topics that are needed. Raises `InputError`, one line, for a file that cannot be decoded."""
     try:
         from pyulog.core import ULog

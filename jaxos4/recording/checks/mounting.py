@@ -50,7 +50,9 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
 
 def _rotation_for(evidence: Evidence, turn: Float[Numeric, "3 3"]) -> str:
     """The advice to give the rotation that turns the sensors further by the matrix `turn`."""
-    axes = np.asarray(turn if evidence.airframe is None else turn @ evidence.airframe.sensor_axes)
+    axes = np.asarray(turn)
+    if evidence.airframe is not None:
+        axes = axes @ np.asarray(evidence.airframe.sensor_axes)
     degrees = ", ".join(f"{round(math.degrees(angle)) + 0}" for angle in angles_of(axes))
     return f"give `sensor_rotation = [{degrees}]` [deg] in the airframe's file"
 
