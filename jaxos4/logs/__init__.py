@@ -38,7 +38,7 @@ FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEU
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
 _OTHERS: Registry[LogFormat] = Registry("jaxos4.log_formats", {})
 
-# Files that no reader takes, by their first bytes: what they are, and how to make a log of them that is read.
+# Files that no reader takes, by their first bytes: their kind, and how to make a log of them that is read.
 _IN_PYTHON = "read it in Python, and give its arrays to jaxos4.read_log"
 _ARCHIVE = rb"PK\x03\x04|.{257}ustar"
 _UNREAD = {
@@ -124,7 +124,7 @@ def read_flight(path: LogPath, airframe: Airframe | None = None) -> Flight:
     """Read a flight from a CSV file. Its columns: docs/index.md.
 
     Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such a grid. Jumps of 2 pi in
-    roll and yaw are removed. Each change to the data is a `UserWarning`. Arguments and errors are those of `read_log`.
+    roll and yaw are removed. Each change to the data is a `UserWarning`. For arguments and errors see `read_log`.
     """
     found = recording_of(*CSV.read(path), airframe)
     for note in found.notes:
@@ -142,7 +142,7 @@ def log_format(path: LogPath) -> LogFormat:
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
         begin = file.read(1 << 18) if file.seekable() else b""
-    # What an archive holds without compression is not its own format.
+    # An archive may begin with a log that it holds without compression.
     formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1]
     kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin) or FORMATS[-1]
     unread = (each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL))

@@ -1,6 +1,6 @@
 """DataFlash logs (`.BIN`) of ArduPilot's Copter. Messages, frames and settings: docs/logs.md.
 
-A file describes its own messages: a message FMT gives the number, length, name, field types and field names of each.
+A file describes its messages: a message FMT gives the number, length and name of a kind, and its types and fields.
 Reference: `AP_Logger` and `LogStructure.h` of ArduPilot.
 """
 

@@ -25,7 +25,7 @@ def recording_of(
         table.refuse(what, column="t")
     if not any(map(table.holds, STATE_NAMES)):
         table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
-    # Cells that hold no value were not logged, also those of a rotor.
+    # A column of empty cells was not logged, also if it is a rotor's.
     motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
     dt = _check_time(table)
     rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}

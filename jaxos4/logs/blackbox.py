@@ -64,7 +64,7 @@ _CONVERTED = {
     for name in _RAW
     for unit, factor in _UNITS.get(name.partition("[")[0], {}).items()
 }
-# Sessions are joined to the longest one if these settings are equal.
+# Sessions follow the longest one if these settings are equal.
 _USED = (*_GYRO_SCALES, "acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
 
 Settings = dict[str, str]
@@ -72,7 +72,7 @@ Columns = dict[str, np.ndarray]
 
 
 class _Log(NamedTuple):
-    """A blackbox log: its own columns `raw` and `settings`, and our `columns`, the log's `names` of them, `notes`.
+    """A blackbox log: its columns `raw` and its `settings`; our `columns` and their `names` in the log; `notes`.
 
     - `header`: the row of the CSV's header; `None` for a log that was not decoded.
     - `converted`: of columns that `blackbox_decode` has converted, the whole name ("gyroADC[0] (deg/s)") and the unit.

@@ -43,7 +43,7 @@ class ColumnMap(NamedTuple):
     - `name`: in messages.
     - `sources`: by column of the flight CSV, or `qw, qx, qy, qz`, the attitude from the body to the earth.
     - `needed`: the columns that a log must hold.
-    - `recorded`: whether messages have the time at which they were recorded, and not that of their own stamp.
+    - `recorded`: whether messages have the time at which they were recorded, instead of the time of their stamp.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Logs of the Crazyflie's micro-SD card: versions 1 and 2, and that of 2019. Variables and frames: docs/logs.md.
+"""Logs of the Crazyflie's micro-SD card: versions 1 and 2, and the format of 2019. Variables and frames: docs/logs.md.
 
 Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 """
@@ -26,7 +26,7 @@ _DEGREE, _RPM, _FULL = math.pi / 180, 2 * math.pi / 60, 65535.0
 _SOURCES = {
     RATES: ([f"gyro.{axis}" for axis in "xyz"], _DEGREE),
     ANGLES: ([f"stateEstimate.{name}" for name in ("roll", "pitch", "yaw")], _DEGREE * np.array([1, -1, 1])),
-    # Each of these is read by itself.
+    # These are read one by one.
     **{(name,): ([f"acc.{name[1]}"], STANDARD_GRAVITY) for name in FORCES},
     **{(name,): ([f"stateEstimate.{name}"], 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")},
     ("voltage",): (["pm.vbat"], 1.0),
@@ -131,7 +131,7 @@ def _sets(path: LogPath, content: bytes, notes: list[str]) -> Events:
 
 
 def _field(variable: re.Match[bytes]) -> tuple[str, str]:
-    """The name and the type of a variable; the letter e is that of a half float."""
+    """The name and the type of a variable; the letter e means a half float."""
     return variable[1].decode(), "<f2" if variable[2] == b"e" else f"<{variable[2].decode()}"
 
 

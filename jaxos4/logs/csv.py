@@ -1,4 +1,4 @@
-"""The flight CSV, the project's own log format. Its columns: docs/index.md."""
+"""The flight CSV, the log format of this project. Its columns: docs/index.md."""
 
 import contextlib
 import csv

@@ -1,4 +1,4 @@
-"""Logs of messages: sensors with times of their own, brought to the rows of the gyro."""
+"""Logs of messages: sensors that were logged at different times, brought to the rows of the gyro."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -61,9 +61,9 @@ class Messages:
     - `fields`: by kind of message and instance, the fields of its messages as arrays of one length. `t`: times [s].
     - `remedy`: what to do if the log is corrupt.
     - `notes`: what was assumed, one line each.
-    - `names`: by our column, what the log calls it.
+    - `names`: by our column, its name in the log.
     - `parameters`: the settings of the autopilot.
-    - `prefixed`: whether the name of a field begins with that of its kind and a dot.
+    - `prefixed`: whether the name of a field begins with the name of its kind and a dot.
     """
 
     path: LogPath

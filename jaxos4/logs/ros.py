@@ -40,12 +40,12 @@ _FIELD = re.compile(r"[^.\[\]]+")
 _STAMPS = (("timestamp_sample", 1000), ("timestamp", 1000))  # of PX4, and their unit [ns]
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
 _REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
-_LONGEST_DEFINITIONS = 1 << 16  # characters: those of our topics have a few thousand, and their parser is slow
+_LONGEST_DEFINITIONS = 1 << 16  # characters: usual definitions have a few thousand, and their parser is slow
 _NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag record -s mcap`), or convert it"
 
 
 class _Topic(NamedTuple):
-    """The messages of a topic: when they were recorded and their own stamps [ns], and the fields of columns."""
+    """The messages of a topic: the times at which they were recorded, their stamps [ns], and the fields of columns."""
 
     recorded: list[float]
     stamps: list[int]
@@ -77,7 +77,7 @@ ROS = LogFormat(
 
 
 def _reader(path: LogPath) -> Any:
-    """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for what is far too large."""
+    """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for one that is far too large."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2.storage_mcap import McapReader
@@ -132,7 +132,7 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
     topics = sorted({each.topic for each in reader.connections})
 
     def held(source: str) -> str | None:
-        """The source with the whole name of its topic: the only one that ends like that of the source."""
+        """The source with the whole name of its topic: the only topic that ends like the source's."""
         name, _, field = source.partition(".")
         found = [name] if name in topics else [topic for topic in topics if topic.endswith(name)]
         return f"{found[0]}.{field}" if len(found) == 1 and name.startswith("/") and field else None
@@ -177,7 +177,7 @@ def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, _Topic]
 
 
 def _decoder(path: LogPath, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
-    """A function that decodes messages of these connections, by their definitions in the file, or by ROS 2's own."""
+    """A function that decodes messages of these connections, by their definitions in the file, or by those of ROS 2."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -221,7 +221,7 @@ def _getter(path: LogPath, topic: str, field: str) -> Callable[[Any], float]:
 
 
 def _stamp(message: Any) -> int:
-    """The time of a message in its own words [ns]; 0 if it has none."""
+    """The time stamp of a message [ns]; 0 if it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is not None:
         return stamp.sec * 10**9 + stamp.nanosec

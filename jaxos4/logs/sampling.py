@@ -33,7 +33,7 @@ class Series(NamedTuple):
 def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Columns]:
     """The integral of each column from the first sample, as a function of the time; 0 before the first sample.
 
-    A value is held until the next one, and the last one for ever. If `linear`, values are interpolated instead.
+    A value lasts until the next one, and the last one for ever. If `linear`, values are interpolated instead.
     """
     t, values = series
     mean = (values[:-1] + values[1:]) / 2 if linear else values[:-1]
@@ -79,7 +79,7 @@ def speeds_within(
 ) -> Callable[[RowPositions, float], Float[np.ndarray, "rows parts 4"]]:
     """Root mean square of each rotor's speed in the parts of the samples around rows, a function of rows and step [s].
 
-    Arguments as of `averages`. Before the first time, speeds are those of the first row.
+    Arguments as of `averages`. Before the first time, rotors have the speeds of the first row.
     """
     times, values = np.append(2 * t[0] - t[-1], t), np.concatenate([omega[:1], omega])
     speeds = root_mean_square(Series(times, values), linear=not held)

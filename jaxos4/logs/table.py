@@ -74,11 +74,11 @@ class Table(NamedTuple):
     - `columns`: arrays of one length, with the names, units and frame of the flight CSV (docs/index.md).
     - `unknown`: names of the columns that the reader ignored.
     - `first_row`: the row of the file, counted from 1, that holds entry 0; `None` if the format has no rows.
-    - `names`: the log's own name of a column, if it is another.
+    - `names`: by column, its name in the log, if that is another.
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
     - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
-    - `held`: whether measured rotor speeds are means until the next row, and not those at the time of their row.
+    - `held`: whether measured rotor speeds are means until the next row, and not speeds at the time of their row.
     - `impossible`: by column, how many values `jaxos4.logs.values` took out, and the first of them.
     """
 
@@ -119,7 +119,7 @@ class LogFormat(NamedTuple):
     - `recognises`: takes the first bytes of a file; returns whether the file has this format.
     - `read`: takes a path; returns the columns and the notes on what the reader assumed, one line each. Raises
       `InputError` (by `refuse`) for a file that cannot be used.
-    - `mapped`: takes a path and a column map, and returns the same; `None` if the format has columns of its own.
+    - `mapped`: takes a path and a column map, and returns the same; `None` if the columns of the format are fixed.
     - `of_vehicles`: whether only real vehicles write it.
     """
 
@@ -137,7 +137,7 @@ _ARRAYS = ("time", *SIGNALS)
 class Recording(NamedTuple):
     """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
 
-    Fields are as in `Flight`, in SI units. A recording is cleaned, cut and joined, and becomes a `Flight` at the end.
+    Fields are as in `Flight`, in SI units. Recordings are cleaned, cut and concatenated, and become a `Flight` last.
 
     - `name`: in messages and in the provenance. Usually the path of the file.
     - `notes`: what the reader changed in the data, one line each. `facts`: what the log says beside the flight.
@@ -231,7 +231,7 @@ def signals_of(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def order_note(first: str) -> str:
-    """The note on the order of the rotors; `first`: what the log calls rotor 1."""
+    """The note on the order of the rotors; `first`: the name of rotor 1 in the log."""
     same = "rotor_positions and rotor_spins must be in the same order"
     return f"rotors keep the log's order ({first} is rotor 1): {same}"
 

@@ -219,7 +219,7 @@ def _outputs(log: Messages) -> Rotors | None:
 
 
 def _thrust_curve(log: Messages) -> tuple[float, str]:
-    """THR_MDL_FAC, 0 if it is not known, and what follows for the speeds."""
+    """THR_MDL_FAC, 0 if it is not known, and its consequence for the speeds in words."""
     curve = log.parameters.get("THR_MDL_FAC", 0.0)
     if 0 < curve <= 1:
         return curve, f"taken as fractions of full-scale rotor speed by THR_MDL_FAC = {curve:.3g}"

@@ -191,7 +191,7 @@ def _isolated(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " sampl
 
 
 # Values are clipped if this many are equal to the largest one, and this many times more than lie just below, within a
-# share of the range. A signal without limits has a single largest value. A value that is held counts once.
+# share of the range. A signal without limits has a single largest value. A value that is repeated counts once.
 EQUAL, TIMES, NEAR = 4, 3.0, 0.01
 # With more repeated values than this, a signal is coarse, and the level below the largest counts as near. If so few
 # values are most of the signal, it is at rest: they are counts of noise, and not the end of a range.

@@ -98,7 +98,7 @@ NEIGHBOURS = 2  # frequencies to either side over which spectra are averaged
 
 
 def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float) -> Changes | None:
-    """The mean power of the changes from sample to sample, by frequency; that of white changes is their variance."""
+    """The mean power of the changes from sample to sample, by frequency; white changes have their variance."""
     length = 2 * (max(round(SPECTRUM / dt), MIN_SAMPLES) // 2)
     found = np.concatenate([spectra(np.diff(signal, axis=0), length) for signal in signals])
     if not len(found):

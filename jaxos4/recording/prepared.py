@@ -258,7 +258,7 @@ def _sample_times(name: str, slowest: float, sample_time: float | None, *, predi
 
 
 def finest(slowest: float, sample_time: float | None = None, *, predicted: bool = False) -> float:
-    """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: that of the logs."""
+    """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: of the logs."""
     shortest = max(SHORTEST if sample_time is None else sample_time, slowest)
     whole = max(round(shortest / slowest), 1) * slowest  # samples of whole rows
     is_near = sample_time is None or abs(whole - shortest) < WHOLE * shortest
@@ -309,7 +309,7 @@ def _sampled(
 
 
 def _available_inputs(whole: Recording, flown: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
-    """The inputs for `Term.needs` that the joined recording offers. A force counts if every stretch measured it."""
+    """The inputs for `Term.needs` that the whole recording offers. A force counts if every stretch measured it."""
     force = np.all([~np.isnan(each.channels[:, len(STATE_NAMES) :]).all(axis=0) for each in flown], axis=0)
     offers = {
         COMMANDS: whole.commanded,

@@ -1,4 +1,4 @@
-"""Recordings as windows: averaged to longer samples, joined to a flight of whole windows, some of them held out."""
+"""Recordings as windows: averaged to longer samples, concatenated to whole windows, some of them held out."""
 
 import math
 from collections.abc import Sequence

@@ -72,7 +72,7 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
     )
 
 
-UNCERTAIN = 0.2  # rad; a rotation about the vertical axis by the rotors with a larger error is that of another airframe
+UNCERTAIN = 0.2  # rad; a rotation by the rotors that is less certain comes from a wrong airframe
 SAME_ANGLE = 0.17  # rad; a rotation turns roll and pitch by the same angle, up to this
 
 

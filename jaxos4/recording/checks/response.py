@@ -136,7 +136,7 @@ class _Turning(NamedTuple):
     ) -> tuple[Float[np.ndarray, "4"], float, Float[np.ndarray, "2"]]:
         """The gains from torques to rates, their delay [s], and the explained shares; NaN: not measured.
 
-        Errors are those of a prediction of the rates, less their inputs times their gains, from their past.
+        Errors are of predictions, from their past, of the rates less their inputs times their gains.
         """
         if not products.any():
             return np.full(4, np.nan), math.nan, np.full(2, np.nan)
