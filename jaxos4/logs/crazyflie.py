@@ -85,10 +85,9 @@ def _rotors(log: Messages) -> Rotors | None:
         series = _logged(log, SPEED_NAMES if is_measured else COMMAND_NAMES, names, factor)
         if series is None:
             continue
-        finite = np.isfinite(series.values).all(axis=1)
-        if np.count_nonzero(finite) > 1 and not (is_measured and not (series.values > 0).any(axis=0).all()):
-            values = series.values[finite] if is_measured else np.clip(series.values[finite], 0.0, 1.0)
-            return Rotors(Series(series.t[finite], values), names, is_measured)
+        series = series if is_measured else Series(series.t, np.clip(series.values, 0.0, 1.0))
+        if (rotors := Rotors.of(series, names, is_measured=is_measured)) is not None:
+            return rotors
     return None
 
 

@@ -42,6 +42,15 @@ class Rotors(NamedTuple):
     is_measured: bool
     note: str = ""
 
+    @classmethod
+    def of(cls, series: Series, names: Sequence[str], *, is_measured: bool) -> "Rotors | None":
+        """Samples in which all rotors have a value; `None` if there are not two, or if a measured rotor never turns."""
+        whole = np.isfinite(series.values).all(axis=1)
+        values = series.values[whole]
+        if len(values) < 2 or (is_measured and not (values > 0).any(axis=0).all()):
+            return None
+        return cls(Series(series.t[whole], values), names, is_measured)
+
 
 def motor_order(functions: Sequence[int], motors: Sequence[int]) -> list[int] | None:
     """The places of motors 1 to 4 among the outputs with these functions; `None` if one of them is missing."""

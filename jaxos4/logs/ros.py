@@ -267,26 +267,15 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[T
 
         def at(name: str) -> np.ndarray:
             series = found[name]
-            if series.t is t:
-                return series.values[:, 0]
-            return (
-                log.speeds_at(t, series, chosen[name])
-                if name in SPEED_NAMES
-                else np.interp(t, series.t, series.values[:, 0])
-            )
+            if series.t is not t and name in SPEED_NAMES:
+                return log.speeds_at(t, series, chosen[name])
+            return series.values[:, 0] if series.t is t else np.interp(t, series.t, series.values[:, 0])
 
         return Series(t, np.column_stack([at(name) for name in names]))
 
-    def turning(names: Sequence[str]) -> Rotors | None:
-        """The samples with all four rotors; `None` if one of them never turns."""
-        rotors = together(names)
-        if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
-            return None
-        whole = np.isfinite(rotors.values).all(axis=1)
-        if np.count_nonzero(whole) < 2:
-            return None
-        series = Series(rotors.t[whole], rotors.values[whole])
-        return Rotors(series, [chosen[name] for name in names], is_measured=names == SPEED_NAMES)
+    def rotors(names: Sequence[str]) -> Rotors | None:
+        found, is_measured = together(names), names == SPEED_NAMES
+        return found and Rotors.of(found, [chosen[name] for name in names], is_measured=is_measured)
 
     quaternion, angles = together(QUATERNION), together(ANGLES)
     if angles is None and quaternion is not None:
@@ -295,6 +284,6 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[T
     single = found.keys() - {*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, *RATES, "t"}
     return log.table(
         {RATES: together(RATES), ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)},
-        turning(SPEED_NAMES) or turning(COMMAND_NAMES),
+        rotors(SPEED_NAMES) or rotors(COMMAND_NAMES),
         remedies=(f"name p, q and r in {columns.name}", f"name omega1..4 or command1..4 in {columns.name}"),
     )

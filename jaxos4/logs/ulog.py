@@ -176,16 +176,13 @@ def _speeds(log: Messages) -> Rotors | None:
     series = log.series("esc_status", names)
     if series is None:
         return None
-    if not (np.abs(series.values) > 0).any(axis=0).all():
-        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
-        return None
     functions = [int(log.latest("esc_status", f"esc[{i}].actuator_function") or 0) for i in range(4)]
     order = motor_order(functions, _MOTORS) or range(4)
-    measured = np.isfinite(series.values).all(axis=1)
-    if np.count_nonzero(measured) < 2:
-        return None
-    speeds = Series(series.t[measured], np.abs(series.values[measured])[:, order] * (2 * math.pi / 60))
-    return Rotors(speeds, [f"esc_status.{names[i]}" for i in order], is_measured=True)
+    speeds = Series(series.t, np.abs(series.values)[:, order] * (2 * math.pi / 60))
+    rotors = Rotors.of(speeds, [f"esc_status.{names[i]}" for i in order], is_measured=True)
+    if rotors is None:
+        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
+    return rotors
 
 
 def _motors(log: Messages) -> Rotors | None:
