@@ -170,12 +170,28 @@ class Messages:
             refuse(self.path, f"holds no body rates; {remedies[0]}")
         if rotors is None:
             refuse(self.path, f"holds no rotor speeds or commands; {remedies[1]}")
-        speeds, rotor_names = rotors.series, SPEED_NAMES if rotors.is_measured else COMMAND_NAMES
-        self.names.update(zip(rotor_names, rotors.names, strict=True))
-        sources = [rotors.names[0], self.names["p"]]
-        motors, gyro = (each.partition(".")[0] if self.prefixed else each for each in sources)
-        written = Sampling(motors, logged_rate(speeds.t)), Sampling(gyro, logged_rate(rates.t))
+        self.names.update(zip(SPEED_NAMES if rotors.is_measured else COMMAND_NAMES, rotors.names, strict=True))
+        motors, gyro = (
+            Sampling(name.partition(".")[0] if self.prefixed else name, logged_rate(series.t))
+            for name, series in ((rotors.names[0], rotors.series), (self.names["p"], rates))
+        )
+        rows, table = self._at_rows_of(rates, rotors, {names: each for names, each in found.items() if names != RATES})
+        first, last = float(rows[0]), float(rows[-1])
+        inside = [(max(begin, first) - first, min(end, last) - first) for begin, end in landed]
+        about = LogFacts(motors, gyro, landed=tuple(each for each in inside if each[0] <= each[1]), **facts)
+        if not rotors.is_measured:
+            plain = f"commands are {rotors.names[0]}.., taken as fractions of full-scale rotor speed"
+            self.notes.append(rotors.note or plain)
+        if is_ordered:
+            self.notes.append(order_note(rotors.names[0]))
+        return table._replace(held=True, facts=about), tuple(self.notes)
+
+    def _at_rows_of(
+        self, rates: Series, rotors: Rotors, others: Mapping[Names, Series | None]
+    ) -> tuple[RowPositions, Table]:
+        """The times of the gyro while the motors were logged [s], and all columns brought to them."""
         table = Table(self.path, {}, first_row=None, names=self.names, remedy=self.remedy)
+        speeds, rotor_names = rotors.series, SPEED_NAMES if rotors.is_measured else COMMAND_NAMES
         start = rates.t[min(np.count_nonzero(rates.t < speeds.t[0]), rates.t.size - 1)]
 
         def possible(names: Names, series: Series) -> Series:
@@ -195,19 +211,11 @@ class Messages:
             refuse(self.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
         columns = {"t": rows - rows[0]} | dict(zip(RATES, rates.values[inside].T, strict=True))
         columns |= zip(rotor_names, root_mean_square(speeds, linear=rotors.is_measured)(rows).T, strict=True)
-        for names, series in found.items():
-            if series is None or names == RATES:
+        for names, series in others.items():
+            if series is None:
                 continue
             if names == ANGLES:
                 phi, theta, psi = series.values.T
                 series = Series(series.t, np.column_stack([unwrap(phi)[0], theta, unwrap(psi)[0]]))
             columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
-        first, last = float(rows[0]), float(rows[-1])
-        inside = [(max(begin, first) - first, min(end, last) - first) for begin, end in landed]
-        about = LogFacts(*written, landed=tuple(each for each in inside if each[0] <= each[1]), **facts)
-        if not rotors.is_measured:
-            plain = f"commands are {rotors.names[0]}.., taken as fractions of full-scale rotor speed"
-            self.notes.append(rotors.note or plain)
-        if is_ordered:
-            self.notes.append(order_note(rotors.names[0]))
-        return table._replace(columns=columns, held=True, facts=about), tuple(self.notes)
+        return rows, table._replace(columns=columns)
