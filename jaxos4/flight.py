@@ -20,6 +20,9 @@ ANGLES, RATES, POSITION, VELOCITY = (
     np.array([STATE_NAMES.index(name) for name in names])
     for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
 )
+SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
+COMMAND_NAMES = ("command1", "command2", "command3", "command4")
+"""The columns of measured rotor speeds [rad/s], and of commands [0..1]."""
 FORCE_NAMES = ("ax", "ay", "az")
 CHANNEL_NAMES = (*STATE_NAMES, *FORCE_NAMES)
 """Every channel that a flight can measure: the states, then the specific force."""

@@ -22,11 +22,11 @@ from .._custom_types import Key, Numeric, Scalar, as_float
 from .._files import write_atomically
 from .._xla import quick_jit
 from ..errors import InputError
-from ..flight import STATE_NAMES, Flight
+from ..flight import SPEED_NAMES, STATE_NAMES, Flight
 from ..linalg import gram, joint_factor
 from ..logs import write_flight
 from ..logs.csv import read_table
-from ..logs.table import SPEED_NAMES, LogPath, refuse
+from ..logs.table import LogPath, refuse
 from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]

@@ -7,9 +7,9 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..errors import printable
-from ..flight import FORCE_NAMES, SIGNALS, STATE_NAMES
+from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES, STATE_NAMES
 from .sampling import UNIFORM, grid_size, held_regularly, last_measured, logged_rate, resample, unwrap
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, Recording, Sampling, Table, counted, listed, signals_of
+from .table import MAX_ROWS, Recording, Sampling, Table, counted, listed, signals_of
 from .values import COLUMNS, PITCH, without_impossible
 
 

@@ -15,23 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
+from ..flight import COMMAND_NAMES, SPEED_NAMES
 from ..rotations import HALF_TURN, euler_angles
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
 from .messages import ANGLES, FORCES, RATES
 from .sampling import in_order
-from .table import (
-    COMMAND_NAMES,
-    SPEED_NAMES,
-    LogFormat,
-    LogPath,
-    Table,
-    counted,
-    opened,
-    order_note,
-    read_bytes,
-    refuse,
-)
+from .table import LogFormat, LogPath, Table, counted, opened, order_note, read_bytes, refuse
 
 _MAGIC = b"H Product:Blackbox"
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")

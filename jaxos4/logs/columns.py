@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import check_plain, read_toml
-from ..flight import SIGNALS
+from ..flight import SIGNALS, SPEED_NAMES
 from ..rotations import euler_angles
 from .messages import ANGLES
-from .table import SPEED_NAMES, LogPath, Table, listed, quoted, refuse
+from .table import LogPath, Table, listed, quoted, refuse
 from .values import COLUMNS, PWM, PWM_ZERO, Quantity
 
 ColumnsGiven = LogPath | Mapping[str, Any] | None

@@ -12,9 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
+from ..flight import COMMAND_NAMES, SPEED_NAMES
 from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, records
 from .sampling import Series
-from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, LogPath, Table, counted, quoted, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, counted, quoted, read_bytes, refuse
 
 _MAGIC = b"\xbc"
 _PAIR = re.compile(rb"(..)(..)", re.DOTALL)

@@ -11,21 +11,9 @@ import numpy as np
 
 from .._files import write_atomically
 from ..airframe import Airframe
-from ..flight import Flight
+from ..flight import COMMAND_NAMES, SPEED_NAMES, Flight
 from .columns import ColumnMap, column_map, mapped_rows
-from .table import (
-    COMMAND_NAMES,
-    MAX_ROWS,
-    SPEED_NAMES,
-    LogFormat,
-    LogPath,
-    Recording,
-    Table,
-    counted,
-    opened,
-    quoted,
-    refuse,
-)
+from .table import MAX_ROWS, LogFormat, LogPath, Recording, Table, counted, opened, quoted, refuse
 from .values import COLUMNS
 
 _LONGEST_LINE = 1 << 20

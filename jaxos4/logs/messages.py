@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..flight import COMMAND_NAMES, SPEED_NAMES
 from .sampling import (
     REACH,
     RowPositions,
@@ -19,7 +20,7 @@ from .sampling import (
     root_mean_square,
     unwrap,
 )
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFacts, LogPath, Sampling, Table, order_note, refuse
+from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, order_note, refuse
 from .values import dropped, without_impossible
 
 RATES, ANGLES, FORCES = ("p", "q", "r"), ("phi", "theta", "psi"), ("ax", "ay", "az")

@@ -16,23 +16,13 @@ import numpy as np
 
 from .._files import reading
 from ..errors import shortened
+from ..flight import COMMAND_NAMES, SPEED_NAMES
 from ..rotations import euler_angles
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
 from .compression import check_parts, check_sizes
 from .messages import ANGLES, RATES, Fields, Messages, Rotors
 from .sampling import Series
-from .table import (
-    COMMAND_NAMES,
-    MAX_ROWS,
-    SPEED_NAMES,
-    LogFormat,
-    LogPath,
-    Table,
-    listed,
-    opened,
-    quoted,
-    refuse,
-)
+from .table import MAX_ROWS, LogFormat, LogPath, Table, listed, opened, quoted, refuse
 
 _ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"rosbag2_bagfile_information:"
 _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it

@@ -24,9 +24,6 @@ Rotors follow their commands with a lag of 20 to 80 ms. In closed loop, commands
 too large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 """
 
-SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
-COMMAND_NAMES = ("command1", "command2", "command3", "command4")
-
 
 class Sampling(NamedTuple):
     """The `rate` [Hz] at which a log holds something, and its `source`, as the log names it."""

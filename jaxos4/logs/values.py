@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..airframe import STANDARD_GRAVITY
-from ..flight import FORCE_NAMES, SIGNALS
+from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES
 from .sampling import filled
-from .table import COMMAND_NAMES, SPEED_NAMES, Recording, Table
+from .table import Recording, Table
 
 
 class Quantity(NamedTuple):
