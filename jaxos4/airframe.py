@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ._custom_types import Numeric, Scalar, as_constant
 from ._files import read_toml
 from .errors import InputError, named, shortened
+from .rotations import rotation
 
 GRAVITY, STANDARD_GRAVITY = 9.81, 9.80665
 """The gravity of an airframe that gives none, and the unit g [m/s^2]."""
@@ -117,18 +118,6 @@ class Airframe(eqx.Module):
     def hover_squares(self) -> Float[np.ndarray, "4"]:
         """The squared rotor speeds [rad^2/s^2] that carry the weight without torque; negative if none do."""
         return np.linalg.solve(np.asarray(self.mixer), [0.0, 0.0, 0.0, float(self.mass) * float(self.gravity)])
-
-
-def rotation(angles: Float[Numeric, "3 *samples"]) -> Float[Numeric, "3 3 *samples"]:
-    """R_z(psi) R_y(theta) R_x(phi) of the angles phi, theta, psi [rad]."""
-    xp = np if isinstance(angles, np.ndarray) else jnp
-    (sx, cx), (sy, cy), (sz, cz) = zip(xp.sin(angles), xp.cos(angles), strict=True)
-    rows = (
-        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
-        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
-        (-sy, cy * sx, cy * cx),
-    )
-    return xp.stack([xp.stack(row) for row in rows])
 
 
 def plus_layout(arm: float) -> list[tuple[float, float]]:

@@ -1,5 +1,8 @@
 """A flight: the recorded rotor speeds, and the measured rates, attitude, velocity and position."""
 
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,13 +20,34 @@ ANGLES, RATES, POSITION, VELOCITY = (
     np.array([STATE_NAMES.index(name) for name in names])
     for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
 )
+SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
+COMMAND_NAMES = ("command1", "command2", "command3", "command4")
+"""The columns of measured rotor speeds [rad/s], and of commands [0..1]."""
 FORCE_NAMES = ("ax", "ay", "az")
 CHANNEL_NAMES = (*STATE_NAMES, *FORCE_NAMES)
 """Every channel that a flight can measure: the states, then the specific force."""
 
 
+class Signal(NamedTuple):
+    """A field of `Flight` with one row a sample. What cuts, joins, averages, reads or writes flights looks here.
+
+    - `shape`: of a row; `None`: any.
+    - `columns`: its columns in a log, by name, with their units; none if it follows from other signals.
+    - `is_input`: models need its value in all samples. Otherwise NaN marks what was not measured.
+    """
+
+    shape: tuple[int, ...] | None
+    columns: Mapping[str, str] = MappingProxyType({})
+    is_input: bool = False
+
+
 def _optional_float(x: ArrayLike | None) -> Array | None:
     return None if x is None else as_float(x)
+
+
+def _signal(*signal: Any, is_input: bool = False, converter: Any = _optional_float) -> Any:
+    """A field of `Flight` that is `None` if it is not known. Arguments as of `Signal`."""
+    return eqx.field(converter=converter, default=None, metadata={"signal": Signal(*signal, is_input=is_input)})
 
 
 class Stretches(NamedTuple):
@@ -78,8 +102,11 @@ class Inputs(NamedTuple):
         )
 
 
+_STATES = Signal((len(STATE_NAMES),), dict(zip(STATE_NAMES, STATE_UNITS, strict=True)))
+
+
 class Flight(eqx.Module):
-    """A recorded or simulated flight on a uniform time grid.
+    """A recorded or simulated flight on a uniform time grid. A new signal is a field here and in `Recording`.
 
     - `time`: sample times [s], uniform.
     - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing. Unless
@@ -101,16 +128,16 @@ class Flight(eqx.Module):
     """
 
     time: Float[Array, " samples"] = eqx.field(converter=as_float)
-    omega: RotorSpeeds = eqx.field(converter=as_float)
-    states: States = eqx.field(converter=as_float)
-    specific_force: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
+    omega: RotorSpeeds = eqx.field(converter=as_float, metadata={"signal": Signal((4,), is_input=True)})
+    states: States = eqx.field(converter=as_float, metadata={"signal": _STATES})
+    specific_force: Float[Array, "samples 3"] | None = _signal((3,), dict.fromkeys(FORCE_NAMES, "m/s^2"))
     result: RESULTS = eqx.field(default_factory=lambda: RESULTS.successful)
-    body_velocity: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
-    stretch: Int[Array, " samples"] | None = None
+    body_velocity: Float[Array, "samples 3"] | None = _signal((3,), is_input=True)
+    stretch: Int[Array, " samples"] | None = _signal((), is_input=True, converter=None)
     commanded: bool = eqx.field(static=True, default=False)
-    voltage: Float[Array, " samples"] | None = eqx.field(converter=_optional_float, default=None)
+    voltage: Float[Array, " samples"] | None = _signal((), {"voltage": "V"}, is_input=True)
     held: bool = eqx.field(static=True, default=True)
-    within: Float[Array, "samples parts 4"] | None = eqx.field(converter=_optional_float, default=None)
+    within: Float[Array, "samples parts 4"] | None = _signal(None, is_input=True)
     averaging_time: Scalar = eqx.field(converter=as_float, default=0.0)
 
     def __check_init__(self):
@@ -120,12 +147,10 @@ class Flight(eqx.Module):
                 "`time`, `omega` and `states` must have shapes (samples,), (samples, 4) and (samples, 12), got "
                 f"{samples}, {self.omega.shape} and {self.states.shape}; a batch of flights is made by `vmap`."
             )
-        vectors = (*samples, 3)
-        shapes = {"specific_force": vectors, "body_velocity": vectors, "stretch": samples, "voltage": samples}
-        for name, shape in shapes.items():
+        for name, signal in SIGNALS.items():
             value = getattr(self, name)
-            if value is not None and value.shape != shape:
-                raise ValueError(f"`{name}` must have shape {shape}, got {value.shape}.")
+            if value is not None and signal.shape is not None and value.shape != (*samples, *signal.shape):
+                raise ValueError(f"`{name}` must have shape {(*samples, *signal.shape)}, got {value.shape}.")
         if samples[0] < 2:
             raise ValueError(f"A flight needs at least two samples, got {samples[0]}.")
 
@@ -160,6 +185,12 @@ class Flight(eqx.Module):
         """`channels` of a recorded flight as NumPy, without a compiled program."""
         force = self.specific_force
         return with_force(np.asarray(self.states), None if force is None else np.asarray(force), np)
+
+
+SIGNALS: dict[str, Signal] = {
+    field.name: field.metadata["signal"] for field in dataclasses.fields(Flight) if "signal" in field.metadata
+}
+"""The fields of `Flight` with one row a sample, besides the time."""
 
 
 def with_force(states: Any, force: Any, numpy: Any) -> Any:

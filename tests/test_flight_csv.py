@@ -135,9 +135,9 @@ def test_plain_lines_are_read_together_up_to_the_first_that_is_not(row, cell, wo
     for lines in (1, 2, 100):
         if words:
             with pytest.raises(InputError, match=words):
-                csv_module.read_table(path, csv_module.COLUMN_NAMES, lines_at_once=lines)
+                csv_module.read_table(path, csv_module.COLUMNS, lines_at_once=lines)
         else:
-            table = csv_module.read_table(path, csv_module.COLUMN_NAMES, lines_at_once=lines)
+            table = csv_module.read_table(path, csv_module.COLUMNS, lines_at_once=lines)
             found.append(np.stack([*table.columns.values()]))
     assert all(np.array_equal(each, found[0], equal_nan=True) for each in found)
 

@@ -11,11 +11,13 @@ from hypothesis import given, settings, strategies as st
 
 import jaxos4
 from jaxos4.errors import InputError
-from jaxos4.logs import as_recording
+from jaxos4.flight import SIGNALS
+from jaxos4.logs import as_recording, read_recording, write_flight
 from jaxos4.logs.sampling import averages
 from jaxos4.recording import Recording
 from jaxos4.recording.stretches import Stretch, cut
-from jaxos4.recording.windows import averaged, hold_out
+from jaxos4.recording.windows import averaged, concatenate, hold_out
+from jaxos4.shooting.segments import pad_flight
 
 
 def stretch(samples, seed, *, force=False, velocity=False, voltage=False, dt=0.01, start=0.0):
@@ -73,6 +75,27 @@ def test_velocity_and_voltage_are_kept_if_every_stretch_has_them_and_averaged_an
     np.testing.assert_allclose(coarse.voltage, expected, rtol=1e-9)
     assert averaged(flight._replace(voltage=None), [0.004])[0].voltage is None
     np.testing.assert_array_equal(cut(flight, Stretch(0.1, 0.2)).voltage, flight.voltage[100:201])
+
+
+@pytest.mark.parametrize("field", [name for name, signal in SIGNALS.items() if signal.columns])
+def test_a_signal_is_written_read_cut_averaged_joined_and_padded(field, tmp_path):
+    """A new signal, a field of `Flight` and of `Recording`, needs no line here, nor elsewhere."""
+    signal, rows = SIGNALS[field], np.random.default_rng(0).uniform(0.1, 1.2, (40, *SIGNALS[field].shape))
+    flown = Recording(0.01 * np.arange(40), np.full((40, 4), 300.0), np.full((40, 12), 0.5))._replace(**{field: rows})
+    write_flight(flown.flight, tmp_path / "flight.csv")
+    again = read_recording(tmp_path / "flight.csv")
+    np.testing.assert_array_equal(getattr(again, field), rows)
+    part = cut(again, Stretch(0.1, 0.19))
+    (coarse,) = averaged(part, [0.02])
+    means = rows[10:20].reshape(5, 2, *signal.shape).mean(axis=1)
+    np.testing.assert_allclose(getattr(coarse, field), means, rtol=1e-9)
+    whole = concatenate([part, cut(again, Stretch(0.2, 0.29))])
+    np.testing.assert_array_equal(getattr(whole, field), rows[10:30])
+    last = getattr(pad_flight(whole.flight, 30), field)[-1]
+    np.testing.assert_array_equal(last, rows[29] if signal.is_input else np.full(signal.shape, np.nan))
+    if field != "states":
+        some = getattr(concatenate([part, part._replace(**{field: None})]), field)
+        assert some is None if signal.is_input else np.isnan(some[10:]).all() and np.isfinite(some[:10]).all()
 
 
 def test_the_cost_of_joined_flights_is_the_sum_of_theirs():

@@ -91,6 +91,12 @@ UNREAD = {
     "zip of a CSV": (b"PK\x03\x04\x14" + bytes(25) + blackbox.SMALL, "is an archive"),
     "zip of another": (b"PK\x03\x04\x14" + bytes(25) + columns.neurobem_csv(50), "is an archive"),
     "tar of a CSV": (b"log.csv".ljust(257, b"\0") + b"ustar".ljust(255, b"\0") + blackbox.SMALL, "is an archive"),
+    "a result": (
+        b'{"estimator": "ibss"}',
+        "is a JSON file; the result of `jaxos4 estimate` is read by `jaxos4 report`",
+    ),
+    "an airframe": (b"# weighed\n\nmass = 0.03\n", "is a TOML file; give an airframe as `airframe`"),
+    "a column map": (b'[columns]\np = "gyro x"\n', "is a TOML file"),
     "other": (b"abc\x01\x02\x03", "is of a kind that is not known; export it as CSV"),
 }
 

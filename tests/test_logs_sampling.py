@@ -9,7 +9,7 @@ from recorded_logs import rates, table_csv
 
 from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs.messages import Messages
+from jaxos4.logs.messages import Messages, Rotors
 from jaxos4.logs.sampling import PARTS, Series, logged_rate, resample, root_mean_square, speeds_within
 
 # Uneven times
@@ -96,10 +96,12 @@ def test_a_gyro_beyond_a_kilohertz_is_averaged_to_one():
     t = grid(0.00025, 2.0)
     noise = np.random.default_rng(0).normal(0, 0.1, (t.size, 3))
     motor = Series(grid(0.01, 2.2, offset=-0.1), np.full((220, 4), 0.5))
-    log = Messages("", {}, "", names={"p": "gyro", "command1": "motors"})
-    rows, table = log.table(Series(t, rates(t) + noise), motor, {})
+    log = Messages("", {}, "", names={"p": "gyro"})
+    gyro, rotors = {("p", "q", "r"): Series(t, rates(t) + noise)}, Rotors(motor, ["motors"] * 4, is_measured=False)
+    table, _ = log.table(gyro, rotors, remedies=("", ""))
+    rows = table.columns["t"]
     assert np.median(np.diff(rows)) == pytest.approx(0.001)
-    off = np.column_stack([table.columns[name] for name in "pqr"]) - rates(rows)
+    off = np.column_stack([table.columns[name] for name in "pqr"]) - rates(t[0] + 0.0005 + rows)
     assert np.std(off) == pytest.approx(0.1 / 2, rel=0.15)  # of four samples each
 
 

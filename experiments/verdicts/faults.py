@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.recording import Recording
-from jaxos4.recording.motion import rotations_to_body
+from jaxos4.rotations import rotations_to_body
 
 FORCE = slice(12, 15)  # of the channels
 
@@ -72,7 +72,7 @@ def turned(recording: Recording, degrees: float) -> Recording:
 def along_the_earth(recording: Recording, size: float) -> Recording:
     """Specific force is along the axes of the earth; `size`: the share of the turn."""
     channels = recording.channels.copy()
-    turns = rotations_to_body(*(size * channels[:, ANGLES]).T)
+    turns = rotations_to_body(size * channels[:, ANGLES])
     channels[:, FORCE] = np.einsum("tji,tj->ti", turns, channels[:, FORCE])
     return changed(recording, channels)
 

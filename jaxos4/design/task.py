@@ -22,11 +22,11 @@ from .._custom_types import Key, Numeric, Scalar, as_float
 from .._files import write_atomically
 from .._xla import quick_jit
 from ..errors import InputError
-from ..flight import STATE_NAMES, Flight
+from ..flight import SPEED_NAMES, STATE_NAMES, Flight
 from ..linalg import gram, joint_factor
 from ..logs import write_flight
 from ..logs.csv import read_table
-from ..logs.table import SPEED_NAMES, Path, refuse
+from ..logs.table import LogPath, refuse
 from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]
@@ -135,7 +135,7 @@ class AbstractTask(eqx.Module):
 
     @staticmethod
     @abc.abstractmethod
-    def write(designed: Designed, path: Path) -> None:
+    def write(designed: Designed, path: LogPath) -> None:
         """Write the inputs as CSV."""
 
     @abc.abstractmethod
@@ -253,21 +253,21 @@ def check_settings(
         raise InputError(f"`bandwidth` must lie between {limits}, got {bandwidth:g} Hz.")
 
 
-def write_input(designed: Designed, path: Path) -> None:
+def write_input(designed: Designed, path: LogPath) -> None:
     """Write rotor speeds as a flight CSV with the columns t and omega1..4."""
     samples = designed.inputs.shape[0]
     nothing = np.full((samples, len(STATE_NAMES)), np.nan)
     write_flight(Flight(designed.dt * np.arange(samples), designed.inputs, nothing), path)
 
 
-def write_references(designed: Designed, path: Path) -> None:
+def write_references(designed: Designed, path: LogPath) -> None:
     """Write references as CSV, with the columns t, roll_reference, pitch_reference, yaw_reference and az_reference."""
     rows = np.column_stack([designed.dt * np.arange(len(designed.inputs)), designed.inputs])
     with write_atomically(path) as beside:
         np.savetxt(beside, rows, delimiter=",", header=",".join(("t", *_REFERENCE_NAMES)), comments="", fmt="%.8g")
 
 
-def read_input(path: Path, dt: float) -> Series:
+def read_input(path: LogPath, dt: float) -> Series:
     """Read rotor speeds [rad/s] with the sample time `dt` [s]. Raises `InputError` as `read_references` does."""
     omega, step = read_references(path, SPEED_NAMES)
     if (omega < 0).any() or abs(step - dt) > _PRECISION * dt:
@@ -275,7 +275,7 @@ def read_input(path: Path, dt: float) -> Series:
     return omega
 
 
-def read_references(path: Path, names: tuple[str, ...] = _REFERENCE_NAMES) -> tuple[Series, float]:
+def read_references(path: LogPath, names: tuple[str, ...] = _REFERENCE_NAMES) -> tuple[Series, float]:
     """Read the columns `names`, by default references, and their sample time [s]. Raises `InputError`, one line."""
     columns = read_table(path, ("t", *names)).columns
     for column in ("t", *names):

@@ -9,12 +9,10 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
-import numpy as np
-
 from .._registry import Registry
 from ..airframe import Airframe
 from ..errors import in_words, printable
-from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
+from ..flight import SIGNALS, Flight
 from .ardupilot import ARDUPILOT
 from .assemble import recording_of
 from .blackbox import BLACKBOX
@@ -25,12 +23,13 @@ from .ros import ROS
 from .table import (
     LogFacts as LogFacts,
     LogFormat as LogFormat,
-    Path,
+    LogPath,
     Recording as Recording,
     Sampling as Sampling,
     Table as Table,
     opened,
     refuse,
+    signals_of,
 )
 from .ulog import ULOG
 from .values import without_impossible
@@ -39,7 +38,7 @@ FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEU
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
 _OTHERS: Registry[LogFormat] = Registry("jaxos4.log_formats", {})
 
-# Files that no reader takes, by their first bytes: what they are, and how to make a log of them that is read.
+# Files that no reader takes, by their first bytes: their kind, and how to make a log of them that is read.
 _IN_PYTHON = "read it in Python, and give its arrays to jaxos4.read_log"
 _ARCHIVE = rb"PK\x03\x04|.{257}ustar"
 _UNREAD = {
@@ -61,6 +60,14 @@ _UNREAD = {
         "convert it to CSV by sdlog2_dump.py (of PX4 before version 1.10), and give a column map",
     ),
     rb".{16}BUILD|.{242}DJI": ("a log of DJI", "decode it by DatCon, and give its CSV with a column map"),
+    rb"(?:\xef\xbb\xbf)?\s*\{": (
+        "a JSON file",
+        "the result of `jaxos4 estimate` is read by `jaxos4 report`, `export` and `predict`; give a log here",
+    ),
+    rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[ \t]*(?:\[\w|[\w-]+[ \t]*=)": (
+        "a TOML file",
+        "give an airframe as `airframe`, a column map as `columns`, a study to `jaxos4 study`, and a log here",
+    ),
     rb"[^\n]{0,4000}[\0-\x08\x0e-\x1f]": ("of a kind that is not known", "export it as CSV, and give a column map"),
 }
 
@@ -69,7 +76,7 @@ Source = Flight | Recording | str | os.PathLike[str] | Any
 
 
 def read_log(
-    log: Path | Any,
+    log: LogPath | Any,
     airframe: Airframe | None = None,
     *,
     full_scale: float | None = None,
@@ -93,7 +100,7 @@ def read_log(
 
 
 def read_recording(
-    log: Path | Any,
+    log: LogPath | Any,
     airframe: Airframe | None = None,
     *,
     full_scale: float | None = None,
@@ -113,11 +120,11 @@ def read_recording(
     return recording._replace(facts=recording.facts._replace(format=kind))
 
 
-def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
+def read_flight(path: LogPath, airframe: Airframe | None = None) -> Flight:
     """Read a flight from a CSV file. Its columns: docs/index.md.
 
     Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such a grid. Jumps of 2 pi in
-    roll and yaw are removed. Each change to the data is a `UserWarning`. Arguments and errors are those of `read_log`.
+    roll and yaw are removed. Each change to the data is a `UserWarning`. For arguments and errors see `read_log`.
     """
     found = recording_of(*CSV.read(path), airframe)
     for note in found.notes:
@@ -125,7 +132,7 @@ def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
     return found.flight
 
 
-def log_format(path: Path) -> LogFormat:
+def log_format(path: LogPath) -> LogFormat:
     """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
 
     Formats of other packages are asked before the last; one that fails is a `UserWarning`. A pipe can be read only
@@ -135,7 +142,7 @@ def log_format(path: Path) -> LogFormat:
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
     with opened(inside if os.path.isfile(inside) else path, "rb") as file:
         begin = file.read(1 << 18) if file.seekable() else b""
-    # What an archive holds without compression is not its own format.
+    # An archive may begin with a log that it holds without compression.
     formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1]
     kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin) or FORMATS[-1]
     unread = (each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL))
@@ -178,11 +185,9 @@ def as_recording(flight: Source, name: str = "flight", airframe: Airframe | None
     if not isinstance(flight, Flight):
         return read_recording(flight, airframe)
     found = Recording.of(flight, name)
-    columns = {"t": found.time, **dict(zip(CHANNEL_NAMES, found.channels.T, strict=True))}
+    columns = {"t": found.time, **found.columns(inputs=False)}
     table = without_impossible(Table(name, columns, first_row=None))
     if not table.impossible:
         return found
-    channels = np.stack([table.columns[each] for each in CHANNEL_NAMES], axis=1)
-    states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
-    specific = None if found.specific_force is None else force
-    return found._replace(states=states, specific_force=specific, notes=(table.impossible_note,))
+    inputs = {field: getattr(found, field) for field, signal in SIGNALS.items() if signal.is_input}
+    return found._replace(**signals_of(table.columns) | inputs, notes=(table.impossible_note,))

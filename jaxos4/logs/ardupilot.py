@@ -1,6 +1,6 @@
 """DataFlash logs (`.BIN`) of ArduPilot's Copter. Messages, frames and settings: docs/logs.md.
 
-A file describes its own messages: a message FMT gives the number, length, name, field types and field names of each.
+A file describes its messages: a message FMT gives the number, length and name of a kind, and its types and fields.
 Reference: `AP_Logger` and `LogStructure.h` of ArduPilot.
 """
 
@@ -9,9 +9,10 @@ import math
 
 import numpy as np
 
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, motor_order
-from .sampling import HALF_TURN, Series, logged_rate
-from .table import LogFormat, Path, Table, counted, fast_enough, needed, order_note, read_bytes, refuse
+from ..rotations import HALF_TURN
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, motor_order, records
+from .sampling import Series, logged_rate
+from .table import LogFormat, LogPath, Table, counted, fast_enough, read_bytes, refuse
 
 _HEAD, _FMT, _FMT_LENGTH = b"\xa3\x95", 0x80, 89
 _TYPES = {  # by letter: the type, and the unit of its last digit, 0 for texts and arrays
@@ -40,7 +41,7 @@ _FAST = 1 | 1 << 18  # LOG_BITMASK: fast attitude, fast IMU
 _REMEDY = "the log is corrupt there: download it again, or choose another"
 
 
-def read_ardupilot(path: Path) -> tuple[Table, tuple[str, ...]]:
+def read_ardupilot(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a log of ArduPilot, and notes on what was assumed. Raises `InputError`."""
     log = _decoded(path)
     get = log.parameters.get
@@ -49,14 +50,14 @@ def read_ardupilot(path: Path) -> tuple[Table, tuple[str, ...]]:
         refuse(path, "FRAME_CLASS or SERVO5_FUNCTION: this is no quadrotor; give the log of a quadrotor")
     outputs = motor_order(functions, _MOTORS) or [0, 1, 2, 3]
     setting = f"set LOG_BITMASK to {int(get('LOG_BITMASK', 0)) | _FAST} (with fast attitude and fast IMU)"
-    others = {columns: log.fastest(columns, sources) for columns, sources in _SOURCES.items()}
-    rates = needed(path, others.pop(RATES), "body rates", setting)
-    remedy = "add 1024 (RC output) to LOG_BITMASK, and use ESC telemetry by bidirectional DShot"
-    rotors = needed(path, _rotors(log, outputs), "rotor speeds or commands", remedy)
-    log.notes.append(order_note(log.names.get("omega1") or log.names["command1"]))
     dshot = "log rotor speeds at 100 Hz by ESC telemetry of bidirectional DShot (SERVO_BLH_BDMASK = 15)"
-    faster = f"{dshot}, because RCOU is always at 10 Hz, {setting}, and fly again"
-    return log.table(rates, rotors, others, faster=faster)[1], tuple(log.notes)
+    return log.table(
+        {columns: log.fastest(columns, sources) for columns, sources in _SOURCES.items()},
+        _rotors(log, outputs),
+        remedies=(setting, "add 1024 (RC output) to LOG_BITMASK, and use ESC telemetry by bidirectional DShot"),
+        is_ordered=True,
+        faster=f"{dshot}, because RCOU is always at 10 Hz, {setting}, and fly again",
+    )
 
 
 def _recognises(begin: bytes) -> bool:
@@ -67,8 +68,8 @@ def _recognises(begin: bytes) -> bool:
 ARDUPILOT = LogFormat("ArduPilot", "ArduPilot DataFlash log", _recognises, read_ardupilot)
 
 
-def _rotors(log: Messages, outputs: list[int]) -> Series | None:
-    """Speeds [rad/s], or commands [0..1] if they were not measured, or only rarely."""
+def _rotors(log: Messages, outputs: list[int]) -> Rotors | None:
+    """Measured speeds, or commands if there are none, or only rare ones."""
     every = {f"ESC.RPM of output {output + 1}": log.series("ESC", ("RPM",), output) for output in outputs}
     escs = {name: each for name, each in every.items() if each is not None and (each.values > 0).any()}
     commands = log.series("RCOU", [f"C{output + 1}" for output in outputs])
@@ -76,21 +77,20 @@ def _rotors(log: Messages, outputs: list[int]) -> Series | None:
         t = next(iter(escs.values())).t
         rate = logged_rate(t)
         if commands is None or fast_enough(rate) or rate >= logged_rate(commands.t):
-            log.names.update((f"omega{i}", name) for i, name in enumerate(escs, start=1))
             values = [log.speeds_at(t, each, name) * _RPM for name, each in escs.items()]
-            return Series(t, np.abs(np.column_stack(values)))
+            return Rotors(Series(t, np.abs(np.column_stack(values))), [*escs], is_measured=True)
         log.notes.append(f"measured speeds (ESC) were logged at {rate:.2g} Hz only: commands are used")
     if commands is None:
         return None
     get = log.parameters.get
     low, high = get("MOT_PWM_MIN") or 1000.0, get("MOT_PWM_MAX") or 2000.0  # [us]
     low, high = (low, high) if low < high else (1000.0, 2000.0)
-    log.names.update((f"command{i}", f"RCOU.C{output + 1}") for i, output in enumerate(outputs, start=1))
-    log.notes.append(f"commands are RCOU, PWM {low:g}..{high:g}, taken as fractions of full-scale rotor speed")
-    return Series(commands.t, np.clip((commands.values - low) / (high - low), 0.0, 1.0))
+    shares = Series(commands.t, np.clip((commands.values - low) / (high - low), 0.0, 1.0))
+    note = f"commands are RCOU, PWM {low:g}..{high:g}, taken as fractions of full-scale rotor speed"
+    return Rotors(shares, [f"RCOU.C{output + 1}" for output in outputs], is_measured=False, note=note)
 
 
-def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> Messages:
+def _decoded(path: LogPath, *, largest: int = 1 << 30, most_damage: int = 1000) -> Messages:
     """The messages that are read. Raises `InputError` for more than `largest` bytes, or places of damage."""
     content, at, notes = read_bytes(path, largest), 0, []
     sizes, layouts = {_FMT: _FMT_LENGTH}, {}
@@ -115,17 +115,16 @@ def _decoded(path: Path, *, largest: int = 1 << 30, most_damage: int = 1000) -> 
     if damaged:
         what = "what follows up to the next message is ignored"
         notes.append(f"the log is damaged in {counted(damaged, 'place')}; {what}")
-    data, messages, parameters = np.frombuffer(content, dtype=np.uint8), {}, {}
+    messages, parameters = {}, {}
     for kind, (name, layout, units) in layouts.items():
-        begin = np.asarray(places[kind], dtype=np.int64)
-        if layout is None or not begin.size or name not in _READ:
+        if layout is None or not places[kind] or name not in _READ:
             continue
-        records = data[begin[:, None] + np.arange(layout.itemsize)].reshape(-1).view(layout)
+        found = records(content, places[kind], layout)
         with np.errstate(all="ignore"):  # a damaged float need not be finite
-            fields = {f: records[f].astype(float) * unit for f, unit in units.items() if unit}
+            fields = {f: found[f].astype(float) * unit for f, unit in units.items() if unit}
         messages[name] = _instances(fields)
         if name == "PARM" and "Name" in units and "Value" in fields:  # a text is no field
-            names = (each.decode(errors="replace") for each in records["Name"].astype("S64").tolist())
+            names = (each.decode(errors="replace") for each in found["Name"].astype("S64").tolist())
             parameters = {n: x for n, x in zip(names, fields["Value"].tolist(), strict=True) if abs(x) < 1e9}
     return Messages(path, messages, _REMEDY, notes, parameters=parameters)
 

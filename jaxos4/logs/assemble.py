@@ -7,12 +7,10 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..errors import printable
-from ..flight import CHANNEL_NAMES, STATE_NAMES
+from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES, STATE_NAMES
 from .sampling import UNIFORM, grid_size, held_regularly, last_measured, logged_rate, resample, unwrap
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, Recording, Sampling, Table, counted, listed
-from .values import LIMITS, PITCH, without_impossible
-
-COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
+from .table import MAX_ROWS, Recording, Sampling, Table, counted, listed, signals_of
+from .values import COLUMNS, PITCH, without_impossible
 
 
 def recording_of(
@@ -27,7 +25,7 @@ def recording_of(
         table.refuse(what, column="t")
     if not any(map(table.holds, STATE_NAMES)):
         table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
-    # Cells that hold no value were not logged, also those of a rotor.
+    # A column of empty cells was not logged, also if it is a rotor's.
     motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
     dt = _check_time(table)
     rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
@@ -35,7 +33,7 @@ def recording_of(
     for name in filter(table.holds, motors):
         if np.isnan(table.columns[name][0]):
             table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
-    table = without_impossible(table, LIMITS | PITCH)
+    table = without_impossible(table, COLUMNS | PITCH)
     if table.holds("psi"):
         psi = table.columns["psi"]
         measured, jumps = np.flatnonzero(np.isfinite(psi)), np.zeros(psi.size, dtype=bool)
@@ -44,8 +42,7 @@ def recording_of(
     if table.impossible:
         found.append(table.impossible_note)
     omega = _rotor_speeds(table, airframe, full_scale, found)
-    channels, voltage = _channels(table, found), _voltage(table)
-    with_force = np.isfinite(channels[:, len(STATE_NAMES) :]).any()
+    columns, inputs = _measured(table, found), _inputs(table)
     commanded = motors is COMMAND_NAMES
     t = table.columns["t"]
     table = table._replace(columns={"t": t})  # frees the memory of a long log
@@ -55,21 +52,21 @@ def recording_of(
         what = f"comes after a gap of {t[row + 1] - t[row]:.6g} s: at the median step of {dt:.3g} s the flight would "
         table.refuse(what + f"have {samples:.3g} samples; cut the file there", index=row + 1, column="t")
     held = commanded or table.held
-    (time, omega, channels), figures = resample(t, omega, channels, dt, held=held)
+    (time, omega, rows), figures = resample(t, omega, np.column_stack([*columns.values()]), dt, held=held)
     if figures:  # resampled speeds are means from sample to sample
         held = True
         found.append(figures)
-        voltage = None if voltage is None else np.interp(time, t, voltage)
-    if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
+        inputs = {name: np.interp(time, t, column) for name, column in inputs.items()}
+    columns = {name: column for name, column in zip(columns, rows.T, strict=True) if np.isfinite(column).any()}
+    if not columns.keys() & {*STATE_NAMES}:
         table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
     dt = float(time[-1] - time[0]) / (time.size - 1)
     if np.finfo(jnp.result_type(float)).eps * abs(time[0]) > UNIFORM * dt:
         found.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
         time = dt * np.arange(time.size)
-    states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
     about = {"commanded": commanded, "held": held, "name": printable(os.fspath(table.path))}
     about |= {"notes": tuple(found), "facts": facts}
-    return Recording(time, omega, states, force if with_force else None, voltage, **about)
+    return Recording(time=time, **signals_of(columns | inputs) | {"omega": omega}, **about)
 
 
 def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
@@ -90,7 +87,7 @@ def _check_time(table: Table, *, shortest: float = 1e-6, longest: float = 2.0) -
     """The median time between rows [s], refused outside of `shortest` to `longest`, or if times do not increase."""
     t = table.columns["t"]
     _refuse_any(table, "t", np.isnan(t), "is empty; each row needs its time")
-    _refuse_any(table, "t", np.abs(t) > LIMITS["t"].largest, f"is {{:g}} s; {LIMITS['t'].advice}")
+    _refuse_any(table, "t", np.abs(t) > COLUMNS["t"].largest, f"is {{:g}} s; {COLUMNS['t'].advice}")
     step = np.diff(t)
     if (step <= 0).any():
         index = int(np.argmax(step <= 0))
@@ -151,28 +148,32 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
     return column[last]
 
 
-def _channels(table: Table, notes: list[str]) -> np.ndarray:
-    """States and specific force, shape (rows, 15), with unwrapped angles."""
-    nothing = np.full(table.columns["t"].size, np.nan)
-    channels = np.column_stack([table.columns.get(name, nothing) for name in CHANNEL_NAMES])
-    for name in ("phi", "psi"):
-        i = CHANNEL_NAMES.index(name)
-        channels[:, i], jumps = unwrap(channels[:, i])
+def _measured(table: Table, notes: list[str]) -> dict[str, np.ndarray]:
+    """The columns of measurements, in which NaN marks gaps, with unwrapped angles."""
+    columns = {name: table.columns[name] for name in _names(table, inputs=False)}
+    for name in filter(columns.__contains__, ("phi", "psi")):
+        columns[name], jumps = unwrap(columns[name])
         if jumps:
             notes.append(f"{name}: {counted(jumps, 'jump')} of 2 pi removed")
-    force = channels[:, len(STATE_NAMES) :]
-    measured = force[:, np.isfinite(force).any(axis=0)]
+    force = [columns[name] for name in FORCE_NAMES if name in columns and np.isfinite(columns[name]).any()]
     # No accelerometer lies still to the last bit for this many samples.
-    if len(measured) >= 100 and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
+    if force and len(force[0]) >= 100 and all(np.nanmax(each) == np.nanmin(each) for each in force):
         notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
-        force[:] = np.nan
-    return channels
+        columns = {name: column for name, column in columns.items() if name not in FORCE_NAMES}
+    return columns
 
 
-def _voltage(table: Table) -> np.ndarray | None:
-    """The battery's voltage at every row [V], interpolated linearly between measured cells; 0 is not measured."""
-    if not table.holds("voltage"):
-        return None
-    t, voltage = table.columns["t"], table.columns["voltage"]
-    measured = voltage > 0
-    return np.interp(t, t[measured], voltage[measured]) if measured.any() else None
+def _inputs(table: Table) -> dict[str, np.ndarray]:
+    """The columns of inputs at every row, interpolated linearly between measured cells."""
+    t, found = table.columns["t"], {}
+    for name in _names(table, inputs=True):
+        measured = np.isfinite(table.columns[name])
+        if measured.any():
+            found[name] = np.interp(t, t[measured], table.columns[name][measured])
+    return found
+
+
+def _names(table: Table, *, inputs: bool) -> list[str]:
+    """The columns of a table that hold inputs, or the others, in the order of `SIGNALS`."""
+    signals = [signal for signal in SIGNALS.values() if signal.is_input == inputs]
+    return [name for signal in signals for name in signal.columns if table.holds(name)]

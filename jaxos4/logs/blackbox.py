@@ -15,11 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
+from ..flight import COMMAND_NAMES, SPEED_NAMES
+from ..rotations import HALF_TURN, euler_angles
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
 from .messages import ANGLES, FORCES, RATES
-from .sampling import HALF_TURN, euler_angles, in_order
-from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, opened, order_note, read_bytes, refuse
+from .sampling import in_order
+from .table import LogFormat, LogPath, Table, counted, opened, order_note, read_bytes, refuse
 
 _MAGIC = b"H Product:Blackbox"
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
@@ -52,7 +54,7 @@ _CONVERTED = {
     for name in _RAW
     for unit, factor in _UNITS.get(name.partition("[")[0], {}).items()
 }
-# Sessions are joined to the longest one if these settings are equal.
+# Sessions follow the longest one if these settings are equal.
 _USED = (*_GYRO_SCALES, "acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
 
 Settings = dict[str, str]
@@ -60,13 +62,13 @@ Columns = dict[str, np.ndarray]
 
 
 class _Log(NamedTuple):
-    """A blackbox log: its own columns `raw` and `settings`, and our `columns`, the log's `names` of them, `notes`.
+    """A blackbox log: its columns `raw` and its `settings`; our `columns` and their `names` in the log; `notes`.
 
     - `header`: the row of the CSV's header; `None` for a log that was not decoded.
     - `converted`: of columns that `blackbox_decode` has converted, the whole name ("gyroADC[0] (deg/s)") and the unit.
     """
 
-    path: Path
+    path: LogPath
     header: int | None
     settings: Settings
     raw: Columns
@@ -99,7 +101,7 @@ class _Log(NamedTuple):
         return value if least <= value <= most else None
 
 
-def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
+def read_blackbox(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
     with opened(path, "rb") as file:
         is_raw = file.seekable() and file.read(len(_MAGIC)) == _MAGIC
@@ -145,7 +147,7 @@ def _is_header(line: str) -> bool:
     return any(mark in line for mark in _HEADER_MARKS) and line.count(",") > 2
 
 
-def _settings_above(path: Path) -> tuple[Settings, int]:
+def _settings_above(path: LogPath) -> tuple[Settings, int]:
     """The settings above the header, and the number of their lines."""
     settings: Settings = {}
     with opened(path) as file:
@@ -162,7 +164,7 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
+def _sessions(path: LogPath) -> list[tuple[Settings, bytes]]:
     """The settings and the frames of each session. A header ends before a line without `H `, or that is not text."""
     content, found = read_bytes(path, 1 << 29), []  # more than an hour of flight
     places = [match.start() for match in re.finditer(_MAGIC, content)]
@@ -180,7 +182,7 @@ def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
     return found
 
 
-def _decoded(path: Path, *, between: float = 1.0) -> _Log:
+def _decoded(path: LogPath, *, between: float = 1.0) -> _Log:
     """A `.bbl` or `.BFL` file: all sessions, with a time `between` [s] them. Raises `InputError`."""
     notes: list[str] = []
     found: list[tuple[Settings, Columns]] = []

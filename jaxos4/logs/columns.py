@@ -3,51 +3,33 @@
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._files import check_plain, read_toml
-from ..airframe import STANDARD_GRAVITY
-from ..flight import CHANNEL_NAMES, FORCE_NAMES
+from ..flight import SIGNALS, SPEED_NAMES
+from ..rotations import euler_angles
 from .messages import ANGLES
-from .sampling import euler_angles
-from .table import COMMAND_NAMES, SPEED_NAMES, Path, Table, listed, quoted, refuse
+from .table import LogPath, Table, listed, quoted, refuse
+from .values import COLUMNS, PWM, PWM_ZERO, Quantity
 
-ColumnsGiven = Path | Mapping[str, Any] | None
+ColumnsGiven = LogPath | Mapping[str, Any] | None
 """A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
 
-PRESETS = {path.stem: path for path in sorted(FilePath(__file__).with_name("presets").glob("*.toml"))}
+PRESETS = {path.stem: path for path in sorted(Path(__file__).with_name("presets").glob("*.toml"))}
 QUATERNION = ("qw", "qx", "qy", "qz")
-_COLUMNS = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, *QUATERNION, "voltage")
-_DEGREE, _PWM = math.pi / 180, "PWM"
-_UNITS = {  # by the unit of a column: other units, in the column's
-    "s": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "rad/s": {"deg/s": _DEGREE, "rpm": 2 * math.pi / 60},
-    "of full scale": {"%": 0.01, _PWM: 1e-3},
-    "rad": {"deg": _DEGREE},
-    "m": {"cm": 0.01, "mm": 1e-3},
-    "m/s": {"cm/s": 0.01, "mm/s": 1e-3},
-    "m/s^2": {"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY},
-    "V": {"mV": 1e-3},
-    "of a quaternion": {},
-}
-_UNIT_OF = {
-    **{"t": "s", "voltage": "V"},
-    **dict.fromkeys((*SPEED_NAMES, "p", "q", "r"), "rad/s"),
-    **dict.fromkeys(COMMAND_NAMES, "of full scale"),
-    **dict.fromkeys(ANGLES, "rad"),
-    **dict.fromkeys("xyz", "m"),
-    **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
-    **dict.fromkeys(FORCE_NAMES, "m/s^2"),
-    **dict.fromkeys(QUATERNION, "of a quaternion"),
-}
-_TURNED = {"q", "r", "theta", "psi", "y", "z", "vy", "vz", "ay", "az", "qy", "qz"}  # by half a turn about x
+_QUATERNION = Quantity("of a quaternion", -math.inf, math.inf, "")
+_COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
+_VECTORS = [tuple(signal.columns) for signal in SIGNALS.values() if len(signal.columns) == 3]
+_ALONG_YZ = [name for vector in _VECTORS for name in vector[1:]]
+_TURNED = {"q", "r", "theta", "psi", "y", "z", "vy", "vz", "qy", "qz", *_ALONG_YZ}
+"""What has the opposite sign after half a turn about x."""
 _REMEDY = "correct its unit or sign in the column map"
 
 
-class Source(NamedTuple):
+class ColumnSource(NamedTuple):
     """The source of a column: the first of `names` that a log holds. Its values: (value - `zero`) * `factor`."""
 
     names: tuple[str, ...]
@@ -61,15 +43,15 @@ class ColumnMap(NamedTuple):
     - `name`: in messages.
     - `sources`: by column of the flight CSV, or `qw, qx, qy, qz`, the attitude from the body to the earth.
     - `needed`: the columns that a log must hold.
-    - `recorded`: whether messages have the time at which they were recorded, and not that of their own stamp.
+    - `recorded`: whether messages have the time at which they were recorded, instead of the time of their stamp.
     """
 
     name: str
-    sources: dict[str, Source]
+    sources: dict[str, ColumnSource]
     needed: frozenset[str] = frozenset()
     recorded: bool = False
 
-    def chosen(self, path: Path, held: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
+    def chosen(self, path: LogPath, held: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
         """By column, its place in a log.
 
         - `held`: takes a source; returns its name in the log, or `None` if the log does not hold it.
@@ -97,7 +79,7 @@ class ColumnMap(NamedTuple):
 def column_map(given: ColumnsGiven) -> ColumnMap:
     """A checked column map; `None`: the columns of the flight CSV. Raises `InputError`, one line, or `OSError`."""
     if given is None:
-        return ColumnMap("flight CSV", {name: Source((name,)) for name in _COLUMNS})
+        return ColumnMap("flight CSV", {name: ColumnSource((name,)) for name in _COLUMNS})
     if isinstance(given, Mapping):
         name, table = "columns", dict(given)
         check_plain(name, table, "correct it")
@@ -131,7 +113,7 @@ def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
     return ColumnMap(quoted(name), sources, frozenset(columns) if needed else frozenset(), time == "recorded")
 
 
-def _source(name: str, column: str, value: Any) -> Source:
+def _source(name: str, column: str, value: Any) -> ColumnSource:
     """The source of one column, as it stands in the map. Raises `InputError`."""
     if column not in _COLUMNS:
         refuse(name, f"there is no column {quoted(str(column))}; the columns are {', '.join(_COLUMNS)}")
@@ -140,16 +122,16 @@ def _source(name: str, column: str, value: Any) -> Source:
     names = [names] if isinstance(names, str) else names
     if not isinstance(names, list) or not names or not all(isinstance(each, str) and each for each in names):
         refuse(name, 'has no source; give a name, as in p = "gyro x"', column=column)
-    own, factor = _UNIT_OF[column], 1.0 if unit is None else unit
+    quantity, factor = _COLUMNS[column], 1.0 if unit is None else unit
     if isinstance(factor, str):
-        factor = 1.0 if factor == own else _UNITS[own].get(factor, math.nan)
+        factor = 1.0 if factor == quantity.unit else quantity.others.get(factor, math.nan)
     usable = isinstance(factor, int | float) and math.isfinite(factor) and factor != 0
     if not usable or sign not in (1, -1) or not entry.keys() <= {"source", "unit", "sign"}:
-        units = ", ".join([own, *_UNITS[own]])
+        units = ", ".join([quantity.unit, *quantity.others])
         refuse(
             name, f"may have a source, a unit ({units}, or a factor) and a sign (1 or -1); correct it", column=column
         )
-    return Source(tuple(names), float(factor) * sign, 1000.0 if unit == _PWM else 0.0)  # [us] of no thrust
+    return ColumnSource(tuple(names), float(factor) * sign, PWM_ZERO if unit == PWM else 0.0)
 
 
 def mapped_rows(table: Table, columns: ColumnMap) -> Table:

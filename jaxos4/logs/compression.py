@@ -5,11 +5,11 @@ import re
 import struct
 from collections.abc import Iterable, Iterator
 from importlib import import_module
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import IO, Any, NoReturn
 
 from ..errors import InputError
-from .table import Path, opened, refuse
+from .table import LogPath, opened, refuse
 
 MAX_PART = 1 << 28  # bytes of a chunk or a message, in memory; recorders write about a megabyte, a bomb has gigabytes
 MAX_FILE = 1 << 34  # bytes, on the disk, of a file compressed as a whole; a bag of an hour has a few gigabytes
@@ -19,12 +19,12 @@ _STEP = 1 << 20  # bytes that are decompressed at a time
 _MCAP, _CHUNK_OF_MCAP, _ATTACHMENT_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, 9, b"\x05"
 
 
-def check_sizes(path: Path) -> None:
+def check_sizes(path: LogPath) -> None:
     """Raises `InputError` for a bag, file or folder, that is too large when it is decompressed. Readers report damage.
 
     What is in a folder must be files: a pipe or a device has no end.
     """
-    place = FilePath(path)
+    place = Path(path)
     for each in sorted(place.iterdir()) if place.is_dir() else [place]:
         if each.is_dir() or not each.exists():
             continue
@@ -44,7 +44,7 @@ def check_sizes(path: Path) -> None:
                 _check_whole(each, file)
 
 
-def _check_metadata(path: FilePath) -> None:
+def _check_metadata(path: Path) -> None:
     """The same for a text in YAML, which may not refer to itself either: lists of lists of it could have any length."""
     with opened(path, "rb") as file:
         content = file.read(MAX_METADATA + 1)
@@ -54,7 +54,7 @@ def _check_metadata(path: FilePath) -> None:
         refuse(path, "names parts of itself (& and *), which no recorder does; make it anew by `ros2 bag reindex`")
 
 
-def _check_whole(path: FilePath, packed: IO[bytes]) -> None:
+def _check_whole(path: Path, packed: IO[bytes]) -> None:
     """The same for a file that may be compressed as a whole. It is decompressed once, a part at a time."""
     most = min(MAX_FILE, max(SMALL, MAX_TIMES * path.stat().st_size))
     end = most + 1
@@ -72,17 +72,17 @@ def _check_whole(path: FilePath, packed: IO[bytes]) -> None:
         refuse(path, f"{what}; record it again in several files (--max-bag-size)")
 
 
-def check_parts(path: Path, parts: Iterable[tuple[str, bytes]]) -> None:
+def check_parts(path: LogPath, parts: Iterable[tuple[str, bytes]]) -> None:
     """The same for parts, each the name of its compression and its content."""
     if any(_exceeds(kind, content) for kind, content in parts):
         _refuse_part(path)
 
 
-def _refuse_part(path: Path) -> NoReturn:
+def _refuse_part(path: LogPath) -> NoReturn:
     refuse(path, f"holds a part of more than {MAX_PART:,} bytes; record it again in parts of a few megabytes")
 
 
-def _mcap_parts(path: Path, file: IO[bytes], *, end: int) -> Iterator[tuple[str, bytes]]:
+def _mcap_parts(path: LogPath, file: IO[bytes], *, end: int) -> Iterator[tuple[str, bytes]]:
     """The compression and the content of each chunk of a file that is open behind its first eight bytes.
 
     A reader holds each record in memory, except attachments. `end`: nothing is looked at from this byte on.
@@ -99,7 +99,7 @@ def _mcap_parts(path: Path, file: IO[bytes], *, end: int) -> Iterator[tuple[str,
         yield chunk[32 : 32 + size].decode(errors="replace"), chunk[40 + size :]
 
 
-def _ros1_parts(path: Path, file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
+def _ros1_parts(path: LogPath, file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
     """The same of a bag of ROS 1, behind its first line."""
     while len(head := file.read(4)) == 4:
         header = file.read(struct.unpack("<I", head)[0])

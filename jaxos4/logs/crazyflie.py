@@ -1,4 +1,4 @@
-"""Logs of the Crazyflie's micro-SD card: versions 1 and 2, and that of 2019. Variables and frames: docs/logs.md.
+"""Logs of the Crazyflie's micro-SD card: versions 1 and 2, and the format of 2019. Variables and frames: docs/logs.md.
 
 Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 """
@@ -12,9 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
-from .messages import ANGLES, FORCES, RATES, Fields, Messages
+from ..flight import COMMAND_NAMES, SPEED_NAMES
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, records
 from .sampling import Series
-from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, needed, quoted, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, counted, quoted, read_bytes, refuse
 
 _MAGIC = b"\xbc"
 _PAIR = re.compile(rb"(..)(..)", re.DOTALL)
@@ -23,18 +24,18 @@ _NAME = re.compile(rb"([^\0]{0,255})\0")
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
 _SETS = re.compile(rb"(.)(tick\(I\),(?:[\x20-\x27\x2a\x2b\x2d-\x7e]{1,80}\([bBhHiIqQefd]\),){1,255})", re.DOTALL)
 _DEGREE, _RPM, _FULL = math.pi / 180, 2 * math.pi / 60, 65535.0
-_RATES = [f"gyro.{axis}" for axis in "xyz"]
-_OTHERS = {
+_SOURCES = {
+    RATES: ([f"gyro.{axis}" for axis in "xyz"], _DEGREE),
     ANGLES: ([f"stateEstimate.{name}" for name in ("roll", "pitch", "yaw")], _DEGREE * np.array([1, -1, 1])),
-    # Each of these is read by itself.
+    # These are read one by one.
     **{(name,): ([f"acc.{name[1]}"], STANDARD_GRAVITY) for name in FORCES},
     **{(name,): ([f"stateEstimate.{name}"], 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")},
     ("voltage",): (["pm.vbat"], 1.0),
 }
 _ROTORS = (
-    (SPEED_NAMES, "rpm.m{}", _RPM),
-    (COMMAND_NAMES, "motor.m{}", 1 / _FULL),
-    (COMMAND_NAMES, "pwm.m{}_pwm", 1 / _FULL),
+    ("rpm.m{}", True, _RPM),
+    ("motor.m{}", False, 1 / _FULL),
+    ("pwm.m{}_pwm", False, 1 / _FULL),
 )
 _AGAIN = "copy it again from the card"
 _REMEDY = f"the log is corrupt there: {_AGAIN}, or choose another"
@@ -45,7 +46,7 @@ Types = dict[int, tuple[str, np.dtype]]
 Events = dict[str, dict[int, Fields]]
 
 
-def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
+def read_crazyflie(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a Crazyflie's log, and notes on what was assumed. Raises `InputError`."""
     notes: list[str] = []
     content = read_bytes(path, 1 << 28)  # an hour at 1 kHz
@@ -53,15 +54,15 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     if not events:
         refuse(path, "holds no events; a flight needs at least two")
     log = Messages(path, events, _REMEDY, notes, prefixed=False)
-    rates = _logged(log, RATES, _RATES, _DEGREE)
-    rates = needed(path, rates, "body rates", "add gyro.x, gyro.y and gyro.z to the deck's config.txt")
-    remedy = "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt"
-    rotors = needed(path, _rotors(log), "rotor speeds or commands", remedy)
-    others = {columns: _logged(log, columns, *source) for columns, source in _OTHERS.items()}
-    if "command1" in log.names:
-        log.note_commands()
-    faster = "raise the frequency of these variables in the deck's config.txt, and fly again"
-    return log.table(rates, rotors, others, faster=faster)[1], tuple(notes)
+    return log.table(
+        {columns: _logged(log, columns, *source) for columns, source in _SOURCES.items()},
+        _rotors(log),
+        remedies=(
+            "add gyro.x, gyro.y and gyro.z to the deck's config.txt",
+            "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt",
+        ),
+        faster="raise the frequency of these variables in the deck's config.txt, and fly again",
+    )
 
 
 CRAZYFLIE = LogFormat(
@@ -79,22 +80,19 @@ def _logged(
     return log.fastest(columns, [(event, variables, factor) for event in log.fields])
 
 
-def _rotors(log: Messages) -> Series | None:
-    """Rotor speeds [rad/s] or commands [0..1]."""
-    for columns, variable, factor in _ROTORS:
-        series = _logged(log, columns, [variable.format(i) for i in range(1, 5)], factor)
+def _rotors(log: Messages) -> Rotors | None:
+    for variable, is_measured, factor in _ROTORS:
+        names = [variable.format(i) for i in range(1, 5)]
+        series = _logged(log, SPEED_NAMES if is_measured else COMMAND_NAMES, names, factor)
         if series is None:
             continue
-        measured, finite = columns == SPEED_NAMES, np.isfinite(series.values).all(axis=1)
-        if np.count_nonzero(finite) > 1 and not (measured and not (series.values > 0).any(axis=0).all()):
-            values = series.values[finite]
-            return Series(series.t[finite], values if measured else np.clip(values, 0.0, 1.0))
-        for column in columns:
-            del log.names[column]
+        series = series if is_measured else Series(series.t, np.clip(series.values, 0.0, 1.0))
+        if (rotors := Rotors.of(series, names, is_measured=is_measured)) is not None:
+            return rotors
     return None
 
 
-def _events(path: Path, content: bytes, notes: list[str]) -> Events:
+def _events(path: LogPath, content: bytes, notes: list[str]) -> Events:
     """The events of versions 1 and 2, by the names of their types."""
     types, version, at = _types(path, content)
     valid = len(content) >= at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
@@ -102,17 +100,16 @@ def _events(path: Path, content: bytes, notes: list[str]) -> Events:
     if not valid:
         cut = f"and its last {ignored} bytes are not a complete event" if ignored else "but ends with a complete event"
         notes.append(f"the log has no valid checksum, {cut}: it was cut while it was written, or is corrupt")
-    data, found = np.frombuffer(content, dtype=np.uint8), {}
+    found: Events = {}
     for number, (name, layout) in types.items():
-        at = np.asarray(places[number], dtype=np.int64)
-        if at.size > 1:
-            records = data[at[:, None] + np.arange(layout.itemsize)].reshape(-1).view(layout)
-            fields = {each: records[each] for each in layout.names or () if each[0] != " "}
-            found.setdefault(name, {})[number] = fields | {"t": records[" t"] * (1e-3 if version == 1 else 1e-6)}
+        if len(places[number]) > 1:
+            events = records(content, places[number], layout)
+            fields = {each: events[each] for each in layout.names or () if each[0] != " "}
+            found.setdefault(name, {})[number] = fields | {"t": events[" t"] * (1e-3 if version == 1 else 1e-6)}
     return found
 
 
-def _sets(path: Path, content: bytes, notes: list[str]) -> Events:
+def _sets(path: LogPath, content: bytes, notes: list[str]) -> Events:
     """The one event of the format of 2019: names, then blocks of data sets, each with the inverse of its CRC-32."""
     match = _SETS.match(content)
     found = [] if match is None else [_VARIABLE.fullmatch(text.strip()) for text in match[2].split(b",")[:-1]]
@@ -128,17 +125,17 @@ def _sets(path: Path, content: bytes, notes: list[str]) -> Events:
         at = end + 4
     if bad:
         notes.append(f"{counted(bad, 'block')} of the log with a wrong checksum are ignored: they are cut or corrupt")
-    records = np.frombuffer(b"".join(good), layout)
-    sets = {name: records[name] for name, _ in fields} | {"t": records["tick"] * 1e-3}
-    return {"its data sets": {0: sets}} if records.size > 1 else {}
+    rows = np.frombuffer(b"".join(good), layout)
+    sets = {name: rows[name] for name, _ in fields} | {"t": rows["tick"] * 1e-3}
+    return {"its data sets": {0: sets}} if rows.size > 1 else {}
 
 
 def _field(variable: re.Match[bytes]) -> tuple[str, str]:
-    """The name and the type of a variable; the letter e is that of a half float."""
+    """The name and the type of a variable; the letter e means a half float."""
     return variable[1].decode(), "<f2" if variable[2] == b"e" else f"<{variable[2].decode()}"
 
 
-def _types(path: Path, content: bytes, *, most_types: int = 64, most_variables: int = 256) -> tuple[Types, int, int]:
+def _types(path: LogPath, content: bytes, *, most_types: int = 64, most_variables: int = 256) -> tuple[Types, int, int]:
     """The types of events, the version, and the number of bytes of the header. Raises `InputError`."""
     at = 1
 
@@ -175,7 +172,7 @@ def _types(path: Path, content: bytes, *, most_types: int = 64, most_variables: 
     return types, version, at
 
 
-def _places(path: Path, content: bytes, types: Types, at: int, *, valid: bool) -> tuple[dict[int, array.array], int]:
+def _places(path: LogPath, content: bytes, types: Types, at: int, *, valid: bool) -> tuple[dict[int, array.array], int]:
     """The position of each event by its type, and the number of bytes after the last complete event."""
     places, end = {number: array.array("q") for number in types}, len(content)
     sizes = {number: layout.itemsize for number, (_, layout) in types.items()}

@@ -1,31 +1,28 @@
-"""The flight CSV, the project's own log format. Its columns: docs/index.md."""
+"""The flight CSV, the log format of this project. Its columns: docs/index.md."""
 
+import contextlib
 import csv
-import functools
 import itertools
 import math
-import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import IO
 
 import numpy as np
 
 from .._files import write_atomically
 from ..airframe import Airframe
-from ..flight import FORCE_NAMES, STATE_NAMES, Flight
-from .assemble import COLUMN_NAMES as COLUMN_NAMES
+from ..flight import COMMAND_NAMES, SPEED_NAMES, Flight
 from .columns import ColumnMap, column_map, mapped_rows
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFormat, Path, Table, counted, opened, quoted, refuse
+from .table import MAX_ROWS, LogFormat, LogPath, Recording, Table, counted, opened, quoted, refuse
+from .values import COLUMNS
 
 _LONGEST_LINE = 1 << 20
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # float() also reads "nan" and "1_0"
-_IN_NUMBERS = dict.fromkeys(map(ord, "-+.0123456789eE,\n"))
-# An empty cell becomes NaN: in its first and second neighbour, at the end of a line, at its beginning.
-_FILLED = ((",,", ",nan,"), (",,", ",nan,"), (",\n", ",nan\n"), ("\n,", "\nnan,"))
+_IN_NUMBERS = dict.fromkeys(map(ord, "-+.0123456789eE \t"))  # float() also reads "nan" and "1_0"
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
 
-def read_mapped(path: Path, columns: ColumnMap) -> tuple[Table, tuple[str, ...]]:
+def read_mapped(path: LogPath, columns: ColumnMap) -> tuple[Table, tuple[str, ...]]:
     """Read a CSV file by a column map. Raises `InputError`."""
     known = {name for source in columns.sources.values() for name in source.names}
     return mapped_rows(read_table(path, known, missing=("NaN", "nan")), columns), ()
@@ -43,14 +40,14 @@ CSV = LogFormat(
     "CSV",
     "flight CSV",
     lambda begin: True,
-    lambda path: (read_table(path, COLUMN_NAMES), ()),
+    lambda path: (read_table(path, COLUMNS), ()),
     read_mapped,
     of_vehicles=False,
 )
 
 
 def read_table(
-    path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = (), lines_at_once: int = 10_000
+    path: LogPath, known: Collection[str], *, skip: int = 0, missing: Collection[str] = (), lines_at_once: int = 10_000
 ) -> Table:
     """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
 
@@ -68,26 +65,22 @@ def read_table(
             file.readline(_LONGEST_LINE)
         header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
         wanted = {name: header.index(name) for name in header if name in known}
-        lines = iter(functools.partial(file.readline, _LONGEST_LINE), "")
-        while batch := list(itertools.islice(lines, lines_at_once)):
-            numbers = _plain_numbers(batch, len(header), missing)
-            if numbers is None:
-                rows = [*_rows(path, batch, lines, len(header), skip + 2 + count)]
-                numbers = np.array([_numbers(path, wanted, missing, *row) for row in rows])
-                found.append(numbers.reshape(len(rows), len(wanted)))
-            else:
-                found.append(numbers[:, [*wanted.values()]])
-            count += len(found[-1])
+        rows = _rows(path, file, len(header), skip + 2)
+        while batch := list(itertools.islice(rows, lines_at_once)):
+            cells = [*zip(*batch, strict=True)]
+            columns = {name: cells[place] for name, place in wanted.items()}
+            found.append(_numbers(path, columns, missing, skip + 2 + count))
+            count += len(batch)
             if count > MAX_ROWS:
                 refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
     if count < 2:
         refuse(path, f"has a header and {['no data', 'one row of data'][count]}; a flight needs two rows")
-    columns = {name: np.concatenate([batch[:, i] for batch in found]) for i, name in enumerate(wanted)}
+    columns = {name: np.concatenate([batch[name] for batch in found]) for name in wanted}
     return Table(path, columns, tuple(name for name in header if name not in known), skip + 2)
 
 
-def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
-    """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of states, specific force and voltage.
+def write_flight(flight: Flight, path: LogPath, airframe: Airframe | None = None) -> None:
+    """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of its signals.
 
     Reading the file gives back every bit of measured speeds and states; angles are unwrapped. If writing fails, an
     older file at `path` is unchanged.
@@ -104,9 +97,7 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
     if flight.commanded and airframe is not None and np.isfinite(airframe.max_rotor_speed):
         names, omega = COMMAND_NAMES, omega / np.asarray(airframe.max_rotor_speed)
     needed = {"t": np.asarray(flight.time), **dict(zip(names, omega.T, strict=True))}
-    measured: dict[str, np.ndarray] = dict(zip((*STATE_NAMES, *FORCE_NAMES), flight.recorded.T, strict=True))
-    if flight.voltage is not None:
-        measured["voltage"] = np.asarray(flight.voltage)
+    measured = Recording.of(flight).columns()
     for name, column in {**needed, **measured}.items():
         usable = np.isfinite(column) if name in needed else ~np.isinf(column)
         if not usable.all():
@@ -121,14 +112,14 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
         writer.writerows(["" if math.isnan(x) else x for x in row.tolist()] for row in rows)
 
 
-def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str]:
+def _header(path: LogPath, line: str, known: Collection[str], row: int) -> list[str]:
     """The names of the columns."""
     if not _readable(line):
         refuse(path, _NOT_UTF8, row=row)
     names = [name.strip() for name in _cells(path, line.rstrip("\n"), row)]
     separators = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
     wrong = next((shown for each, shown in separators.items() if len(names) == 1 and each in line.strip()), None)
-    numbers = all(_NUMBER.fullmatch(name) for name in names if name)
+    numbers = not any(math.isnan(_float(name)) for name in names if name)
     what = (
         "is empty; a flight needs a header row and at least two rows of data" * (not line)
         or "is empty; the first row must be the header" * (not any(names))
@@ -143,71 +134,72 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
     return names
 
 
-def _plain_numbers(lines: list[str], width: int, missing: Collection[str]) -> np.ndarray | None:
-    """The numbers in lines without a fault, all at once; NaN for cells without a number. `None` for any other lines."""
-    text = "".join(lines)
-    if " " in text:  # to look for one character is fast
-        text = text.replace(", ", ",")
-    for cell in missing:
-        text = re.sub(rf"(^|(?<=,)){re.escape(cell)}(?=,|$)", "", text, flags=re.MULTILINE)
-    if not text or text.isspace() or len(max(lines, key=len)) >= _LONGEST_LINE - 1 or text.translate(_IN_NUMBERS):
-        return None
-    try:
-        numbers = _array(text)
-    except ValueError:  # some cells are empty
-        text = f"\n{text}\n"
-        for empty, filled in _FILLED:
-            text = text.replace(empty, filled)
-        try:
-            numbers = _array(text)
-        except ValueError:
-            return None
-    return numbers if numbers.shape == (len(lines), width) and not np.isinf(numbers).any() else None
-
-
-def _array(text: str) -> np.ndarray:
-    """The numbers in lines that are not blank."""
-    return np.loadtxt(text.splitlines(), delimiter=",", comments=None, ndmin=2)
-
-
-def _rows(path: Path, batch: list[str], rest: Iterable[str], width: int, row: int) -> Iterator[tuple[list[str], int]]:
-    """The cells of each line of a batch, and its row, from `row` on; without the blank lines at the end of the file."""
-    for i, line in enumerate(batch):
-        if line.isspace():
-            if not all(map(str.isspace, itertools.chain(batch[i:], rest))):
-                refuse(path, "is blank; delete it", row=row + i)
+def _rows(path: LogPath, file: IO[str], width: int, first: int) -> Iterator[list[str]]:
+    """The cells of each line, from row `first` on, without the blank lines at the end of the file."""
+    blank = None
+    for row in itertools.count(first):
+        line = file.readline(_LONGEST_LINE)
+        if not line:
             return
-        cells = _cells(path, line.rstrip("\n"), row + i)
+        if line.isspace():
+            blank = row if blank is None else blank
+            continue
+        if blank is not None:
+            refuse(path, "is blank; delete it", row=blank)
+        cells = _cells(path, line.rstrip("\n"), row)
         if len(cells) != width:
             what = f"has {counted(len(cells), 'cell')}, but the header has {width}; repair or delete the row"
-            refuse(path, what, row=row + i)
-        yield cells, row + i
+            refuse(path, what, row=row)
+        yield cells
 
 
-def _cells(path: Path, line: str, row: int) -> list[str]:
+def _cells(path: LogPath, line: str, row: int) -> list[str]:
     """The cells of one line: an open quote ends with its line."""
     if len(line) >= _LONGEST_LINE - 1:
         refuse(path, "is longer than a million characters; export the log as CSV with a header row", row=row)
+    if '"' not in line:
+        return line.split(",")
     try:
-        return next(csv.reader([line]), [])
+        return next(csv.reader([line]))
     except csv.Error:
         refuse(path, "contains a cell that is too long; repair or delete the row", row=row)
 
 
 def _numbers(
-    path: Path, places: Mapping[str, int], missing: Collection[str], cells: list[str], row: int
-) -> list[float]:
-    values = []
-    for column, place in places.items():
-        cell = cells[place].strip()
-        number = _NUMBER.fullmatch(cell) is not None
-        values.append(float(cell) if number else math.nan)
-        if cell and cell not in missing and not math.isfinite(values[-1]):
-            fault = ", which is too large for a number;" if number else ", which is not a number; correct it, or"
-            fault = ";" if cell.lower().lstrip("+-") in _NO_NUMBER else fault
-            what = f"contains {quoted(cell)}{fault} leave the cell empty if it was not measured"
-            refuse(path, what if _readable(cell) else _NOT_UTF8, row=row, column=column)
-    return values
+    path: LogPath, columns: Mapping[str, Sequence[str]], missing: Collection[str], first: int
+) -> dict[str, np.ndarray]:
+    """The numbers in columns of cells, from row `first` on; NaN for cells without one."""
+    found, faults = {}, []
+    for name, cells in columns.items():
+        found[name] = np.array(_floats(cells))
+        suspects = ((i, cells[i].strip()) for i in np.flatnonzero(~np.isfinite(found[name])).tolist())
+        wrong = ((i, name, cell) for i, cell in suspects if cell and cell not in missing)
+        faults += itertools.islice(wrong, 1)
+    if faults:
+        index, name, cell = min(faults, key=lambda fault: fault[0])
+        fault = ", which is not a number; correct it, or"
+        if math.isinf(_float(cell)):
+            fault = ", which is too large for a number;"
+        elif cell.lower().lstrip("+-") in _NO_NUMBER:
+            fault = ";"
+        what = f"contains {quoted(cell)}{fault} leave the cell empty if it was not measured"
+        refuse(path, what if _readable(cell) else _NOT_UTF8, row=first + index, column=name)
+    return found
+
+
+def _floats(cells: Sequence[str]) -> list[float]:
+    """The numbers in cells; NaN for other cells. Cells that are numbers or empty take a third of the time."""
+    if not "".join(cells).translate(_IN_NUMBERS):
+        with contextlib.suppress(ValueError):
+            return [float(cell) if cell else math.nan for cell in cells]
+    return [*map(_float, cells)]
+
+
+def _float(cell: str) -> float:
+    try:
+        return math.nan if cell.translate(_IN_NUMBERS) else float(cell)
+    except ValueError:
+        return math.nan
 
 
 def _readable(text: str) -> bool:

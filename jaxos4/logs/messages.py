@@ -1,12 +1,13 @@
-"""Logs of messages: sensors with times of their own, brought to the rows of the gyro."""
+"""Logs of messages: sensors that were logged at different times, brought to the rows of the gyro."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ..flight import COMMAND_NAMES, SPEED_NAMES
 from .sampling import (
     REACH,
     RowPositions,
@@ -19,7 +20,7 @@ from .sampling import (
     root_mean_square,
     unwrap,
 )
-from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, LogFacts, Path, Sampling, Table, refuse
+from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, order_note, refuse
 from .values import dropped, without_impossible
 
 RATES, ANGLES, FORCES = ("p", "q", "r"), ("phi", "theta", "psi"), ("ax", "ay", "az")
@@ -27,13 +28,40 @@ _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no
 
 Names = tuple[str, ...]
 Fields = dict[str, np.ndarray]
-Source = tuple[str, Sequence[str], float | Float[np.ndarray, " fields"]]
+MessageSource = tuple[str, Sequence[str], float | Float[np.ndarray, " fields"]]
 """A kind of messages, the fields that hold some of our columns, and the factors to our units and frame."""
+
+
+class Rotors(NamedTuple):
+    """Speeds [rad/s] or commands [0..1] of four rotors, and their names in the log.
+
+    - `is_measured`: whether they are speeds. `note`: what was assumed of commands.
+    """
+
+    series: Series
+    names: Sequence[str]
+    is_measured: bool
+    note: str = ""
+
+    @classmethod
+    def of(cls, series: Series, names: Sequence[str], *, is_measured: bool) -> "Rotors | None":
+        """Samples in which all rotors have a value; `None` if there are not two, or if a measured rotor never turns."""
+        whole = np.isfinite(series.values).all(axis=1)
+        values = series.values[whole]
+        if len(values) < 2 or (is_measured and not (values > 0).any(axis=0).all()):
+            return None
+        return cls(Series(series.t[whole], values), names, is_measured)
 
 
 def motor_order(functions: Sequence[int], motors: Sequence[int]) -> list[int] | None:
     """The places of motors 1 to 4 among the outputs with these functions; `None` if one of them is missing."""
     return [functions.index(motor) for motor in motors] if {*motors} <= {*functions} else None
+
+
+def records(content: bytes, places: Sequence[int], layout: np.dtype) -> np.ndarray:
+    """The records of this layout that begin at these bytes."""
+    begin = np.asarray(places, dtype=np.int64)[:, None]
+    return np.frombuffer(content, np.uint8)[begin + np.arange(layout.itemsize)].reshape(-1).view(layout)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,12 +71,12 @@ class Messages:
     - `fields`: by kind of message and instance, the fields of its messages as arrays of one length. `t`: times [s].
     - `remedy`: what to do if the log is corrupt.
     - `notes`: what was assumed, one line each.
-    - `names`: by our column, what the log calls it.
+    - `names`: by our column, its name in the log.
     - `parameters`: the settings of the autopilot.
-    - `prefixed`: whether the name of a field begins with that of its kind and a dot.
+    - `prefixed`: whether the name of a field begins with the name of its kind and a dot.
     """
 
-    path: Path
+    path: LogPath
     fields: Mapping[str, Mapping[int, Fields]]
     remedy: str
     notes: list[str] = dataclasses.field(default_factory=list)
@@ -85,7 +113,9 @@ class Messages:
             values = np.column_stack([raw[name].astype(float)[kept] for name in fields])
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
 
-    def fastest(self, columns: Sequence[str], sources: Iterable[Source], *, faster: float = 1.1) -> Series | None:
+    def fastest(
+        self, columns: Sequence[str], sources: Iterable[MessageSource], *, faster: float = 1.1
+    ) -> Series | None:
         """The source that was logged most often in our units and frame; a later one must be `faster` by this factor."""
         best, found = 0.0, None
         for kind, fields, factor in sources:
@@ -113,31 +143,57 @@ class Messages:
         begin = f"{kind}." if self.prefixed else ""
         self.names.update((column, begin + field) for column, field in zip(columns, fields, strict=True))
 
-    def note_commands(self) -> None:
-        """Note that commands are taken as they are."""
-        self.notes.append(f"commands are {self.names['command1']}.., taken as fractions of full-scale rotor speed")
-
     def table(
-        self, rates: Series, rotors: Series, others: Mapping[Names, Series | None], **facts: Any
-    ) -> tuple[RowPositions, Table]:
-        """Rows at the times of the gyro, at most 1 kHz, with rotors and `others` brought to them.
+        self,
+        found: Mapping[Names, Series | None],
+        rotors: Rotors | None,
+        *,
+        remedies: tuple[str, str],
+        is_ordered: bool = False,
+        landed: Iterable[tuple[float, float]] = (),
+        **facts: Any,
+    ) -> tuple[Table, tuple[str, ...]]:
+        """Rows at the times of the gyro, at most 1 kHz, with rotors and other columns brought to them; and all notes.
 
-        Series are in our units and frame. Impossible samples are taken out before. Rotor speeds are measured if
-        `omega1` has a name, else commands [0..1]. `others`: by the names of their columns; `None`: not logged. `facts`:
-        more of `LogFacts`.
+        Series are in our units and frame. Impossible samples are taken out before.
 
-        **Returns:** the times of the rows [s], and the table; `t` is 0 in the first row.
+        - `found`: by the names of their columns, body rates among them; `None`: not logged.
+        - `remedies`: if the log has no body rates, and if it has no rotors.
+        - `is_ordered`: whether the log says which rotor is which.
+        - `landed`: from when to when the vehicle was on the ground [s], in the log's time.
+        - `facts`: more of `LogFacts`.
 
-        **Raises:** `InputError` if rates and rotors do not overlap, for too many rows or impossible samples.
+        **Raises:** `InputError` if rates or rotors are missing or do not overlap, for too many rows or impossible
+        samples.
         """
-        measured = "omega1" in self.names
-        rotor_names = SPEED_NAMES if measured else COMMAND_NAMES
-        sources = {name: self.names[name] for name in (rotor_names[0], "p")}
-        motors, gyro = (each.partition(".")[0] if self.prefixed else each for each in sources.values())
-        written = Sampling(motors, logged_rate(rotors.t)), Sampling(gyro, logged_rate(rates.t))
-        about = LogFacts(*written, **facts)
-        table = Table(self.path, {}, first_row=None, names=self.names, remedy=self.remedy, facts=about)
-        start = rates.t[min(np.count_nonzero(rates.t < rotors.t[0]), rates.t.size - 1)]
+        rates = found.get(RATES)
+        if rates is None:
+            refuse(self.path, f"holds no body rates; {remedies[0]}")
+        if rotors is None:
+            refuse(self.path, f"holds no rotor speeds or commands; {remedies[1]}")
+        self.names.update(zip(SPEED_NAMES if rotors.is_measured else COMMAND_NAMES, rotors.names, strict=True))
+        motors, gyro = (
+            Sampling(name.partition(".")[0] if self.prefixed else name, logged_rate(series.t))
+            for name, series in ((rotors.names[0], rotors.series), (self.names["p"], rates))
+        )
+        rows, table = self._at_rows_of(rates, rotors, {names: each for names, each in found.items() if names != RATES})
+        first, last = float(rows[0]), float(rows[-1])
+        inside = [(max(begin, first) - first, min(end, last) - first) for begin, end in landed]
+        about = LogFacts(motors, gyro, landed=tuple(each for each in inside if each[0] <= each[1]), **facts)
+        if not rotors.is_measured:
+            plain = f"commands are {rotors.names[0]}.., taken as fractions of full-scale rotor speed"
+            self.notes.append(rotors.note or plain)
+        if is_ordered:
+            self.notes.append(order_note(rotors.names[0]))
+        return table._replace(held=True, facts=about), tuple(self.notes)
+
+    def _at_rows_of(
+        self, rates: Series, rotors: Rotors, others: Mapping[Names, Series | None]
+    ) -> tuple[RowPositions, Table]:
+        """The times of the gyro while the motors were logged [s], and all columns brought to them."""
+        table = Table(self.path, {}, first_row=None, names=self.names, remedy=self.remedy)
+        speeds, rotor_names = rotors.series, SPEED_NAMES if rotors.is_measured else COMMAND_NAMES
+        start = rates.t[min(np.count_nonzero(rates.t < speeds.t[0]), rates.t.size - 1)]
 
         def possible(names: Names, series: Series) -> Series:
             nonlocal table
@@ -145,24 +201,22 @@ class Messages:
             table = without_impossible(table._replace(columns=columns))
             return Series(series.t, np.column_stack([table.columns[name] for name in names]))
 
-        rates, rotors = at_most(possible(RATES, rates), _FASTEST_ROWS), possible(rotor_names, rotors)
-        turning = np.isfinite(rotors.values).all(axis=1)
-        rotors = Series(rotors.t[turning], rotors.values[turning])
-        inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + REACH * median_step(rotors.t))
+        rates, speeds = at_most(possible(RATES, rates), _FASTEST_ROWS), possible(rotor_names, speeds)
+        turning = np.isfinite(speeds.values).all(axis=1)
+        speeds = Series(speeds.t[turning], speeds.values[turning])
+        inside = (rates.t >= speeds.t[0]) & (rates.t <= speeds.t[-1] + REACH * median_step(speeds.t))
         if np.count_nonzero(inside) < 2:
             refuse(self.path, "rates and motors were not logged at the same time; record both in one flight")
         rows = rates.t[inside]
         if rows.size > MAX_ROWS:
             refuse(self.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
         columns = {"t": rows - rows[0]} | dict(zip(RATES, rates.values[inside].T, strict=True))
-        columns |= zip(rotor_names, root_mean_square(rotors, linear=measured)(rows).T, strict=True)
+        columns |= zip(rotor_names, root_mean_square(speeds, linear=rotors.is_measured)(rows).T, strict=True)
         for names, series in others.items():
             if series is None:
                 continue
-            if names == ("voltage",):  # 0 is not measured
-                series = Series(series.t, np.where(series.values > 0, series.values, np.nan))
             if names == ANGLES:
                 phi, theta, psi = series.values.T
                 series = Series(series.t, np.column_stack([unwrap(phi)[0], theta, unwrap(psi)[0]]))
             columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
-        return rows, table._replace(columns=columns, held=True)
+        return rows, table._replace(columns=columns)

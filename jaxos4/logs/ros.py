@@ -9,30 +9,20 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._files import reading
 from ..errors import shortened
+from ..flight import COMMAND_NAMES, SPEED_NAMES
+from ..rotations import euler_angles
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
 from .compression import check_parts, check_sizes
-from .messages import ANGLES, RATES, Fields, Messages, Names
-from .sampling import Series, euler_angles
-from .table import (
-    COMMAND_NAMES,
-    MAX_ROWS,
-    SPEED_NAMES,
-    LogFormat,
-    Path,
-    Table,
-    listed,
-    needed,
-    opened,
-    quoted,
-    refuse,
-)
+from .messages import ANGLES, RATES, Fields, Messages, Rotors
+from .sampling import Series
+from .table import MAX_ROWS, LogFormat, LogPath, Table, listed, opened, quoted, refuse
 
 _ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"rosbag2_bagfile_information:"
 _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it
@@ -40,19 +30,19 @@ _FIELD = re.compile(r"[^.\[\]]+")
 _STAMPS = (("timestamp_sample", 1000), ("timestamp", 1000))  # of PX4, and their unit [ns]
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
 _REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
-_LONGEST_DEFINITIONS = 1 << 16  # characters: those of our topics have a few thousand, and their parser is slow
+_LONGEST_DEFINITIONS = 1 << 16  # characters: usual definitions have a few thousand, and their parser is slow
 _NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag record -s mcap`), or convert it"
 
 
 class _Topic(NamedTuple):
-    """The messages of a topic: when they were recorded and their own stamps [ns], and the fields of columns."""
+    """The messages of a topic: the times at which they were recorded, their stamps [ns], and the fields of columns."""
 
     recorded: list[float]
     stamps: list[int]
     fields: dict[str, list[float]]
 
 
-def read_ros(path: Path, columns: ColumnMap | None = None) -> tuple[Table, tuple[str, ...]]:
+def read_ros(path: LogPath, columns: ColumnMap | None = None) -> tuple[Table, tuple[str, ...]]:
     """Read columns of a bag by a column map, or by the first preset that fits. Raises `InputError`."""
     try:
         import rosbags  # noqa: F401
@@ -76,14 +66,14 @@ ROS = LogFormat(
 )
 
 
-def _reader(path: Path) -> Any:
-    """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for what is far too large."""
+def _reader(path: LogPath) -> Any:
+    """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for one that is far too large."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2.storage_mcap import McapReader
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-    place, begin = FilePath(path), b""
+    place, begin = Path(path), b""
     if not place.is_dir():
         with opened(path, "rb") as file:
             begin = file.read(len(_FOLDER))
@@ -96,7 +86,7 @@ def _reader(path: Path) -> Any:
 
 
 @contextlib.contextmanager
-def _only_tables(path: Path) -> Iterator[None]:
+def _only_tables(path: LogPath) -> Iterator[None]:
     """Databases that are opened inside must consist of tables, and answer in a time that their size explains.
 
     A view can have rows without end, and so can damaged pages. A sound bag takes less than two steps for a byte.
@@ -124,15 +114,15 @@ def _only_tables(path: Path) -> Iterator[None]:
         apsw.connection_hooks.remove(check)
 
 
-def _damage(path: Path) -> contextlib.AbstractContextManager[None]:
+def _damage(path: LogPath) -> contextlib.AbstractContextManager[None]:
     return reading(path, "cannot be decoded", _REPAIR, Exception)  # of a damaged file, rosbags raises any
 
 
-def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
+def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
     topics = sorted({each.topic for each in reader.connections})
 
     def held(source: str) -> str | None:
-        """The source with the whole name of its topic: the only one that ends like that of the source."""
+        """The source with the whole name of its topic: the only topic that ends like the source's."""
         name, _, field = source.partition(".")
         found = [name] if name in topics else [topic for topic in topics if topic.endswith(name)]
         return f"{found[0]}.{field}" if len(found) == 1 and name.startswith("/") and field else None
@@ -145,15 +135,15 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
                 break
         else:
             what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {listed(topics) or 'none'}"
-            refuse(path, f"{what}: say in a column map which hold rates and motors, and give --columns map.toml")
+            refuse(path, f"{what}: say in a column map which hold rates and motors, and give that map as `columns`")
         notes.append(f"columns are those of the preset {columns.name}")
     chosen = columns.chosen(path, held, topics)
     found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
     log = Messages(path, found, _REMEDY, notes, prefixed=False)
-    return _table(log, columns, chosen), tuple(notes)
+    return _table(log, columns, chosen)
 
 
-def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
+def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, _Topic]:
     """The fields at these places, by topic. Raises `InputError`."""
     found: dict[str, _Topic] = {}
     for topic, field in sorted(each.split(".", 1) for each in places):
@@ -176,8 +166,8 @@ def _messages(path: Path, reader: Any, places: set[str]) -> dict[str, _Topic]:
     return found
 
 
-def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
-    """A function that decodes messages of these connections, by their definitions in the file, or by ROS 2's own."""
+def _decoder(path: LogPath, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
+    """A function that decodes messages of these connections, by their definitions in the file, or by those of ROS 2."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -196,7 +186,7 @@ def _decoder(path: Path, connections: list[Any], *, ros1: bool) -> Callable[[byt
     return store.deserialize_ros1 if ros1 else store.deserialize_cdr
 
 
-def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
+def _getter(path: LogPath, topic: str, field: str) -> Callable[[Any], float]:
     """A function that takes a number out of a message; NaN if an array is shorter. It raises `InputError`."""
     steps = [int(each) if each.isdecimal() and len(each) < 10 else each for each in _FIELD.findall(field)]
     wrong = functools.partial(refuse, path, column=f"{topic}.{field}", kind="field")
@@ -221,7 +211,7 @@ def _getter(path: Path, topic: str, field: str) -> Callable[[Any], float]:
 
 
 def _stamp(message: Any) -> int:
-    """The time of a message in its own words [ns]; 0 if it has none."""
+    """The time stamp of a message [ns]; 0 if it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is not None:
         return stamp.sec * 10**9 + stamp.nanosec
@@ -248,7 +238,7 @@ def _timed(
     return messages
 
 
-def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
+def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[Table, tuple[str, ...]]:
     """The table of the columns that a map has `chosen`. Raises `InputError` if body rates or rotors are missing."""
     found: dict[str, Series] = {}
     for topic in sorted({place.partition(".")[0] for place in chosen.values()}):
@@ -267,36 +257,23 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> Table:
 
         def at(name: str) -> np.ndarray:
             series = found[name]
-            if series.t is t:
-                return series.values[:, 0]
-            return (
-                log.speeds_at(t, series, chosen[name])
-                if name in SPEED_NAMES
-                else np.interp(t, series.t, series.values[:, 0])
-            )
+            if series.t is not t and name in SPEED_NAMES:
+                return log.speeds_at(t, series, chosen[name])
+            return series.values[:, 0] if series.t is t else np.interp(t, series.t, series.values[:, 0])
 
         return Series(t, np.column_stack([at(name) for name in names]))
 
-    def turning(names: Sequence[str]) -> Series | None:
-        """The samples with all four rotors; `None` if one of them never turns."""
-        rotors = together(names)
-        if rotors is None or not (np.nan_to_num(rotors.values) > 0).any(axis=0).all():
-            return None
-        whole = np.isfinite(rotors.values).all(axis=1)
-        return Series(rotors.t[whole], rotors.values[whole]) if np.count_nonzero(whole) > 1 else None
+    def rotors(names: Sequence[str]) -> Rotors | None:
+        found, is_measured = together(names), names == SPEED_NAMES
+        return found and Rotors.of(found, [chosen[name] for name in names], is_measured=is_measured)
 
-    rates = needed(log.path, together(RATES), "body rates", f"name p, q and r in {columns.name}")
-    remedy = f"name omega1..4 or command1..4 in {columns.name}"
-    rotors = turning(SPEED_NAMES) or turning(COMMAND_NAMES)
-    rotors = needed(log.path, rotors, "rotor speeds or commands", remedy)
-    if "command1" in log.names:
-        for name in SPEED_NAMES:  # named, but at rest
-            log.names.pop(name, None)
-        log.note_commands()
     quaternion, angles = together(QUATERNION), together(ANGLES)
     if angles is None and quaternion is not None:
         angles = Series(quaternion.t, euler_angles(quaternion.values))
         log.names.update(dict.fromkeys(ANGLES, chosen["qw"]))
     single = found.keys() - {*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, *RATES, "t"}
-    others: dict[Names, Series | None] = {ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)}
-    return log.table(rates, rotors, others)[1]
+    return log.table(
+        {RATES: together(RATES), ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)},
+        rotors(SPEED_NAMES) or rotors(COMMAND_NAMES),
+        remedies=(f"name p, q and r in {columns.name}", f"name omega1..4 or command1..4 in {columns.name}"),
+    )

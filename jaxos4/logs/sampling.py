@@ -14,8 +14,6 @@ REACH = 1.5  # times the step: measured samples further apart have a gap between
 _ROUNDING = 1e-6  # of a step: a smaller difference from a grid is a rounding error
 _FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
 
-HALF_TURN = np.array([1.0, -1.0, -1.0])
-"""About x: from x forward, y right, z down to x forward, y left, z up."""
 Times = Float[np.ndarray, " samples"]
 Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]
@@ -35,7 +33,7 @@ class Series(NamedTuple):
 def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Columns]:
     """The integral of each column from the first sample, as a function of the time; 0 before the first sample.
 
-    A value is held until the next one, and the last one for ever. If `linear`, values are interpolated instead.
+    A value lasts until the next one, and the last one for ever. If `linear`, values are interpolated instead.
     """
     t, values = series
     mean = (values[:-1] + values[1:]) / 2 if linear else values[:-1]
@@ -81,7 +79,7 @@ def speeds_within(
 ) -> Callable[[RowPositions, float], Float[np.ndarray, "rows parts 4"]]:
     """Root mean square of each rotor's speed in the parts of the samples around rows, a function of rows and step [s].
 
-    Arguments as of `averages`. Before the first time, speeds are those of the first row.
+    Arguments as of `averages`. Before the first time, rotors have the speeds of the first row.
     """
     times, values = np.append(2 * t[0] - t[-1], t), np.concatenate([omega[:1], omega])
     speeds = root_mean_square(Series(times, values), linear=not held)
@@ -201,15 +199,6 @@ def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"
     without_turns = np.unwrap(angle[measured])
     unwrapped[measured] = np.where(without_turns == angle[measured], angle[measured], without_turns)  # keeps -0.0
     return unwrapped, int(np.count_nonzero(np.abs(np.diff(angle[measured])) > math.pi))
-
-
-def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarray, "*samples 3"]:
-    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z) of any length, without unwrapping; of zeros, NaN."""
-    with np.errstate(all="ignore"):
-        w, x, y, z = np.moveaxis(quaternion / np.sqrt((quaternion**2).sum(axis=-1, keepdims=True)), -1, 0)
-    phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return np.stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
 
 
 def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"] | None:

@@ -4,7 +4,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import IO, Any, NamedTuple, NoReturn, TypeVar
+from typing import IO, Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 from .._files import at_once
 from ..errors import InputError, printable, shortened
-from ..flight import Flight, with_force
+from ..flight import SIGNALS, Flight, with_force
 
-Path = str | os.PathLike[str]
-Found = TypeVar("Found")
+LogPath = str | os.PathLike[str]
 
 MAX_ROWS = 5_000_000  # 83 minutes at 1 kHz; a longer flight does not fit in the memory of an ordinary machine
 SLOWEST_RATE = 40.0
@@ -24,9 +23,6 @@ SLOWEST_RATE = 40.0
 Rotors follow their commands with a lag of 20 to 80 ms. In closed loop, commands at 10 Hz make inertias 1.4 to 2.1 times
 too large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 """
-
-SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
-COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 
 
 class Sampling(NamedTuple):
@@ -75,15 +71,15 @@ class Table(NamedTuple):
     - `columns`: arrays of one length, with the names, units and frame of the flight CSV (docs/index.md).
     - `unknown`: names of the columns that the reader ignored.
     - `first_row`: the row of the file, counted from 1, that holds entry 0; `None` if the format has no rows.
-    - `names`: the log's own name of a column, if it is another.
+    - `names`: by column, its name in the log, if that is another.
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
     - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
-    - `held`: whether measured rotor speeds are means until the next row, and not those at the time of their row.
+    - `held`: whether measured rotor speeds are means until the next row, and not speeds at the time of their row.
     - `impossible`: by column, how many values `jaxos4.logs.values` took out, and the first of them.
     """
 
-    path: Path
+    path: LogPath
     columns: dict[str, np.ndarray]
     unknown: tuple[str, ...] = ()
     first_row: int | None = 2
@@ -120,25 +116,25 @@ class LogFormat(NamedTuple):
     - `recognises`: takes the first bytes of a file; returns whether the file has this format.
     - `read`: takes a path; returns the columns and the notes on what the reader assumed, one line each. Raises
       `InputError` (by `refuse`) for a file that cannot be used.
-    - `mapped`: takes a path and a column map, and returns the same; `None` if the format has columns of its own.
+    - `mapped`: takes a path and a column map, and returns the same; `None` if the columns of the format are fixed.
     - `of_vehicles`: whether only real vehicles write it.
     """
 
     name: str
     label: str
     recognises: Callable[[bytes], bool]
-    read: Callable[[Path], tuple[Table, tuple[str, ...]]]
-    mapped: Callable[[Path, Any], tuple[Table, tuple[str, ...]]] | None = None
+    read: Callable[[LogPath], tuple[Table, tuple[str, ...]]]
+    mapped: Callable[[LogPath, Any], tuple[Table, tuple[str, ...]]] | None = None
     of_vehicles: bool = True
 
 
-_ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocity", "stretch", "within")
+_ARRAYS = ("time", *SIGNALS)
 
 
 class Recording(NamedTuple):
     """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
 
-    Fields are as in `Flight`, in SI units. A recording is cleaned, cut and joined, and becomes a `Flight` at the end.
+    Fields are as in `Flight`, in SI units. Recordings are cleaned, cut and concatenated, and become a `Flight` last.
 
     - `name`: in messages and in the provenance. Usually the path of the file.
     - `notes`: what the reader changed in the data, one line each. `facts`: what the log says beside the flight.
@@ -182,6 +178,15 @@ class Recording(NamedTuple):
         """The sample time [s]."""
         return float((self.time[-1] - self.time[0]) / (self.time.size - 1))
 
+    def columns(self, *, inputs: bool = True) -> dict[str, Float[np.ndarray, " samples"]]:
+        """The columns of signals in a log, by name; without `inputs`, only those in which NaN marks a gap."""
+        return {
+            name: column
+            for field, signal in SIGNALS.items()
+            if signal.columns and (inputs or not signal.is_input) and (rows := getattr(self, field)) is not None
+            for name, column in zip(signal.columns, rows.reshape(len(rows), -1).T, strict=True)
+        }
+
     @property
     def channels(self) -> Float[np.ndarray, "samples 15"]:
         """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
@@ -211,15 +216,19 @@ class Recording(NamedTuple):
         return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(self[:3], other[:3], strict=True))
 
 
-def needed(path: Path, found: Found | None, what: str, remedy: str) -> Found:
-    """Return `found`, or raise `InputError` if the reader found nothing."""
-    if found is None:
-        refuse(path, f"holds no {what}; {remedy}")
-    return found
+def signals_of(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The signals that columns of a log make, by name: NaN for missing columns, `None` for signals without any."""
+    nothing = np.full(len(next(iter(columns.values()))), np.nan)
+    signals: dict[str, Any] = dict.fromkeys(SIGNALS)
+    for field, signal in SIGNALS.items():
+        if signal.columns.keys() & columns.keys():
+            rows = np.column_stack([columns.get(name, nothing) for name in signal.columns])
+            signals[field] = rows.reshape(nothing.size, *(signal.shape or ()))
+    return signals
 
 
 def order_note(first: str) -> str:
-    """The note on the order of the rotors; `first`: what the log calls rotor 1."""
+    """The note on the order of the rotors; `first`: the name of rotor 1 in the log."""
     same = "rotor_positions and rotor_spins must be in the same order"
     return f"rotors keep the log's order ({first} is rotor 1): {same}"
 
@@ -232,7 +241,7 @@ _UNREADABLE = {
 
 
 @contextlib.contextmanager
-def opened(path: Path, mode: str = "r") -> Iterator[IO]:
+def opened(path: LogPath, mode: str = "r") -> Iterator[IO]:
     """Open a log as UTF-8 text with other bytes escaped, or in mode `rb`. Raises `InputError` if it cannot be read."""
     if "\0" in os.fspath(path):
         refuse(path, "is not a file name, because it contains a null character; give the path of a log")
@@ -245,7 +254,7 @@ def opened(path: Path, mode: str = "r") -> Iterator[IO]:
         refuse(path, _UNREADABLE.get(type(error), f"cannot be read ({reason}); give the path of a log"))
 
 
-def read_bytes(path: Path, most: int) -> bytes:
+def read_bytes(path: LogPath, most: int) -> bytes:
     """The content of a log. Raises `InputError` if it has more than `most` bytes."""
     content = bytearray()
     with opened(path, "rb") as file:
@@ -257,7 +266,7 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def refuse(
-    path: Path, what: str, *, row: int | None = None, column: str | None = None, kind: str = "column"
+    path: LogPath, what: str, *, row: int | None = None, column: str | None = None, kind: str = "column"
 ) -> NoReturn:
     """Raise an `InputError` of one line: the place, `what` is wrong and what to do, without its full stop."""
     places = [f"row {row}"] * (row is not None) + [f"{kind} {column}"] * (column is not None)

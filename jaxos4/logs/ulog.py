@@ -7,20 +7,20 @@ import contextlib
 import functools
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._files import reading
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, Names, motor_order
-from .sampling import HALF_TURN, Series, euler_angles, logged_rate
-from .table import LogFormat, Path, Table, fast_enough, needed, order_note, read_bytes, refuse
+from ..rotations import HALF_TURN, euler_angles
+from .columns import column_map
+from .messages import ANGLES, FORCES, RATES, Fields, Messages, MessageSource, Names, Rotors, motor_order
+from .sampling import Series, logged_rate
+from .table import LogFormat, LogPath, Table, fast_enough, read_bytes, refuse
 
 _MAGIC = b"ULog"
 _MOVING = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
-_GYROS = {"vehicle_angular_velocity": "xyz", "sensor_combined": "gyro_rad"}
-_ACCELEROMETERS = {"sensor_combined": "accelerometer_m_s2", "vehicle_acceleration": "xyz"}
 
 
 def _items(field: str, count: int) -> list[str]:
@@ -28,13 +28,10 @@ def _items(field: str, count: int) -> list[str]:
     return [f"{field}[{i}]" for i in range(count)]
 
 
-_SOURCES = {  # by our columns: topics, and the fields along the body's axes
-    RATES: [(topic, _items(field, 3), HALF_TURN) for topic, field in _GYROS.items()],
-    FORCES: [(topic, _items(field, 3), HALF_TURN) for topic, field in _ACCELEROMETERS.items()],
-    ("voltage",): [("battery_status", ("voltage_v",), 1.0)],
-}
+_BRIDGE = "px4-ros2", "/fmu/out/"
+"""The preset that names the topics of PX4's bridge to ROS 2, which are those of its logs, and how their names begin."""
+_COLUMNS: tuple[Names, ...] = (RATES, FORCES, ("voltage",))
 _TOPICS = (
-    *(kind for sources in _SOURCES.values() for kind, *_ in sources),
     *("esc_status", "actuator_motors", "actuator_outputs", "vehicle_attitude", "vehicle_local_position"),
     *("vehicle_status", "vehicle_land_detected"),
 )
@@ -63,27 +60,40 @@ _DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TI
 _LINKS = {4: _UAVCAN, 5: _DSHOT}  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
 
 
-def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
+def read_ulog(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a PX4 log, and notes on what was assumed. Raises `InputError`."""
     log = _decoded(path)
     _check_vehicle(log)
-    remedy = "log vehicle_angular_velocity or sensor_combined (SDLOG_PROFILE)"
-    found: dict[Names, Series | None] = {columns: log.fastest(columns, each) for columns, each in _SOURCES.items()}
-    rates = needed(path, found.pop(RATES), "body rates", remedy)
-    remedy = "log esc_status, actuator_motors or actuator_outputs"
-    rotors = needed(path, _rotors(log), "rotor speeds or commands", remedy)
-    log.name([f"{'omega' if rotors.measured else 'command'}{i}" for i in range(1, 5)], rotors.topic, rotors.fields)
-    log.names.update(dict.fromkeys(ANGLES, "vehicle_attitude.q"))
     turned = log.series("vehicle_attitude", _items("q", 4))
+    log.names.update(dict.fromkeys(ANGLES, "vehicle_attitude.q"))
+    found: dict[Names, Series | None] = {columns: log.fastest(columns, _sources(columns)) for columns in _COLUMNS}
     found[ANGLES] = None if turned is None else Series(turned.t, euler_angles(turned.values) * HALF_TURN)
     found[tuple(_MOVING)] = _position(log)
-    rows, table = log.table(rates, rotors.series, found, **_facts(log))
-    table = table._replace(facts=table.facts._replace(landed=_landed(log, rows)))
-    log.notes.extend(filter(None, (rotors.note, order_note(f"{rotors.topic}.{rotors.fields[0]}"))))
-    return table, tuple(log.notes)
+    return log.table(
+        found,
+        _rotors(log),
+        remedies=(
+            "log vehicle_angular_velocity or sensor_combined (SDLOG_PROFILE)",
+            "log esc_status, actuator_motors or actuator_outputs",
+        ),
+        is_ordered=True,
+        landed=_landed(log),
+        **_facts(log),
+    )
 
 
 ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(_MAGIC), read_ulog)
+
+
+@functools.cache
+def _sources(columns: Names) -> list[MessageSource]:
+    """The topics of some columns, their fields, and the factors to our units and frame."""
+    preset, begin = _BRIDGE
+    given = [column_map(preset).sources[name] for name in columns]
+    factors = np.array([each.factor for each in given])
+    places = zip(*(each.names for each in given), strict=True)
+    fields = [[name.removeprefix(begin).split(".") for name in names] for names in places]
+    return [(every[0][0], [field for _, field in every], factors) for every in fields]
 
 
 def _check_vehicle(log: Messages) -> None:
@@ -137,59 +147,45 @@ def _facts(log: Messages) -> dict[str, Any]:
     }
 
 
-def _landed(log: Messages, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """When PX4's land detector says that the vehicle touches the ground [s], from the first of the `rows` on."""
+def _landed(log: Messages) -> list[tuple[float, float]]:
+    """From when to when PX4's land detector says that the vehicle touches the ground [s]."""
     topic = "vehicle_land_detected"
     states = {"landed", "maybe_landed", "ground_contact"} & log.of(topic).keys()
     series = log.series(topic, sorted(states), fewest=1)
     if series is None or not series.values.size:
-        return ()
+        return []
     changes = np.flatnonzero(np.diff((series.values > 0).any(axis=1), prepend=False, append=False))
-    times = np.append(series.t, np.inf)[changes]  # a state holds until the next one
-    begins, ends = np.maximum(times[::2], rows[0]) - rows[0], np.minimum(times[1::2], rows[-1]) - rows[0]
-    return tuple((a, b) for a, b in zip(begins.tolist(), ends.tolist(), strict=True) if a <= b)
+    times = np.append(series.t, np.inf)[changes].tolist()  # a state holds until the next one
+    return list(zip(times[::2], times[1::2], strict=True))
 
 
-class _Rotors(NamedTuple):
-    """Speeds [rad/s] or commands [0..1] of the four rotors, their topic and fields, and what was assumed."""
-
-    series: Series
-    topic: str
-    fields: Sequence[str]
-    note: str = ""
-    measured: bool = False
-
-
-def _rotors(log: Messages) -> _Rotors | None:
+def _rotors(log: Messages) -> Rotors | None:
     """Measured speeds, the motors' commands or the outputs: the first that is fast enough, or else the fastest."""
     every = [found for find in (_speeds, _motors, _outputs) if (found := find(log)) is not None]
     rates = [logged_rate(each.series.t) for each in every]
     if not every:
         return None
     chosen = every[next((i for i, rate in enumerate(rates) if fast_enough(rate)), rates.index(max(rates)))]
-    if every[0].measured and not chosen.measured:
+    if every[0].is_measured and not chosen.is_measured:
         log.notes.append(f"measured speeds (esc_status) were logged at {rates[0]:.2g} Hz only: commands are used")
     return chosen
 
 
-def _speeds(log: Messages) -> _Rotors | None:
+def _speeds(log: Messages) -> Rotors | None:
     names = [f"esc[{i}].esc_rpm" for i in range(4)]
     series = log.series("esc_status", names)
     if series is None:
         return None
-    if not (np.abs(series.values) > 0).any(axis=0).all():
-        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
-        return None
     functions = [int(log.latest("esc_status", f"esc[{i}].actuator_function") or 0) for i in range(4)]
     order = motor_order(functions, _MOTORS) or range(4)
-    measured = np.isfinite(series.values).all(axis=1)
-    if np.count_nonzero(measured) < 2:
-        return None
-    speeds = Series(series.t[measured], np.abs(series.values[measured])[:, order] * (2 * math.pi / 60))
-    return _Rotors(speeds, "esc_status", [names[i] for i in order], measured=True)
+    speeds = Series(series.t, np.abs(series.values)[:, order] * (2 * math.pi / 60))
+    rotors = Rotors.of(speeds, [f"esc_status.{names[i]}" for i in order], is_measured=True)
+    if rotors is None:
+        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
+    return rotors
 
 
-def _motors(log: Messages) -> _Rotors | None:
+def _motors(log: Messages) -> Rotors | None:
     names = _items("control", 4)
     series = log.series("actuator_motors", names)
     if series is None or not np.isfinite(series.values).any():
@@ -197,10 +193,11 @@ def _motors(log: Messages) -> _Rotors | None:
     shares = np.clip(np.nan_to_num(series.values), 0.0, 1.0)  # NaN means not armed
     curve, what = _thrust_curve(log)
     note = f"commands are actuator_motors.control, {what}"
-    return _Rotors(Series(series.t, np.sqrt(shares) if curve else shares), "actuator_motors", names, note)
+    speeds = Series(series.t, np.sqrt(shares) if curve else shares)
+    return Rotors(speeds, [f"actuator_motors.{name}" for name in names], is_measured=False, note=note)
 
 
-def _outputs(log: Messages) -> _Rotors | None:
+def _outputs(log: Messages) -> Rotors | None:
     place = _bank_of_motors(log)
     if place is None:
         return None
@@ -215,11 +212,11 @@ def _outputs(log: Messages) -> _Rotors | None:
     curve, what = _thrust_curve(log)
     speeds = np.sqrt(curve * shares**2 + (1 - curve) * shares) if curve else shares
     note = f"commands are {topic}.output, {kind} {low.min():g}..{high.max():g}, {what}"
-    return _Rotors(Series(series.t, speeds), topic, names, note)
+    return Rotors(Series(series.t, speeds), [f"{topic}.{name}" for name in names], is_measured=False, note=note)
 
 
 def _thrust_curve(log: Messages) -> tuple[float, str]:
-    """THR_MDL_FAC, 0 if it is not known, and what follows for the speeds."""
+    """THR_MDL_FAC, 0 if it is not known, and its consequence for the speeds in words."""
     curve = log.parameters.get("THR_MDL_FAC", 0.0)
     if 0 < curve <= 1:
         return curve, f"taken as fractions of full-scale rotor speed by THR_MDL_FAC = {curve:.3g}"
@@ -264,7 +261,7 @@ def _limits(log: Messages, values: np.ndarray, bank: str, channels: list[int]) -
     return kind.name, *np.where(low < high, [low, high], np.array(kind.ends)[:, None])
 
 
-def _decoded(path: Path) -> Messages:
+def _decoded(path: LogPath) -> Messages:
     """The topics that are needed. Raises `InputError`, one line, for a file that cannot be decoded."""
     try:
         from pyulog.core import ULog
@@ -277,7 +274,8 @@ def _decoded(path: Path) -> Messages:
     damage = reading(path, "cannot be decoded", "copy the log again from the vehicle", ULogException)
     with damage, contextlib.redirect_stdout(io.StringIO()):
         _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
-        log = ULog(_Content(content), sorted({*_TOPICS}))
+        topics = {topic for columns in _COLUMNS for topic, *_ in _sources(columns)}
+        log = ULog(_Content(content), sorted(topics.union(_TOPICS)))
     if log.file_corruption:
         refuse(path, "is corrupt; copy the log again from the vehicle, or repair it")
     found: dict[str, dict[int, Fields]] = {}

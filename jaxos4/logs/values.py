@@ -1,30 +1,43 @@
-"""Values that no sensor measured: beyond what any quadrotor does, far from all others, or stuck at the end of a range.
+"""The values that columns can have, and those that no sensor measured: impossible, far from all others, or stuck.
 
-They count as not measured. Many of them in a column are a wrong unit, and refuse the log.
+The latter count as not measured. Many of them in a column are a wrong unit, and refuse the log.
 """
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..flight import FORCE_NAMES, STATE_NAMES
+from ..airframe import STANDARD_GRAVITY
+from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES
 from .sampling import filled
-from .table import COMMAND_NAMES, SPEED_NAMES, Recording, Table
+from .table import Recording, Table
 
 
-class Limit(NamedTuple):
-    """The values that a column can have, their unit, and advice on larger values, and on smaller ones if it differs."""
+class Quantity(NamedTuple):
+    """The numbers that a column can hold.
 
+    - `unit`: of the column. `others`: units in which a log may have it, and their factors to `unit`.
+    - `least`, `largest`: what lies beyond is impossible: out of reach of any quadrotor, but not of a wrong unit.
+    - `advice`: on larger values, and, without `below`, on smaller ones too.
+    - `zero`: whether 0 is a measurement, and negative numbers are. If not, they count as not measured.
+    """
+
+    unit: str
     least: float
     largest: float
-    unit: str
     advice: str
     below: str = ""
+    others: Mapping[str, float] = MappingProxyType({})
+    zero: bool = True
 
 
+_DEGREE, _RPM = math.pi / 180, 2 * math.pi / 60
+PWM, PWM_ZERO = "PWM", 1000.0  # us; a command in this unit is (value - 1000) / 1000
+_TURNING = {"deg/s": _DEGREE, "rpm": _RPM}
 _TIME = "t is in seconds: if these are milli-, micro- or nanoseconds, divide"
 _COMMAND = "commands are fractions 0..1: divide by full scale (100, 65535)"
 _SPEED = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
@@ -34,20 +47,26 @@ _VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
 _FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
 _VOLTAGE = "the battery's voltage is in volts: if these are mV, divide by 1000"
 _PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
-_RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
-LIMITS = {
-    "t": Limit(-1e11, 1e11, "s", _TIME),
-    **dict.fromkeys(SPEED_NAMES, Limit(0, 1e5, "rad/s", _SPEED, _SIGN)),
-    **dict.fromkeys(COMMAND_NAMES, Limit(0, 1, "of full scale", _COMMAND)),
-    **dict.fromkeys("xyz", Limit(-1e6, 1e6, "m", _POSITION)),
-    **dict.fromkeys(("vx", "vy", "vz"), Limit(-1e3, 1e3, "m/s", _VELOCITY)),
-    **dict.fromkeys("pqr", Limit(-60.0, 60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
-    **dict.fromkeys(("phi", "theta", "psi"), Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")),
-    **dict.fromkeys(FORCE_NAMES, Limit(-1e3, 1e3, "m/s^2", _FORCE)),
-    "voltage": Limit(-200.0, 200.0, "V", _VOLTAGE),
+_OF_UNIT = {  # of the signals of a flight
+    each.unit: each
+    for each in (
+        Quantity("m", -1e6, 1e6, _POSITION, others={"cm": 0.01, "mm": 1e-3}),
+        Quantity("m/s", -1e3, 1e3, _VELOCITY, others={"cm/s": 0.01, "mm/s": 1e-3}),
+        Quantity("rad/s", -60.0, 60.0, "it looks like deg/s: divide by 57.3", others=_TURNING),
+        Quantity("rad", -1e4, 1e4, "it looks like degrees: divide by 57.3", others={"deg": _DEGREE}),
+        Quantity("m/s^2", -1e3, 1e3, _FORCE, others={"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}),
+        Quantity("V", -200.0, 200.0, _VOLTAGE, others={"mV": 1e-3}, zero=False),
+    )
 }
-"""A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
-PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
+COLUMNS = {
+    "t": Quantity("s", -1e11, 1e11, _TIME, others={"ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
+    **dict.fromkeys(SPEED_NAMES, Quantity("rad/s", 0, 1e5, _SPEED, _SIGN, others=_TURNING)),
+    **dict.fromkeys(COMMAND_NAMES, Quantity("of full scale", 0, 1, _COMMAND, others={"%": 0.01, PWM: 1e-3})),
+    **{name: _OF_UNIT[unit] for signal in SIGNALS.values() for name, unit in signal.columns.items()},
+}
+"""The columns that a log can have: the time, the rotors, and those of the signals of a flight."""
+_RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
+PITCH = {"theta": Quantity("rad", -_RIGHT_ANGLE, _RIGHT_ANGLE, _PITCH)}
 """The pitch of a log: one that was not read from a file may be any number."""
 
 
@@ -65,7 +84,7 @@ def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " sample
 
 
 def without_impossible(
-    table: Table, limits: Mapping[str, Limit] = LIMITS, *, most: float = 0.01, farthest: float = 10.0
+    table: Table, limits: Mapping[str, Quantity] = COLUMNS, *, most: float = 0.01, farthest: float = 10.0
 ) -> Table:
     """The table without the values outside of `limits`, or `dropped`: they count as not measured.
 
@@ -78,6 +97,8 @@ def without_impossible(
         if name in SPEED_NAMES and (values > 0).any():
             largest = min(largest, farthest * float(np.quantile(values[values > 0], 1 - most)))
         beyond = (values < limit.least) | (values > largest)
+        if not limit.zero and values.size:
+            columns[name] = np.where(values > 0, values, np.nan)
         wrong = beyond | dropped(columns["t"], values) if name in SPEED_NAMES and values.size else beyond
         if name == "t" or not wrong.any():
             continue
@@ -89,7 +110,7 @@ def without_impossible(
             what = f"is {first}, beyond {limit.least if low else limit.largest:.4g} {limit.unit} ({share}); "
             advice = (low and limit.below) or table.remedy or limit.advice
             table.refuse(what + advice, index=index, column=name)
-        columns[name] = np.where(wrong, np.nan, values)
+        columns[name] = np.where(wrong, np.nan, columns[name])
         before, begin = impossible.get(name, (0, f"{first} at {table.columns['t'][index]:.6g} s"))
         impossible[name] = before + int(np.count_nonzero(wrong)), begin
     return table._replace(columns=columns, impossible=impossible)
@@ -117,11 +138,14 @@ def plausible(recording: Recording) -> Plausible:
     A rotor's measured speed is taken out if it is `dropped`, too.
     """
     impossible, clipped, cleaned = {}, {}, {}
-    states = [(name, "states", i) for i, name in enumerate(STATE_NAMES)]
-    force = [(name, "specific_force", i) for i, name in enumerate(FORCE_NAMES) if recording.specific_force is not None]
-    for name, field, place in [*states, *force, *((f"rotor {i + 1}", "omega", i) for i in range(4))]:
+    columns = {field: [*signal.columns] for field, signal in SIGNALS.items() if not signal.is_input}
+    columns["omega"] = [f"rotor {i}" for i in range(1, 5)]
+    places = [(name, field, i) for field, names in columns.items() for i, name in enumerate(names)]
+    for name, field, place in places:
+        if getattr(recording, field) is None:
+            continue
         logged = getattr(recording, field)
-        column = logged[:, place].copy()  # one at a time: a long log has 400 MB
+        column = logged.reshape(len(logged), -1)[:, place].copy()  # one at a time: a long log has 400 MB
         wrong = _isolated(column)
         if name.startswith("rotor") and not recording.commanded:
             wrong |= dropped(recording.time, column)
@@ -140,7 +164,7 @@ def plausible(recording: Recording) -> Plausible:
         if name in impossible or name in clipped:
             if field not in cleaned:
                 cleaned[field] = logged.copy()
-            cleaned[field][:, place] = filled(column) if field == "omega" else column
+            cleaned[field].reshape(len(logged), -1)[:, place] = filled(column) if field == "omega" else column
     return Plausible(recording._replace(**cleaned) if cleaned else recording, impossible, clipped)
 
 
@@ -167,7 +191,7 @@ def _isolated(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " sampl
 
 
 # Values are clipped if this many are equal to the largest one, and this many times more than lie just below, within a
-# share of the range. A signal without limits has a single largest value. A value that is held counts once.
+# share of the range. A signal without limits has a single largest value. A value that is repeated counts once.
 EQUAL, TIMES, NEAR = 4, 3.0, 0.01
 # With more repeated values than this, a signal is coarse, and the level below the largest counts as near. If so few
 # values are most of the signal, it is at rest: they are counts of noise, and not the end of a range.

@@ -10,7 +10,6 @@ import numpy as np
 from .._templates import templates
 from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
-from ..flight import CHANNEL_NAMES
 from ..logs import Recording
 from .checks import Evidence, Finding, findings, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
@@ -98,7 +97,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
 
 def _measured(recording: Recording) -> dict[str, Channel]:
     time, motors = recording.time, recording.facts.motors
-    columns = dict(zip(CHANNEL_NAMES, recording.channels.T, strict=True))
+    columns = recording.columns(inputs=False)
     columns |= {f"rotor{i + 1}": speed for i, speed in enumerate(recording.omega.T)}
     channels = {}
     for name, values in columns.items():

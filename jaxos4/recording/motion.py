@@ -7,10 +7,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..airframe import GRAVITY, MOTIONS, Airframe, rotation
+from ..airframe import GRAVITY, MOTIONS, Airframe
 from ..flight import ANGLES, RATES, VELOCITY, Flight
 from ..logs import Recording, as_recording
 from ..logs.sampling import averages, filled
+from ..rotations import rotations_to_body
 from .noise import white_noise
 
 # Two rotors against the other two: the three ways are roll, pitch and yaw of an X, in an order that depends on the log.
@@ -219,7 +220,7 @@ def velocity_of(recording: Recording, *, forgets: float = 2.0) -> tuple[Float[np
     constant. Both are the same if the attitude was measured.
     """
     angles, velocity = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY))
-    to_body = None if angles is None else rotations_to_body(*angles.T)
+    to_body = None if angles is None else rotations_to_body(angles)
     if to_body is not None and velocity is not None:
         return np.einsum("tij,tj->ti", to_body, velocity), (to_body[:, :, 2], to_body[:, :, 2])
     rates, force = _gapless(recording, RATES), recording.specific_force
@@ -258,11 +259,6 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
     states, force = recording.states.copy(), recording.specific_force
     states[:, RATES] = turned(states[:, RATES])
     return recording._replace(states=states, specific_force=None if force is None else turned(force))
-
-
-def rotations_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> Float[np.ndarray, "samples 3 3"]:
-    """The rotations from the earth frame, the inverse of R_z(psi) R_y(theta) R_x(phi)."""
-    return np.asarray(rotation(np.stack([phi, theta, psi]))).T
 
 
 def _dead_reckoned(

@@ -1,4 +1,4 @@
-"""White noise of sensors, and the rotor speeds that are expected given all measured ones.
+"""White noise and vibration of sensors, and the rotor speeds that are expected given all measured ones.
 
 A noisy input makes the slope of a regression too small: moments of inertia come out too large. The expectation of the
 speeds given the measurements, by a Wiener filter without delay, has no such bias: what it misses does not correlate
@@ -12,9 +12,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
-from ..airframe import Airframe
+from ..airframe import AXES, Airframe
+from ..flight import RATES
 from ..logs import Recording
 
 Changes = Float[np.ndarray, "frequencies 4"]
@@ -49,6 +50,25 @@ def force_noise(recording: Recording) -> Float[np.ndarray, "3"]:
     return least
 
 
+SPECTRUM = 1.0  # s that the samples of one spectrum last
+
+
+def spectra(
+    signals: Float[np.ndarray, "samples *signals"], length: int
+) -> Complex[np.ndarray, "segments *signals frequencies"]:
+    """Spectra of segments of `length` samples that overlap by half, of each signal without its mean, in a Hann window.
+
+    A segment with NaN is NaN. The mean square of white noise is its variance. Reference: Welch 1967, IEEE Trans. Audio
+    Electroacoustics 15.
+    """
+    window = np.hanning(length + 1)[:-1]
+    window /= np.linalg.norm(window)
+    if len(signals) < length:
+        return np.empty((0, *signals.shape[1:], length // 2 + 1), dtype=complex)
+    segments = np.lib.stride_tricks.sliding_window_view(signals, length, axis=0)[:: max(length // 2, 1)]
+    return np.fft.rfft(window * (segments - segments.mean(axis=-1, keepdims=True)))
+
+
 NEGLIGIBLE = 1e-3  # share of the power of the changes; less noise changes no answer
 
 
@@ -73,22 +93,17 @@ def without_noise(stretches: Sequence[Recording], airframe: Airframe) -> tuple[l
     return smooth, float(np.sqrt(noise.mean() / 2)), share
 
 
-SPECTRUM, MIN_SAMPLES = 1.0, 32  # s, and samples at the least, of one spectrum
+MIN_SAMPLES = 32  # of one spectrum
 NEIGHBOURS = 2  # frequencies to either side over which spectra are averaged
 
 
 def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float) -> Changes | None:
-    """The mean power of the changes from sample to sample, by frequency; that of white changes is their variance."""
+    """The mean power of the changes from sample to sample, by frequency; white changes have their variance."""
     length = 2 * (max(round(SPECTRUM / dt), MIN_SAMPLES) // 2)
-    weight, spectra = np.hanning(length + 1)[:-1, None], []
-    for signal in signals:
-        changes = np.diff(signal, axis=0)
-        for first in range(0, len(changes) - length + 1, length // 2):
-            own = changes[first : first + length]
-            spectra.append(np.abs(np.fft.rfft(weight * (own - own.mean(axis=0)), axis=0)) ** 2)
-    if not spectra:
+    found = np.concatenate([spectra(np.diff(signal, axis=0), length) for signal in signals])
+    if not len(found):
         return None
-    power = np.mean(spectra, axis=0) / np.square(weight).sum()
+    power = np.square(np.abs(found)).mean(axis=0).T
     around = np.pad(power, ((NEIGHBOURS, NEIGHBOURS), (0, 0)), mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(around, 2 * NEIGHBOURS + 1, axis=0)
     return windows.mean(axis=-1)
@@ -134,3 +149,38 @@ def _filtered(signal: Float[np.ndarray, "samples 4"], kept: Changes) -> Float[np
     share = np.column_stack([np.interp(frequencies, np.arange(len(kept)), each) for each in kept.T])
     share[0] = 1.0
     return np.fft.irfft(share * np.fft.rfft(mirrored, axis=0), len(mirrored), axis=0)[: len(signal)]
+
+
+ABOVE = 25.0  # Hz; a rigid body that rotors turn moves below this frequency
+TIMES = 5.0  # a line has this many times the power of its surroundings: the median within an octave to both sides
+OCTAVE = 2.0
+MIN_SPECTRA = 5  # that are averaged
+
+
+def vibrating_rates(stretches: Sequence[Recording]) -> dict[str, float]:
+    """The body rates (`p`, `q`, `r`) whose spectrum shows a line, with its frequency [Hz].
+
+    Rotors that turn at nearly one speed shake a gyro at this frequency, or at one that the log's rate folds it to.
+    White noise, its filter and the motion of a rigid body have no line.
+
+    **Arguments:** `stretches`: as logged, not averaged, of one vehicle.
+    """
+    step = max((each.dt for each in stretches), default=SPECTRUM)
+    length = round(SPECTRUM / step)
+    frequency = np.fft.rfftfreq(max(length, 1), step)
+    high, found = np.flatnonzero((frequency >= ABOVE) & (frequency < 0.98 * frequency[-1])), {}
+    if not high.size:
+        return found
+    for axis, column in zip(AXES, RATES, strict=True):
+        every = np.concatenate([spectra(each.states[:, column], length) for each in stretches])
+        power = np.square(np.abs(every[np.isfinite(every).all(axis=-1)]))
+        if len(power) < MIN_SPECTRA:
+            continue
+        power = np.convolve(power.mean(axis=0), np.full(3, 1 / 3), "same")  # speeds vary a little
+        around = [
+            np.median(power[(frequency > frequency[i] / OCTAVE) & (frequency < frequency[i] * OCTAVE)]) for i in high
+        ]
+        ratio = power[high] / np.maximum(around, np.finfo(float).tiny)
+        if ratio.max() > TIMES:
+            found[axis.rate] = float(frequency[high[np.argmax(ratio)]])
+    return found

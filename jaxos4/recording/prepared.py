@@ -18,11 +18,10 @@ from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCIT
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .level import force_level
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
-from .noise import force_noise, without_noise
+from .noise import force_noise, vibrating_rates, without_noise
 from .richest import fair_share, note_of
 from .stretches import Stretch, cut, nothing_usable
-from .vibration import vibrating_rates
-from .windows import averaged, hold_out, joined, whole_windows
+from .windows import averaged, concatenate, hold_out, whole_windows
 
 HOLDOUT = 0.25
 """The share that is held out by default."""
@@ -259,7 +258,7 @@ def _sample_times(name: str, slowest: float, sample_time: float | None, *, predi
 
 
 def finest(slowest: float, sample_time: float | None = None, *, predicted: bool = False) -> float:
-    """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: that of the logs."""
+    """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: of the logs."""
     shortest = max(SHORTEST if sample_time is None else sample_time, slowest)
     whole = max(round(shortest / slowest), 1) * slowest  # samples of whole rows
     is_near = sample_time is None or abs(whole - shortest) < WHOLE * shortest
@@ -294,7 +293,7 @@ def _sampled(
     if None not in moved:
         velocities, ups = zip(*moved, strict=True)
         flown = [each._replace(body_velocity=velocity) for each, velocity in zip(flown, velocities, strict=True)]
-    everything = joined(flown)
+    everything = concatenate(flown)
     fitted, tested = hold_out(everything, length, holdout)
     return Prepared(
         fitted=fitted.flight,
@@ -310,7 +309,7 @@ def _sampled(
 
 
 def _available_inputs(whole: Recording, flown: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
-    """The inputs for `Term.needs` that the joined recording offers. A force counts if every stretch measured it."""
+    """The inputs for `Term.needs` that the whole recording offers. A force counts if every stretch measured it."""
     force = np.all([~np.isnan(each.channels[:, len(STATE_NAMES) :]).all(axis=0) for each in flown], axis=0)
     offers = {
         COMMANDS: whole.commanded,

@@ -225,7 +225,7 @@ TILTED, STILL = 0.5, 0.2  # gravity along z of a vehicle on its side or back, an
 def _resting(omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: Samples, dt: float) -> Samples:
     """Whether each `airborne` sample is of a vehicle at rest, by its accelerometer.
 
-    In flight the specific force along z is the thrust over the mass; on the ground and in a hand it is that of gravity,
+    In flight the specific force along z is the thrust over the mass; on the ground and in a hand it is gravity,
     whatever the rotors do, and on its side or back it is across their axes. Constant thrust proves nothing.
     """
     size = omega.shape[0]

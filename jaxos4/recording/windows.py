@@ -1,13 +1,16 @@
-"""Recordings as windows: averaged to longer samples, joined to a flight of whole windows, some of them held out."""
+"""Recordings as windows: averaged to longer samples, concatenated to whole windows, some of them held out."""
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
-from ..flight import STATE_NAMES, Flight
+from ..flight import SIGNALS, Flight, Signal
 from ..logs import Recording, as_recording
 from ..logs.sampling import averages, speeds_within
+from ..logs.table import signals_of
 
 _SAME = 1e-6  # sample times that differ by less than this share are equal
 
@@ -15,26 +18,17 @@ _SAME = 1e-6  # sample times that differ by less than this share are equal
 def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
     """A flight averaged to samples of each length [s], if longer than its own, with the rotor speeds `within` each."""
     within = speeds_within(flight.time, flight.omega, held=flight.held)
-    columns = [flight.channels] if flight.voltage is None else [flight.channels, flight.voltage[:, None]]
-    average = averages(flight.time, flight.omega, np.hstack(columns), held=flight.held)
+    columns = flight.columns()
+    average = averages(flight.time, flight.omega, np.column_stack([*columns.values()]), held=flight.held)
 
     def at(dt: float) -> Recording:
         if dt <= flight.dt * (1 + _SAME):
             return flight._replace(within=within(flight.time, flight.dt))
         time, omega, means = average(dt)
-        return flight._replace(
-            time=time,
-            omega=omega,
-            states=means[:, :12],
-            specific_force=None if flight.specific_force is None else means[:, 12:15],
-            voltage=None if flight.voltage is None else means[:, 15],
-            body_velocity=None,
-            stretch=None,
-            held=True,
-            within=within(time, dt),
-            # Means of as many instants have the same variance in time as a mean over this time.
-            averaging_time=dt * math.sqrt(1 - (flight.dt / dt) ** 2),
-        )
+        signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within(time, dt)}
+        # Means of as many instants have the same variance in time as a mean over this time.
+        averaging_time = dt * math.sqrt(1 - (flight.dt / dt) ** 2)
+        return flight._replace(**signals, time=time, held=True, averaging_time=averaging_time)
 
     return [at(dt) for dt in steps]
 
@@ -50,7 +44,7 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
     whole = [stretch for stretch in whole if stretch.time.size]
     if not whole:
         raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
-    return joined(whole).flight
+    return concatenate(whole).flight
 
 
 def whole_windows(recording: Recording, length: int) -> Recording:
@@ -58,30 +52,29 @@ def whole_windows(recording: Recording, length: int) -> Recording:
     return recording.rows(slice(recording.time.size // length * length))
 
 
-def joined(stretches: Sequence[Recording]) -> Recording:
+def concatenate(stretches: Sequence[Recording]) -> Recording:
     """Stretches one after the other; time counts samples from 0. Raises `ValueError` if the sample times differ."""
     steps = [stretch.dt for stretch in stretches]
     if np.ptp(steps) > _SAME * steps[0]:
         raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
-    states, force = np.split(np.concatenate([each.channels for each in stretches]), [len(STATE_NAMES)], axis=1)
     sizes = [stretch.time.size for stretch in stretches]
 
-    def of_all(name: str) -> np.ndarray | None:
-        """A channel, if all stretches have it."""
-        values = [getattr(stretch, name) for stretch in stretches]
-        return None if any(each is None for each in values) else np.concatenate(values)
+    def whole(name: str, signal: Signal) -> np.ndarray | None:
+        """A signal of all stretches: NaN in those without it, or `None` if an input is missing in one of them."""
+        rows = [getattr(stretch, name) for stretch in stretches]
+        missing = [each is None for each in rows]
+        if all(missing) or (signal.is_input and any(missing)):
+            return None
+        nothing = [np.full((size, *(signal.shape or ())), np.nan) for size in sizes]
+        return np.concatenate([none if each is None else each for each, none in zip(rows, nothing, strict=True)])
 
+    signals: dict[str, Any] = {name: whole(name, signal) for name, signal in SIGNALS.items()}
+    signals["stretch"] = np.repeat(np.arange(len(sizes)), sizes)
     return Recording(
         time=steps[0] * np.arange(sum(sizes)),
-        omega=np.concatenate([stretch.omega for stretch in stretches]),
-        states=states,
-        specific_force=None if np.isnan(force).all() else force,
-        voltage=of_all("voltage"),
-        body_velocity=of_all("body_velocity"),
-        stretch=np.repeat(np.arange(len(sizes)), sizes),
+        **signals,
         commanded=any(stretch.commanded for stretch in stretches),
         held=all(stretch.held for stretch in stretches),
-        within=of_all("within"),
         averaging_time=stretches[0].averaging_time,
     )
 
@@ -106,12 +99,16 @@ def hold_out(
     batch = max(min(round(seconds / (length * recording.dt)), int(windows * share / 2)), 1)
     number = np.arange(windows) // batch
     held_out = np.floor((number + 1) * share + rounding) > np.floor(number * share + rounding)
-    held_out = np.repeat(held_out, length)[:, None]
+    held_out = np.repeat(held_out, length)
     if not held_out.any() or held_out.all():
         return recording, None
-    force = recording.specific_force
-    fitted = recording._replace(
-        states=np.where(held_out, np.nan, recording.states),
-        specific_force=None if force is None else np.where(held_out, np.nan, force),
-    )
-    return fitted, recording._replace(states=np.where(held_out, recording.states, np.nan))
+    measured = {name: getattr(recording, name) for name, signal in SIGNALS.items() if not signal.is_input}
+    fitted = {name: None if rows is None else _without(rows, held_out) for name, rows in measured.items()}
+    return recording._replace(**fitted), recording._replace(states=_without(recording.states, ~held_out))
+
+
+def _without(rows: np.ndarray, which: Bool[np.ndarray, " samples"]) -> np.ndarray:
+    """The rows of a signal; NaN in some samples."""
+    kept = rows.copy()
+    kept[which] = np.nan
+    return kept

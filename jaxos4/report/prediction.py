@@ -7,7 +7,7 @@ from rich.console import Console
 
 from .._files import write_file
 from ..forecast import QUANTITIES, FlightPrediction
-from ..logs.sampling import euler_angles
+from ..rotations import euler_angles
 from .panels import Band, Figure, Line, Panel, Scale
 from .style import BOUND_DASHES, style
 from .svg import as_file

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from .._custom_types import Count, Numeric
-from ..flight import Flight
+from ..flight import SIGNALS, Flight, Signal
 from ..models.state import CASCADE_ORDER, CHANNELS
 from .filters import BLOCK
 from .gains import Observed
@@ -133,21 +133,16 @@ def pad_flight(flight: Flight, capacity: int) -> Flight:
     """The flight with more rows, up to `capacity`, in which nothing was measured and the inputs stay as they were."""
     samples = flight.time.shape[0]
 
-    def pad(values: jax.Array | None, fill: float | None = None) -> jax.Array | None:
+    def pad(name: str, signal: Signal) -> jax.Array | None:
+        values = getattr(flight, name)
         if values is None:
             return None
         rows = np.asarray(values)
-        more = np.repeat(rows[-1:] if fill is None else np.full_like(rows[-1:], fill), capacity - samples, axis=0)
-        return jax.device_put(np.concatenate([rows, more]))
+        last = rows[-1:] if signal.is_input else np.full_like(rows[-1:], np.nan)
+        return jax.device_put(np.concatenate([rows, np.repeat(last, capacity - samples, axis=0)]))
 
     return dataclasses.replace(
         flight,
         time=np.asarray(flight.time)[0] + float(flight.dt) * np.arange(capacity),
-        omega=pad(flight.omega),
-        states=pad(flight.states, np.nan),
-        specific_force=pad(flight.specific_force, np.nan),
-        body_velocity=pad(flight.body_velocity),
-        stretch=pad(flight.stretch),
-        voltage=pad(flight.voltage),
-        within=pad(flight.within),
+        **{name: pad(name, signal) for name, signal in SIGNALS.items()},
     )

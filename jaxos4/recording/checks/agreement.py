@@ -164,7 +164,7 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
 
 DELAY = 0.01  # s between two sensors that are noted; damping and inflow make errors of up to 8 ms
 # s between two sensors that contradict: 20 ms change inertias by 10 %. The filter of an accelerometer can be 10 ms
-# later than that of the gyro.
+# later than the gyro's.
 LATE = 0.015
 LATE_ATTITUDE = 0.025  # s after the gyro; filters and cameras are late by up to 20 ms
 # Standard deviations of delays that are no error of a clock [s]: filters, damping that varies, and the lag and delay of

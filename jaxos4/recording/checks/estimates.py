@@ -10,7 +10,7 @@ from ...airframe import GRAVITY
 from ...flight import ANGLES, RATES, VELOCITY
 from ...logs import Recording
 from ...logs.sampling import averages
-from ..motion import rotations_to_body
+from ...rotations import rotations_to_body
 
 BATCHES = 12
 """The batches of the jackknife."""
@@ -28,7 +28,7 @@ class Measured(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, sums: Inexact[np.ndarray, "batches ..."], fit: Callable[[np.ndarray], np.ndarray]) -> "Measured":
-        """The numbers that fit the sum of all batches; their errors by the jackknife, which leaves out each in turn."""
+        """The numbers that fit the sum of all batches; their errors by the jackknife, which leaves out one batch."""
         whole = sums.sum(axis=0)
         without = np.array([fit(whole - batch) for batch in sums])
         share = (len(sums) - 1) / len(sums)
@@ -39,14 +39,14 @@ class Measured(msgspec.Struct, frozen=True):
 
 
 def batched(products: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "batches ..."]:
-    """The sums of as many samples each."""
+    """The sums of batches of equal size."""
     return np.array([batch.sum(axis=0) for batch in np.array_split(products, BATCHES)])
 
 
 class Turns(msgspec.Struct, frozen=True):
     """The turns of the attitude: `matrix` times the turns of the gyro, `delay` later.
 
-    - `matrix`: the identity if both agree. Rows are roll, pitch and yaw of the attitude; columns those of the gyro.
+    - `matrix`: the identity if both agree. Rows are the axes of the attitude, columns the axes of the gyro.
     - `delay`: [s].
     - `explained`: by axis of the attitude, the share of its turns that the gyro explains.
     """
@@ -193,10 +193,10 @@ def peak(values: Float[np.ndarray, " steps"]) -> tuple[int, float]:
 
 
 def velocity_slopes(stretches: Sequence[Recording]) -> Measured | None:
-    """The horizontal acceleration along and across that of force and attitude, relative to it. `None`: not measured."""
+    """The horizontal acceleration along and across the one by force and attitude, relative. `None`: not measured."""
 
     def vectors(angles: np.ndarray, force: np.ndarray, velocity: np.ndarray, step: float) -> Pair:
-        felt = np.einsum("tji,tj->ti", rotations_to_body(*angles.T), force) - [0.0, 0.0, GRAVITY]
+        felt = np.einsum("tji,tj->ti", rotations_to_body(angles), force) - [0.0, 0.0, GRAVITY]
         return (felt[1:, :2] + felt[:-1, :2]) / 2, np.diff(velocity[:, :2], axis=0) / step
 
     return _slopes(stretches, vectors, step=0.2)  # velocities are noisy

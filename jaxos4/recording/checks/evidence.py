@@ -50,7 +50,7 @@ class Finding(msgspec.Struct, frozen=True):
         return msgspec.to_builtins(self)
 
 
-# Chance reaches this many standard errors in one of 2,000 comparisons, because these errors are those of a dozen
+# Chance reaches this many standard errors in one of 2,000 comparisons, because these errors are of a dozen
 # batches of the flight.
 STANDARD_ERRORS = 5.0
 # Shares of the errors of predicted rates, and of the vertical force, that the rotors explain before their delays count.
@@ -73,7 +73,7 @@ class Evidence:
 
     @functools.cached_property
     def plausible(self) -> Plausible:
-        """The recording without faulty values, along the body's axes. Clipping is found along those of the sensors."""
+        """The recording without faulty values, along the body's axes. Clipping is found along the sensors' axes."""
         found = plausible(self.logged)
         return found._replace(recording=in_body_axes(found.recording, self.airframe))
 
@@ -95,7 +95,7 @@ class Evidence:
     def stretches(self) -> tuple[Recording, ...]:
         """The usable stretches of the flight; those that tell the most, if it is longer than `seconds`."""
         recording = self.plausible.recording
-        if recording.stretch is not None:  # joined flights are usable
+        if recording.stretch is not None:  # concatenated flights are usable
             edges = np.flatnonzero(np.diff(recording.stretch)) + 1
             ends = zip([0, *edges], [*edges, recording.time.size], strict=True)
             return tuple(recording.rows(slice(int(begin), int(end))) for begin, end in ends)

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..._custom_types import Numeric
 from ...airframe import GRAVITY, INERTIAS, YAW
+from ...rotations import angles_of, rotation
 from .estimates import BATCHES, Measured, batched
 from .evidence import EXPLAINED, STANDARD_ERRORS, Evidence, Finding
 
@@ -41,26 +43,18 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     )
     remedy = "leave the attitude out, or correct it"
     if quantities != ("attitude",):
-        remedy = _rotation_for(evidence, _turn(2, angle[0])) + ": counter-clockwise seen from above"
+        turn = rotation(np.array([0.0, 0.0, angle[0]]))
+        remedy = f"{_rotation_for(evidence, turn)}: counter-clockwise seen from above"
     return Finding("mounting", cause, ways, remedy, quantities, True)
 
 
-def _rotation_for(evidence: Evidence, turn: Float[np.ndarray, "3 3"]) -> str:
+def _rotation_for(evidence: Evidence, turn: Float[Numeric, "3 3"]) -> str:
     """The advice to give the rotation that turns the sensors further by the matrix `turn`."""
-    axes = turn if evidence.airframe is None else turn @ np.asarray(evidence.airframe.sensor_axes)
-    roll, yaw = math.atan2(axes[2, 1], axes[2, 2]), math.atan2(axes[1, 0], axes[0, 0])
-    angles = roll, -math.asin(min(max(axes[2, 0], -1.0), 1.0)), yaw
-    degrees = ", ".join(f"{round(math.degrees(angle)) + 0}" for angle in angles)
+    axes = np.asarray(turn)
+    if evidence.airframe is not None:
+        axes = axes @ np.asarray(evidence.airframe.sensor_axes)
+    degrees = ", ".join(f"{round(math.degrees(angle)) + 0}" for angle in angles_of(axes))
     return f"give `sensor_rotation = [{degrees}]` [deg] in the airframe's file"
-
-
-def _turn(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
-    """The matrix that turns a vector about x, y or z by an angle [rad]."""
-    (i, j), turn = ((axis + 1) % 3, (axis + 2) % 3), np.eye(3)
-    turn[i, i] = turn[j, j] = math.cos(angle)
-    turn[j, i] = math.sin(angle)
-    turn[i, j] = -turn[j, i]
-    return turn
 
 
 def opposite_yaw(correlation: float | None) -> Finding | None:
@@ -78,7 +72,7 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
     )
 
 
-UNCERTAIN = 0.2  # rad; a rotation about the vertical axis by the rotors with a larger error is that of another airframe
+UNCERTAIN = 0.2  # rad; a rotation by the rotors that is less certain comes from a wrong airframe
 SAME_ANGLE = 0.17  # rad; a rotation turns roll and pitch by the same angle, up to this
 
 
@@ -155,7 +149,8 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
     elif not flown.size or _tilt(flown.mean(axis=0)) < TILT:
         return None
     roll = math.atan2(mean[1], mean[2])
-    level = _turn(1, -math.atan2(mean[0], math.hypot(mean[1], mean[2]))) @ _turn(0, roll)
+    pitch = -math.atan2(mean[0], math.hypot(mean[1], mean[2]))
+    level = rotation(np.array([roll, pitch, 0.0]))
     along = ", ".join(f"{x:.2f}" for x in mean / size)
     return Finding(
         "force_direction",

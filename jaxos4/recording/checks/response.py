@@ -21,6 +21,7 @@ from ...airframe import Airframe
 from ...flight import RATES
 from ...logs import Recording
 from ..motion import velocity_of
+from ..noise import spectra
 from ..windows import averaged
 from .estimates import BATCHES, Measured, interpolated, peak
 
@@ -135,7 +136,7 @@ class _Turning(NamedTuple):
     ) -> tuple[Float[np.ndarray, "4"], float, Float[np.ndarray, "2"]]:
         """The gains from torques to rates, their delay [s], and the explained shares; NaN: not measured.
 
-        Errors are those of a prediction of the rates, less their inputs times their gains, from their past.
+        Errors are of predictions, from their past, of the rates less their inputs times their gains.
         """
         if not products.any():
             return np.full(4, np.nan), math.nan, np.full(2, np.nan)
@@ -204,12 +205,12 @@ def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float) -> tuple[M
     """The delay of the accelerometer after the rotors [s], and the share of the vertical force that they explain."""
     unknown = Measured(np.full(1, np.nan), np.full(1, np.nan)), math.nan
     step, (low, high) = flown[0].dt, BAND
-    spectra = [each for one in flown for each in _spectra(one, airframe, lag)]
-    if len(spectra) < 2:
+    every = [each for one in flown for each in _spectra(one, airframe, lag)]
+    if len(every) < 2:
         return unknown
-    frequency = np.fft.rfftfreq(2 * len(spectra[0][0]) - 2, step)
+    frequency = np.fft.rfftfreq(2 * len(every[0][0]) - 2, step)
     inside = (frequency >= low) & (frequency <= min(high, 0.5 / step))
-    groups = np.array_split(np.array(spectra)[..., inside], min(BATCHES, len(spectra)))
+    groups = np.array_split(np.array(every)[..., inside], min(BATCHES, len(every)))
     sums = np.array([np.einsum("sif,sjf->fij", group.conj(), group) for group in groups])
     power = np.real(sums.sum(axis=0)[:, 2, 2])
     if not (power > 0).all():
@@ -241,8 +242,5 @@ def _spectra(flown: Recording, airframe: Airframe, lag: float) -> list[Complex[n
         return []
     thrust = _forced(flown, airframe, lag)[:, 2].reshape(len(flown.time), -1).mean(axis=1)
     force = interpolated(flown.time, flown.time, flown.specific_force[:, 2], gap=GAP)
-    signals, length = np.stack([thrust, moved[0][:, 2], force]), round(SPECTRUM / flown.dt)
-    weight = np.hanning(length)
-    windows = [signals[:, i : i + length] for i in range(0, len(thrust) - length, length // 2)]
-    spectra = [np.fft.rfft(weight * (one - one.mean(axis=1, keepdims=True))) for one in windows]
-    return [each for each in spectra if np.isfinite(each).all()]
+    signals = np.column_stack([thrust, moved[0][:, 2], force])
+    return [each for each in spectra(signals, round(SPECTRUM / flown.dt)) if np.isfinite(each).all()]

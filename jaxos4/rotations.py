@@ -1,0 +1,44 @@
+"""Rotations of the body by angles, quaternions and matrices. The order is that of the paper: yaw, pitch, roll."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ._custom_types import Numeric
+
+HALF_TURN = np.array([1.0, -1.0, -1.0])
+"""About x: from x forward, y right, z down to x forward, y left, z up."""
+
+
+def rotation(angles: Float[Numeric, "3 *samples"]) -> Float[Numeric, "3 3 *samples"]:
+    """R_z(psi) R_y(theta) R_x(phi) of the angles phi, theta, psi [rad]: from the axes of the body to the earth's."""
+    xp = np if isinstance(angles, np.ndarray) else jnp
+    (sx, cx), (sy, cy), (sz, cz) = zip(xp.sin(angles), xp.cos(angles), strict=True)
+    rows = (
+        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+        (-sy, cy * sx, cy * cx),
+    )
+    return xp.stack([xp.stack(row) for row in rows])
+
+
+def rotations_to_body(angles: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3 3"]:
+    """The rotations from the earth's axes to those of the body, of roll, pitch and yaw [rad]."""
+    return np.asarray(rotation(angles.T)).T
+
+
+def angles_of(matrix: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
+    """Roll, pitch and yaw [rad] of a rotation."""
+    roll, yaw = math.atan2(matrix[2, 1], matrix[2, 2]), math.atan2(matrix[1, 0], matrix[0, 0])
+    return roll, -math.asin(min(max(matrix[2, 0], -1.0), 1.0)), yaw
+
+
+def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarray, "*samples 3"]:
+    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z) of any length, without unwrapping; of zeros, NaN."""
+    with np.errstate(all="ignore"):
+        w, x, y, z = np.moveaxis(quaternion / np.sqrt((quaternion**2).sum(axis=-1, keepdims=True)), -1, 0)
+    phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    return np.stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
