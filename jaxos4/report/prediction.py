@@ -11,7 +11,7 @@ from ..logs.sampling import euler_angles
 from .panels import Band, Figure, Line, Panel, Scale
 from .style import BOUND_DASHES, style
 from .svg import as_file
-from .text import Listing, percent, plain, say
+from .text import Listing, plain, say
 
 
 def print_prediction(console: Console, found: FlightPrediction) -> None:
@@ -25,7 +25,7 @@ def print_prediction(console: Console, found: FlightPrediction) -> None:
         row = name, QUANTITIES[name][0]
         for i in places:
             errors = [plain(x[i]) for x in quality[:-1]]
-            rows.append((*row, f"{found.horizons[i]:.2f} s", *errors, percent(quality.coverage[i])))
+            rows.append((*row, f"{found.horizons[i]:.2f} s", *errors, plain(100 * quality.coverage[i])))
         rows.append((*row, "sum", *(plain(x) for x in quality.sums.values()), ""))
     errors = ("error", "unaware", "constant", "regression", "in band %")
     Listing(("quantity", "unit", "ahead", *errors), rows, errors).print_on(console)

@@ -41,8 +41,8 @@ def inline(figure: Figure, description: str) -> Markup:
     label = escape(" ".join(description.split()))
     drawn = f'<div class="panels" role="img" aria-label="{label}" style="{style}">{panels}</div>'
     drawn = f'<p class="legend">{legend}</p>{drawn}' if legend else drawn
-    for color, themed in _THEMED.items():
-        drawn = drawn.replace(color, themed)
+    for color, themed in _THEMED.items():  # of attributes: in a text, quotation marks are escaped
+        drawn = drawn.replace(f'"{color}"', f'"{themed}"')
     return Markup(drawn)  # noqa: S704  # texts are escaped
 
 

@@ -69,22 +69,20 @@ def identification_summary(found: Identification, *, verbose: bool = False, widt
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
 
-def quantity_rows(rows: Sequence[PhysicalQuantity]) -> tuple[list[tuple[str, ...]], list[str]]:
-    """The cells of physical quantities (name, estimate, interval, unit), and a note on each."""
-    cells, notes = [], []
-    for row in rows:
-        low, high = row.ci95
-        unit = "" if row.unit == "1" else row.unit
-        cells.append((row.name, f"{row.value:.4g}", f"{low:.4g} to {high:.4g}", unit))
-        status = "" if row.verdict is None or row.trusted else row.verdict.status
-        notes.append("; ".join(filter(None, (status, row.condition))))
-    return cells, notes
+def quantity_rows(quantities: Sequence[PhysicalQuantity]) -> list[tuple[str, ...]]:
+    """The cells of physical quantities: name, estimate, interval, unit, and a note."""
+    rows = []
+    for each in quantities:
+        status = "" if each.verdict is None or each.trusted else each.verdict.status
+        note = "; ".join(filter(None, (status, each.condition)))
+        unit = "" if each.unit == "1" else each.unit
+        rows.append((each.name, f"{each.value:.4g}", " to ".join(f"{end:.4g}" for end in each.ci95), unit, note))
+    return rows
 
 
 def _quantities(found: Identification) -> Section:
-    cells, notes = quantity_rows(physical_quantities(found))
-    if cells:
-        yield Listing(("quantity", "estimate", "95 % interval", "unit"), cells, ("estimate",), notes)
+    if rows := quantity_rows(physical_quantities(found)):
+        yield Listing(("quantity", "estimate", "95 % interval", "unit", "note"), rows, ("estimate",))
 
 
 def _reasons(found: Identification) -> Section:
@@ -101,10 +99,13 @@ def warning_lines(found: Identification) -> list[str]:
     return [*reason_lines(found.verdicts, found.doubts), *[lacking] * bool(wide)]
 
 
+def notes_of(found: Identification) -> list[str]:
+    """What was changed and noticed, and the clock of the motors if it is not the gyro's."""
+    return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
+
+
 def _notes(found: Identification) -> Section:
-    yield from (f"note: {note}" for note in found.provenance.notes)
-    if found.motor_clock:
-        yield f"note: {found.motor_clock} (rotor_delay)"
+    yield from (f"note: {note}" for note in notes_of(found))
 
 
 def _failure(found: Identification) -> Section:
@@ -128,9 +129,9 @@ def _parameters(found: Identification) -> Section:
             low, high = row.ci95
             bound = "-" if row.bound is None else f"{row.bound:.2g}"
             cells = [f"{row.estimate:.{digits}g}", f"[{low:.{digits}g}, {high:.{digits}g}]", bound]
-        rows.append((name, row.unit, *cells[: 2 + of_os4]))
-    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_os4)
-    yield Listing(headings, rows, ("estimate", "bound"), [row.note for row in found.parameters.values()])
+        rows.append((name, row.unit, *cells[: 2 + of_os4], row.note))
+    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_os4, "note")
+    yield Listing(headings, rows, ("estimate", "bound"))
     limits = [
         f"{plain(1 / row.noise_limit, 2)} ({name})"
         for name, row in found.parameters.items()
@@ -296,7 +297,7 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
         console.print(f"note: {note}")
     rows = part_rows(found, most)
     headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
-    Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
+    Listing(headings, rows, numbers).print_on(console)
     if len(found.parts) > len(rows):
         console.print(f"and {len(found.parts) - len(rows)} shorter parts")
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
@@ -320,10 +321,9 @@ def print_information(console: Console, found: FlightInformation) -> None:
     for name, row in found.parameters.items():
         bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
         limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
-        rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit))
+        rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit, row.note))
     numbers = ("bound", "others known", "of bracket", "noise limit")
-    notes = [row.note for row in found.parameters.values()]
-    Listing(("parameter", "unit", *numbers), rows, numbers, notes).print_on(console)
+    Listing(("parameter", "unit", *numbers, "note"), rows, numbers).print_on(console)
     console.print(
         "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
         "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
