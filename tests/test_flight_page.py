@@ -49,7 +49,7 @@ def test_the_page_says_what_was_found(tmp_path):
     says(
         shown,
         *("ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230", "57710 56710 to 58720 130"),
-        *("alpha6 1/(kg m^2) – 2.0e6 not identifiable: not excited", "alpha1 1 -0.8125 fixed: not identifiable"),
+        *("alpha6 1/(kg m^2) – 2.0e6 not identifiable: not excited", "fixed alpha1 1 -0.8125 not identifiable"),
         *("1.733e-05 1.704e-05 to 1.762e-05 if arms and mass are right", "p = 0.21", "377 starts"),
         *("0.248 0.73 ± 0.14 0.41 0.400 0.800", "known to less than half of the model"),
         *("jaxos4 estimate flight.csv --model flight --report flight.html", "t is not uniform", "sample time 0.004"),
@@ -241,7 +241,7 @@ def test_names_cannot_break_out_of_the_page_and_an_older_one_is_kept_if_it_canno
     assert shown.count("alert(1)") >= 6
     path.write_text("of before")
     with pytest.raises(AttributeError):
-        write_flight_page(path, msgspec.structs.replace(identified_vehicle(), held=None), title="")
+        write_flight_page(path, msgspec.structs.replace(identified_vehicle(), rigid_body=None), title="")
     assert path.read_text() == "of before"
     with pytest.raises(FileNotFoundError):
         write_flight_page(tmp_path / "none" / "a.html", identified_vehicle(), title="")

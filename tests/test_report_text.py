@@ -43,12 +43,12 @@ DIVERGED = {"result": "nonfinite_trajectory"}
         ({"rigid_body": RigidBody(CONSTANTS, 0.5, False)}, "no rigid body has such"),
         ({"validation": Validation("other.csv", None, None)}, "trajectory diverges before the flight ends"),
         (DIVERGED, "No estimate: the model's trajectory diverged"),
-        (DIVERGED, "(try --window"),
+        (DIVERGED, "(try `window`"),
     ],
 )
 def test_the_text_of_a_flight_warns_and_is_short_without_an_answer(changes, said):
     says(printed(identified_flight(**changes)), said)
-    assert "--window" not in printed(identified_flight(**DIVERGED, estimator="rls"))
+    assert "`window`" not in printed(identified_flight(**DIVERGED, estimator="rls"))
     assert printed(identified_flight(result="bracket_invalid")) == ""
     assert printed(identified_vehicle(verdicts={}, **DIVERGED)) == "note: t is not uniform"
 

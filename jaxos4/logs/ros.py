@@ -145,7 +145,7 @@ def _read(path: Path, reader: Any, columns: ColumnMap | None) -> tuple[Table, tu
                 break
         else:
             what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {listed(topics) or 'none'}"
-            refuse(path, f"{what}: say in a column map which hold rates and motors, and give --columns map.toml")
+            refuse(path, f"{what}: say in a column map which hold rates and motors, and give that map as `columns`")
         notes.append(f"columns are those of the preset {columns.name}")
     chosen = columns.chosen(path, held, topics)
     found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)

@@ -114,7 +114,7 @@ def _failure(found: Identification) -> Section:
     shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
     yield (
         "No estimate: the model's trajectory diverged wherever the search went. The vehicle may do something that "
-        f"the model lacks{' (try --window, or a shorter window)' if shoots else ''}, or the airframe's constants "
+        f"the model lacks{' (try `window`, or a shorter one)' if shoots else ''}, or the airframe's constants "
         "or the units of the flight are wrong."
     )
 
