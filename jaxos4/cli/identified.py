@@ -11,6 +11,7 @@ from ._shared import (
     MANIFEST,
     check_folder,
     check_outputs,
+    command,
     console,
     end,
     json_text,
@@ -78,12 +79,13 @@ def predict(
     out: options.Predictions = None,
     json: options.Json = None,
     figure: options.Figure = None,
+    report: options.Page = None,
 ) -> None:
     """Predict another flight with an identified vehicle.
 
     Compares the errors with those of constant rates and of a regression.
     """
-    check_outputs(result, flight, columns, out=out, json=json, figure=figure)
+    check_outputs(result, flight, columns, out=out, json=json, figure=figure, report=report)
     with stages("loading the library") as progress:
         from ..recording import read_recording
 
@@ -101,8 +103,10 @@ def predict(
             write_json(found.to_dict(), json)
         if figure is not None:
             jaxos4.report.write_prediction_figure(figure, found)
+        if report is not None:
+            jaxos4.report.write_prediction(report, found, command=command())
     shown = console()
     jaxos4.report.print_prediction(shown, found)
-    for path in filter(None, (out, json, figure)):
+    for path in filter(None, (out, json, figure, report)):
         shown.print(f"written: {path}")
     end(vehicle.result)
