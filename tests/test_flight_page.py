@@ -156,6 +156,8 @@ def test_what_stands_behind_an_estimate_is_drawn(tmp_path):
         "Path",
         "alpha6, alpha3: -0.95",
     )
+    _, shown = written(tmp_path / "vehicle.html", correlations=correlations)
+    says(shown, "Residual: measured minus one-step prediction.")
 
 
 def test_the_figure_says_how_strongly_each_axis_answers(tmp_path):

@@ -23,7 +23,7 @@ from jaxos4.report import error_csv, error_table, study_page, write_report
 from jaxos4.report.matplotlib_figures import as_pdf
 from jaxos4.report.study_tables import scenario_tables, scenarios
 from jaxos4.report.style import styles
-from jaxos4.report.text import DASH, plain
+from jaxos4.report.text import DASH, plain, with_unit
 from jaxos4.study import metrics, read_results
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
@@ -226,7 +226,7 @@ def test_a_study_of_one_flight_shows_the_answer_and_no_statistics(tmp_path):
     held = int((abs(one["estimate"] - one["truth"]).values <= half).sum())
     assert f"ibss at noise x 1: successful, {held} of 3 intervals contain the truth." in shown
     for k, (name, unit) in enumerate(zip(study["parameter"].values, study["unit"].values, strict=True)):
-        given = f"{name} [{unit}] at noise x {{}}, truth {plain(float(one['truth'][k]), 4)}"
+        given = f"{with_unit(name, unit)} at noise x {{}}, truth {plain(float(one['truth'][k]), 4)}"
         row = {heading: cells[given.format(1), "ibss", heading][0] for heading in ("estimate", "interval")}
         value = float(one["estimate"][k])
         ends = f"{plain(value - half[k], 4)} to {plain(value + half[k], 4)}"

@@ -10,7 +10,8 @@ from pages import printed, says, words
 from rich.console import Console
 from synthetic_identification import COLOURED, CONSTANTS, WHITE, WRONG, identified_flight, identified_vehicle
 
-from jaxos4.identification.results import Disturbance, ParameterEstimate, RigidBody, Validation
+from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
+from jaxos4.identification.uncertainty import PRIOR_NOTE
 from jaxos4.report import write_flight_page
 from jaxos4.report.text import DASH, Listing, plain
 
@@ -73,6 +74,11 @@ def test_the_text_of_a_vehicle(tmp_path):
     says(printed(identified_vehicle(parameters=late)), "note: motors are recorded 20 ms late (rotor_delay)")
     write_flight_page(tmp_path / "flight.html", identified_vehicle(parameters=late))
     says(words((tmp_path / "flight.html").read_text(encoding="utf-8")), "motors are recorded 20 ms late")
+    unseen = {"alpha1": FixedParameter(-0.56, "1", PRIOR_NOTE)}
+    says(
+        printed(identified_vehicle(held=unseen)),
+        "fixed, not identifiable from these flights; the uncertainty is included in the other intervals: alpha1 -0.56.",
+    )
     small = {"rotor_delay": msgspec.structs.replace(late["rotor_delay"], estimate=-0.004)}
     assert "late" not in printed(identified_vehicle(parameters=small))
 

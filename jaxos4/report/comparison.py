@@ -14,7 +14,7 @@ from ..logs.table import counted
 from .page import Section, folded, picture, table, text, write_page
 from .panels import Band, Figure, Line, Panel, Scale, across
 from .style import BOUND_DASHES, FAINT, INK, Style, style
-from .text import DASH, Listing, plain, say, span
+from .text import DASH, Listing, plain, say, span, with_unit
 
 
 def print_comparison(console: Console, found: Comparison) -> None:
@@ -35,7 +35,7 @@ def print_comparison(console: Console, found: Comparison) -> None:
     shown = [each for each in found.quantities if each.unit == "kg m^2" or each in found.different]
     for each in shown:
         rows = list(quantity_cells(found, each))
-        headings = (f"{each.name} [{each.unit}]", "estimate", "95 % interval", "note")
+        headings = (with_unit(each.name, each.unit), "estimate", "95 % interval", "note")
         Listing(headings, rows, ("estimate",)).print_on(console)
     for place, (name, flights) in enumerate(zip(found.names, found.flights, strict=True), start=1):
         say(console, f"result {place}: {name}, of {flights}")
@@ -114,8 +114,7 @@ def forest(found: Comparison, look: Style) -> Figure:
                 marks += [across([place], *([end] for end in row.ci95), color=color, width=1.8 if used else 1.2)]
                 marks += [Line([row.value], [place], color, 0, marker="o", size=6, hollow=not used)]
                 marks += [Line([], [], color, 1.8, marker="o", hollow=not used, name=name)]
-        unit = "" if each.unit == "1" else f" [{each.unit}]"
-        title = f"{each.name}{unit}{': differ' if each in found.different else ''}"
+        title = with_unit(each.name, each.unit) + ": differ" * (each in found.different)
         panels.append(Panel(title, marks, x, y, height=70 + 20 * count))
     return Figure("forest", panels)
 
@@ -175,5 +174,5 @@ def _pooled(found: Comparison) -> Markup:
 def _each(found: Comparison) -> Markup:
     rows: list[str | tuple[str, ...]] = []
     for each in found.quantities:
-        rows += [each.name if each.unit == "1" else f"{each.name} [{each.unit}]", *quantity_cells(found, each)]
+        rows += [with_unit(each.name, each.unit), *quantity_cells(found, each)]
     return table("each-table", "Each quantity in each result", ("result", "estimate", "95 % interval", "note"), rows)

@@ -126,11 +126,11 @@ def _sample_times(found: Identification, look: Style) -> list[Markup]:
 
 def _parameters(found: Identification) -> Markup:
     rows: list[str | tuple[str, ...]] = [
-        (name, x.unit, plain(x.estimate, 4), span(x.ci95), plain(x.bound, 2), x.note)
+        (name, x.unit, plain(x.estimate, 4), span(x.ci95), span(x.bracket or None), plain(x.bound, 2), x.note)
         for name, x in found.parameters.items()
     ]
     if found.held:
-        rows += ["fixed", *((name, x.unit, plain(x.value, 4), "", "", x.note) for name, x in found.held.items())]
+        rows += ["fixed", *((name, x.unit, plain(x.value, 4), "", "", "", x.note) for name, x in found.held.items())]
     note = (
         "Bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found. A dash: not "
         "identifiable. Fixed: not estimated, but kept at this value; the note says why."
@@ -138,7 +138,7 @@ def _parameters(found: Identification) -> Markup:
     if found.widened:
         factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
         note += f" Parts of the flights disagree, so that these intervals were widened by the factor: {factors}."
-    headings = ("parameter", *_ESTIMATE, "bound", "note")
+    headings = ("parameter", *_ESTIMATE, "bracket", "bound", "note")
     return table("parameters", "Estimated parameters, then fixed parameters", headings, rows, [note])
 
 

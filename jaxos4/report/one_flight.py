@@ -7,7 +7,7 @@ from ..study import metrics
 from .panels import Figure, Line, Panel, Scale, across
 from .study_tables import Rows, Table, names, positive_scales, scale_labels, shown_level
 from .style import styles
-from .text import DASH, plain, span
+from .text import DASH, plain, span, with_unit
 
 
 def is_of_one(data: xr.Dataset) -> bool:
@@ -18,18 +18,14 @@ def is_of_one(data: xr.Dataset) -> bool:
 def estimates(data: xr.Dataset) -> Table:
     """Estimate, interval and bound of each estimator, in groups of one noise scale and parameter with its truth."""
     rows: Rows = []
-    error, half, level = (
-        metrics.normalised_error(data),
-        data["half_width"].sel(level=shown_level(data)),
-        shown_level(data),
-    )
+    error, level = metrics.normalised_error(data), shown_level(data)
+    half = data["half_width"].sel(level=level)
     shown = (data["estimate"], data["estimate"] - half, data["estimate"] + half, data["bound"], error)
     for i, scale in enumerate(scale_labels(data)):
         for k, (name, unit) in enumerate(zip(names(data, "parameter"), names(data, "unit"), strict=True)):
             at = {"scale": i, "parameter": k, "flight": 0}
-            rows.append(
-                f"{name} [{unit}] at {scale}, truth {plain(float(data['truth'].isel(at, missing_dims='ignore')), 4)}"
-            )
+            truth = float(data["truth"].isel(at, missing_dims="ignore"))
+            rows.append(f"{with_unit(name, unit)} at {scale}, truth {plain(truth, 4)}")
             for j, estimator in enumerate(names(data, "estimator")):
                 value, low, high, bound, ratio = (
                     float(each.isel(at | {"estimator": j}, missing_dims="ignore")) for each in shown

@@ -78,6 +78,11 @@ class Listing(NamedTuple):
         return table
 
 
+def with_unit(name: str, unit: str) -> str:
+    """A name with its unit, such as "Ix [kg m^2]"; a number has none."""
+    return name if unit == "1" else f"{name} [{unit}]"
+
+
 def say(console: Console, line: str, style: str | None = None) -> None:
     """Prints a line as it is: no markup, and no colours but those of `style`."""
     console.print(line, style=style, markup=False, highlight=False)
