@@ -49,7 +49,7 @@ def test_the_page_says_what_was_found(tmp_path):
     says(
         shown,
         *("ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230", "57710 56710 to 58720 130"),
-        *("alpha6 1/(kg m^2) – 2.0e6 not identifiable: not excited", "fixed alpha1 1 -0.8125 not identifiable"),
+        *("alpha6 1/(kg m^2) – 2.0e6 not identifiable: not excited", "fixed: not identifiable alpha1 1 -0.8125"),
         *("1.733e-05 1.704e-05 to 1.762e-05 if arms and mass are right", "p = 0.21", "377 starts"),
         *("0.248 0.73 ± 0.14 0.41 0.400 0.800", "known to less than half of the model"),
         *("jaxos4 estimate flight.csv --model flight --report flight.html", "t is not uniform", "sample time 0.004"),

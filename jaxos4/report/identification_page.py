@@ -126,19 +126,27 @@ def _sample_times(found: Identification, look: Style) -> list[Markup]:
 
 def _parameters(found: Identification) -> Markup:
     rows: list[str | tuple[str, ...]] = [
-        (name, x.unit, plain(x.estimate, 4), span(x.ci95), span(x.bracket or None), plain(x.bound, 2), x.note)
+        (
+            name,
+            x.unit,
+            plain(x.estimate, 4),
+            span(x.ci95) + (f"\nbracket {span(x.bracket)}" if x.bracket else ""),
+            plain(x.bound, 2),
+            x.note,
+        )
         for name, x in found.parameters.items()
     ]
-    if found.held:
-        rows += ["fixed", *((name, x.unit, plain(x.value, 4), "", "", "", x.note) for name, x in found.held.items())]
+    for why in dict.fromkeys(x.note for x in found.held.values()):
+        of_why = {name: x for name, x in found.held.items() if x.note == why}
+        rows += [f"fixed: {why}", *((name, x.unit, plain(x.value, 4), "", "", "") for name, x in of_why.items())]
     note = (
         "Bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found. A dash: not "
-        "identifiable. Fixed: not estimated, but kept at this value; the note says why."
+        "identifiable. Fixed: not estimated, but kept at this value."
     )
     if found.widened:
         factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
         note += f" Parts of the flights disagree, so that these intervals were widened by the factor: {factors}."
-    headings = ("parameter", *_ESTIMATE, "bracket", "bound", "note")
+    headings = ("parameter", *_ESTIMATE, "bound", "note")
     return table("parameters", "Estimated parameters, then fixed parameters", headings, rows, [note])
 
 
