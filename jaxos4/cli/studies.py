@@ -1,6 +1,5 @@
 """`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
 
-import shlex
 import time
 from functools import partial
 from pathlib import Path
@@ -12,10 +11,10 @@ import jaxos4
 
 from .._files import write_file
 from .._xla import add_flags
-from ..errors import InputError, in_words, printable
+from ..errors import InputError, in_words
 from ..estimators import ESTIMATORS
 from . import options
-from ._shared import check_outputs, console, stages
+from ._shared import check_outputs, command, console, stages
 
 
 def study(
@@ -122,7 +121,7 @@ def report(
 
 def compare(
     results: options.Compared = None,
-    page: options.Page = None,
+    report: options.Page = None,
     out: options.ComparisonOut = None,
     quick: options.Quick = False,
 ) -> None:
@@ -133,8 +132,8 @@ def compare(
     if results:
         if quick or out is not None:
             raise InputError(f"{'--quick' if quick else '--out'}: is for a comparison of estimators; leave it out.")
-        _compare_results(results, page)
-    elif page is not None:
+        _compare_results(results, report)
+    elif report is not None:
         raise InputError("--report: is for a comparison of results; give the files of `jaxos4 estimate --out`.")
     else:
         _compare_estimators(out, quick=quick)
@@ -148,8 +147,7 @@ def _compare_results(results: list[Path], page: Path | None) -> None:
         found = jaxos4.compare_results(results)
         if page is not None:
             progress("drawing")
-            command = shlex.join(["jaxos4", "compare", *map(str, results), "--report", str(page)])
-            jaxos4.report.write_comparison(page, found, command=printable(command))
+            jaxos4.report.write_comparison(page, found, command=command())
     jaxos4.report.print_comparison(console(), found)
     if page is not None:
         typer.echo(f"report: {page}")

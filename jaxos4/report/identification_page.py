@@ -125,17 +125,10 @@ def _sample_times(found: Identification, look: Style) -> list[Markup]:
 
 
 def _parameters(found: Identification) -> Markup:
-    rows: list[str | tuple[str, ...]] = [
-        (
-            name,
-            x.unit,
-            plain(x.estimate, 4),
-            span(x.ci95) + (f"\nbracket {span(x.bracket)}" if x.bracket else ""),
-            plain(x.bound, 2),
-            x.note,
-        )
-        for name, x in found.parameters.items()
-    ]
+    rows: list[str | tuple[str, ...]] = []
+    for name, x in found.parameters.items():
+        within = f"\nbracket {span(x.bracket)}" if x.bracket else ""
+        rows.append((name, x.unit, plain(x.estimate, 4), span(x.ci95) + within, plain(x.bound, 2), x.note))
     for why in dict.fromkeys(x.note for x in found.held.values()):
         of_why = {name: x for name, x in found.held.items() if x.note == why}
         rows += [f"fixed: {why}", *((name, x.unit, plain(x.value, 4), "", "", "") for name, x in of_why.items())]
