@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from .._templates import templates
 from ..airframe import INERTIAS
 from ..errors import printable
 from ..identification.next_flight import next_flight, spreads_of
@@ -18,7 +17,7 @@ from ..identification.verdict import headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from . import identification_figures as figures
 from .identification_signals import BAND, identified_signals
-from .page import Section, picture, signals, table, text, write_page
+from .page import Section, picture, signals, table, template, text, write_page
 from .style import Style, styles
 from .terminal import notes_of, quantity_rows, warning_lines, why_no_value
 from .text import DASH, plain, span
@@ -277,8 +276,8 @@ def quantities(found: Identification) -> list[tuple[str, ...]]:
 def identification_html(found: Identification) -> str:
     """Verdict, physical quantities and reservations, for a notebook."""
     lines = [*warning_lines(found), *(f"note: {note}" for note in notes_of(found)), *_next(found)]
-    template = templates("jaxos4.report").get_template("summary.html.j2")
-    return template.render(verdict=verdict(found), rows=quantity_rows(physical_quantities(found)), lines=lines)
+    rows = quantity_rows(physical_quantities(found))
+    return template("summary.html.j2").render(verdict=verdict(found), rows=rows, lines=lines)
 
 
 def _next(found: Identification) -> list[str]:

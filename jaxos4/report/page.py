@@ -34,14 +34,15 @@ def with_code(text: str) -> Markup:
 
 
 @functools.cache
-def _templates() -> Any:
+def template(name: str) -> Any:
+    """A template of this folder. Its filter `code`: `with_code`."""
     found = templates("jaxos4.report")
     found.filters["code"], found.globals["worded"] = with_code, WORDED
-    return found
+    return found.get_template(name)
 
 
 def _part(kind: str, *given: Any) -> Markup:
-    return getattr(_templates().get_template("parts.html.j2").module, kind)(*given)
+    return getattr(template("parts.html.j2").module, kind)(*given)
 
 
 def table(
@@ -113,4 +114,4 @@ def write_page(
     filled = [each for each in sections if each.parts]
     given = {"title": title, "about": about, "top": top, "sections": filled, "end": end, "command": command}
     given |= {"provenance": provenance, "swatches": swatches, "has_signals": has_signals}
-    write_file(path, _templates().get_template("page.html.j2").render(given))
+    write_file(path, template("page.html.j2").render(given))

@@ -75,7 +75,7 @@ def swatch(mark: Line | Band) -> str:
     """A sample of a mark in 32 x 16 pixels: the content of an element `<svg>`."""
     if isinstance(mark, Band):
         return f'<rect y="2" width="32" height="12" fill="{mark.color}" fill-opacity="{mark.opacity}"/>'
-    sample, ends = mark._replace(width=min(mark.width, 3.0), size=min(mark.size, 9.0)), np.array([0.0, 32.0])
+    sample, ends = mark._replace(width=min(mark.width, 3.0), size=min(max(mark.size, 6.0), 9.0)), np.array([0.0, 32.0])
     return _stroke(ends, np.full(2, 8.0), sample) + _marks(ends[1:] / 2, np.array([8.0]), sample)
 
 
