@@ -127,8 +127,7 @@ def write_comparison(path: str | os.PathLike[str], found: Comparison, *, command
     if count:
         lines = text([f"{line}." for line in found.reasons])
         top.append(folded(f"{count} reason{'s' if count > 1 else ''}", lines, id="reasons"))
-    if found.notes:
-        top.append(text([f"{note}." for note in found.notes], id="notes"))
+    top.append(text([f"{note}." for note in found.notes], id="notes"))
     top.append(text(found.next_flight[0].upper() + found.next_flight[1:], id="next"))
     write_page(
         path,

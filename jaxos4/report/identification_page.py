@@ -36,7 +36,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     cost = "" if found.cost is None else f", cost {plain(found.cost)}"
     how = f"{found.estimator}, {found.model} model, {found.result.replace('_', ' ')}, {found.rollouts} rollouts"
     top = [text(verdict(found), "verdict" if found.successful else "verdict warning")]
-    top += [text(lines, "verdicts") for lines in [warning_lines(found)] if lines]
+    top.append(text(warning_lines(found)))
     top += [text(each[0].upper() + each[1:], id="next") for each in _next(found)]
     drawn, notes = _signals(found, look), notes_of(found)
     sections = [
@@ -58,7 +58,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         about=f"Parameters of a quadrotor from its recorded flights: {how}, {plain(found.seconds)} s{cost}.",
         top=top,
         sections=sections,
-        end=[text(notes)] if notes and not drawn else [],
+        end=[] if drawn else [text(notes)],
         command=used.command or "",
         provenance=[
             (
@@ -78,7 +78,7 @@ def _quantities(found: Identification) -> list[Markup]:
     rows = [(name, unit, value, ends, note) for name, value, ends, unit, note in quantities(found)]
     headings = ("quantity", *_ESTIMATE, "note")
     caption = "Estimates with their 95 % intervals"
-    return [table("quantities-table", caption, headings, rows, tested)] if rows else []
+    return [table("quantities-table", caption, headings, rows, tested)]
 
 
 def _signals(found: Identification, look: Style) -> list[Markup]:
@@ -211,7 +211,7 @@ def _disturbances(found: Identification) -> list[Markup]:
         "parameters, because the controller reacts to it."
     )
     caption = "Disturbances of each channel, which the model does not explain"
-    return [table("disturbances-table", caption, headings, rows, [note])] if rows else []
+    return [table("disturbances-table", caption, headings, rows, [note])]
 
 
 def _skill(found: Identification) -> list[Markup]:

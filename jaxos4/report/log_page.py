@@ -71,8 +71,10 @@ def write_log_page(
     shown, block = logged(recording, found)
     label = recording.facts.format.label if recording.facts.format else "recording"
     sampled = f"{found.samples} samples, one every {plain(1e3 * found.sample_time)} ms"
-    top = [text(verdict(found), f"verdict{' warning' if found.refusals else ''}")]
-    top += [text([f"Cannot identify a vehicle: {line}." for line in found.refusals])] if found.refusals else []
+    top = [
+        text(verdict(found), f"verdict{' warning' if found.refusals else ''}"),
+        text([f"Cannot identify a vehicle: {line}." for line in found.refusals]),
+    ]
     caption = (
         "Horizontal: time [s]. Grey: not usable, for the reason in the table of parts. The options above the figure "
         "name the part that is in sight, for jaxos4 estimate."
@@ -97,7 +99,7 @@ def write_log_page(
         top=top,
         sections=sections,
         command=command,
-        end=[text(found.notes)] if found.notes else [],
+        end=[text(found.notes)],
         provenance=[("log", recording.name)],
         has_signals=True,
     )
@@ -110,7 +112,7 @@ def _checks(found: Inspection) -> list[Markup]:
         for each in found.findings
     ]
     headings = ("quantity", "", "cause", "size", "what to do")
-    return [table("checks-table", "Checks that found something", headings, rows)] if rows else []
+    return [table("checks-table", "Checks that found something", headings, rows)]
 
 
 def _parts(found: Inspection) -> Markup:

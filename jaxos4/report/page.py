@@ -53,7 +53,7 @@ def table(
     notes: Sequence[str] = (),
     estimators: Sequence[str] = (),
 ) -> Markup:
-    """A table. On a narrow screen each row is a card, in which headings stand above cells.
+    """A table; nothing without rows. On a narrow screen each row is a card, in which headings stand above cells.
 
     - `headings`: of all columns, some with a unit: `"rate [Hz]"`.
     - `rows`: the name of each row and its cells; a text instead of a row is the name of the rows below it. The second
@@ -61,7 +61,7 @@ def table(
     - `notes`: paragraphs below the table.
     - `estimators`: those of the page's bar, which hides the rows that have their names.
     """
-    return _part("table", id, caption, headings, rows, notes, estimators)
+    return _part("table", id, caption, headings, rows, notes, estimators) if rows else Markup()
 
 
 def picture(figure: Figure, caption: str, title: str = "") -> Markup:
@@ -78,8 +78,8 @@ def signals(drawn: str, caption: str, *, choice: str = "", names_part: bool = Fa
 
 
 def text(given: str | Sequence[str], look: str = "", id: str = "") -> Markup:
-    """A paragraph, or a list of sentences. `look`: a class of the style sheet `page.css`."""
-    return _part("text", given, look, id)
+    """A paragraph, or a list of sentences; nothing if there are none. `look`: a class of the style sheet `page.css`."""
+    return _part("text", given, look, id) if given else Markup()
 
 
 def folded(summary: str, *parts: Markup, id: str = "", is_open: bool = False) -> Markup:
@@ -102,6 +102,8 @@ def write_page(
 ) -> None:
     """Writes a page, completely or not at all: its `title`, what it is `about`, the `top`, sections, how it was made.
 
+    Sections without parts are left out.
+
     - `command`, `end`, `provenance`: the last section. Provenance: labels and values.
     - `estimators`: which the bar shows and hides, instead of links to the sections.
 
@@ -111,7 +113,7 @@ def write_page(
         name: Markup(swatch(Line([], [], look.color, dash=look.dash, marker=look.marker)))  # noqa: S704  # our own
         for name, look in (estimators or {}).items()
     }
-    filled = [each for each in sections if each.parts]
+    filled = [each for each in sections if any(each.parts)]
     given = {"title": title, "about": about, "top": top, "sections": filled, "end": end, "command": command}
     given |= {"provenance": provenance, "swatches": swatches, "has_signals": has_signals}
     write_file(path, template("page.html.j2").render(given))

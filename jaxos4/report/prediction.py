@@ -144,7 +144,7 @@ def write_prediction(path: str | os.PathLike[str], found: FlightPrediction, *, c
         path,
         title=f"{found.flight}, predicted",
         about=f"Another flight, predicted with the vehicle of {found.found}: {_size(found)}.",
-        top=[text(headline(found), "verdict"), *[text([*found.notes, *notes])] * bool(found.notes or notes)],
+        top=[text(headline(found), "verdict"), text([*found.notes, *notes])],
         sections=[
             Section("errors", "Errors by time ahead", [grown], "Errors"),
             Section("prediction", "Measured and predicted", [drawn], "Signals"),
