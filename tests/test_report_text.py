@@ -58,7 +58,7 @@ def test_the_text_of_a_vehicle(tmp_path):
     says(
         printed(identified_vehicle()),
         *("alpha3 1/(kg m^2) 5.771e+04 [5.671e+04, 5.872e+04]", "fixed, not identifiable: alpha1 -0.8125."),
-        *("Ix 1.733e-05 +- 2.9e-07 (if arms and mass are right)", "(377 starts)", "0.50 s - +- -"),
+        *("Ix 1.733e-05 +- 2.9e-07 (if arms and mass are right)", "(377 starts)", "0.50 s – +- –"),
         "0.25 s 0.73 +- 0.14 0.73 +- 0.14 0.73 +- 0.14 0.41, 0.41, 0.41",
         "flight model (offset, damping), 32 s, a sample every 4 ms: successful, 812 rollouts",
     )

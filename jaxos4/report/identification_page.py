@@ -10,7 +10,6 @@ from markupsafe import Markup
 
 from ..airframe import INERTIAS
 from ..errors import printable
-from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification
 from ..identification.verdict import headline, statuses_of
@@ -19,7 +18,7 @@ from . import identification_figures as figures
 from .identification_signals import BAND, identified_signals
 from .page import Section, picture, signals, table, template, text, write_page
 from .style import Style, styles
-from .terminal import notes_of, quantity_rows, warning_lines, why_no_value
+from .terminal import next_lines, notes_of, quantity_rows, share, warning_lines, why_no_value
 from .text import DASH, plain, span
 
 # The page shows these entries of the provenance in a place of their own.
@@ -37,7 +36,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     how = f"{found.estimator}, {found.model} model, {found.result.replace('_', ' ')}, {found.rollouts} rollouts"
     top = [text(verdict(found), "verdict" if found.successful else "verdict warning")]
     top.append(text(warning_lines(found)))
-    top += [text(each[0].upper() + each[1:], id="next") for each in _next(found)]
+    top += [text(each[0].upper() + each[1:], id="next") for each in next_lines(found)]
     drawn, notes = _signals(found, look), notes_of(found)
     sections = [
         Section("quantities", "Physical quantities", _quantities(found), "Quantities"),
@@ -221,8 +220,8 @@ def _skill(found: Identification) -> list[Markup]:
     for name, rate in (("p", skill.p), ("q", skill.q), ("r", skill.r)):
         rows.append(name)
         for i, horizon in enumerate(skill.horizons):
-            std = "" if rate.std[i] is None else f"\n± {_share(rate.std[i])}"
-            shares = f"{_share(rate.skill[i])}{std}", _share(rate.equation_error[i])
+            std = "" if rate.std[i] is None else f"\n± {share(rate.std[i])}"
+            shares = f"{share(rate.skill[i])}{std}", share(rate.equation_error[i])
             rows.append((plain(horizon), *shares, plain(rate.rmse[i]), plain(rate.persistence[i])))
     note = (
         "1 - (RMSE / persistence)²: 1 is perfect, 0 is as good as the assumption that rates stay constant "
@@ -275,13 +274,9 @@ def quantities(found: Identification) -> list[tuple[str, ...]]:
 
 def identification_html(found: Identification) -> str:
     """Verdict, physical quantities and reservations, for a notebook."""
-    lines = [*warning_lines(found), *(f"note: {note}" for note in notes_of(found)), *_next(found)]
+    lines = [*warning_lines(found), *(f"note: {note}" for note in notes_of(found)), *next_lines(found)]
     rows = quantity_rows(physical_quantities(found))
     return template("summary.html.j2").render(verdict=verdict(found), rows=rows, lines=lines)
-
-
-def _next(found: Identification) -> list[str]:
-    return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
 
 
 def verdict(found: Identification) -> str:
@@ -291,7 +286,3 @@ def verdict(found: Identification) -> str:
     if found.verdicts:
         return " ".join(headline(statuses_of(found.verdicts)).values())
     return "No quantity was judged." if found.successful else f"Not to be trusted: {meaning(found.result)}."
-
-
-def _share(value: float | None) -> str:
-    return DASH if value is None else f"{value:.2f}"

@@ -24,7 +24,7 @@ from ..identification.verdict import (
 )
 from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
-from .text import Listing, plain, say
+from .text import DASH, Listing, plain, say
 
 _WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
@@ -46,20 +46,24 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
     `verbose`: for a vehicle, also all parameters, the noise and the quality of predictions. An OS4 always has its
     parameters.
     """
-    sections = [_quantities, _reasons, _notes]
-    if not found.is_vehicle:
-        sections = [_reasons, _notes, _parameters, _fit, _inertias, _validation]
-    elif verbose:
-        sections += [_parameters, _held, _inertias, _of_vehicle]
+    notes = [f"note: {note}" for note in notes_of(found)]
+    parts = [*warning_lines(found), *notes]
+    if not found.has_answer:
+        parts = [*notes, *_failure(found)]
+    elif not found.is_vehicle:
+        parts += [*_parameters(found), *_fit(found), *_inertias(found), *_validation(found)]
+    else:
+        parts = [*_quantities(found), *parts]
+        parts += [*_parameters(found), *_held(found), *_inertias(found), *_of_vehicle(found)] if verbose else []
     if found.has_answer:
+        parts += [_summary(found), *next_lines(found)]
         for status, sentence in headline(statuses_of(found.verdicts)).items():
             say(console, sentence, _COLOURS[status])
-    for section in (*sections, _summary, _next) if found.has_answer else (_notes, _failure):
-        for part in section(found):
-            if isinstance(part, Listing):
-                part.print_on(console)
-            else:
-                say(console, part)
+    for part in parts:
+        if isinstance(part, Listing):
+            part.print_on(console)
+        else:
+            say(console, part)
 
 
 def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:
@@ -85,10 +89,6 @@ def _quantities(found: Identification) -> Section:
         yield Listing(("quantity", "estimate", "95 % interval", "unit", "note"), rows, ("estimate",))
 
 
-def _reasons(found: Identification) -> Section:
-    yield from warning_lines(found)
-
-
 def warning_lines(found: Identification) -> list[str]:
     """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
     wide = {name: factor for name, factor in found.widened.items() if factor > _WIDENED}
@@ -102,10 +102,6 @@ def warning_lines(found: Identification) -> list[str]:
 def notes_of(found: Identification) -> list[str]:
     """What was changed and noticed, and the clock of the motors if it is not the gyro's."""
     return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
-
-
-def _notes(found: Identification) -> Section:
-    yield from (f"note: {note}" for note in notes_of(found))
 
 
 def _failure(found: Identification) -> Section:
@@ -238,29 +234,30 @@ def _of_vehicle(found: Identification) -> Section:
     )
     rates = (skill.p, skill.q, skill.r)
     for i, horizon in enumerate(skill.horizons):
-        cells = [f"{_share(rate.skill[i])} +- {_share(rate.std[i])}" for rate in rates]
-        table.append((f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates)))
+        cells = [f"{share(rate.skill[i])} +- {share(rate.std[i])}" for rate in rates]
+        table.append((f"{horizon:.2f} s", *cells, ", ".join(share(rate.equation_error[i]) for rate in rates)))
     yield Listing(("ahead", "p", "q", "r", "equation error: p, q, r"), table)
 
 
-def _summary(found: Identification) -> Section:
+def _summary(found: Identification) -> str:
     used = found.provenance
     if found.is_vehicle:
         how = f"flight model ({', '.join(used.terms or ())}), {used.fitted_seconds:.0f} s, a sample every "
         how, digits = f"{how}{1e3 * used.sample_time:g} ms", 0
     else:
         how, digits = f"{found.model} model, {used.channels} channels", 1
-    yield f"{found.estimator}, {how}: {found.result}, {found.rollouts} rollouts, {found.seconds:.{digits}f} s"
+    return f"{found.estimator}, {how}: {found.result}, {found.rollouts} rollouts, {found.seconds:.{digits}f} s"
 
 
-def _next(found: Identification) -> Section:
-    if found.verdicts:
-        yield next_flight([found], spreads_of(found))
+def next_lines(found: Identification) -> list[str]:
+    """What to fly next, if anything was judged."""
+    return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
 
 
-def _share(value: float | None) -> str:
+def share(value: float | None) -> str:
+    """A skill: 1 is perfect, and it may be far below 0."""
     if value is None:
-        return "-"
+        return DASH
     return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"
 
 
