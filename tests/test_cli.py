@@ -15,8 +15,9 @@ from pages import words
 from synthetic_results import vehicle_result
 
 import jaxos4
-from jaxos4.cli import main
+from jaxos4.cli import main, options
 from jaxos4.cli._app import app
+from jaxos4.cli._shared import console
 from jaxos4.networks import NetworkEstimator
 
 TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alpha6": 133.33333, "alpha8": 76.923077}
@@ -271,6 +272,13 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(run, inputs, mo
     before = {path: path.stat().st_mtime_ns for path in inputs.iterdir()}
     refused(run(*line.split()), *fragments)
     assert {path: path.stat().st_mtime_ns for path in inputs.iterdir()} == before
+
+
+def test_what_is_printed_names_options_as_they_are_typed(monkeypatch, capsys):
+    monkeypatch.setattr(options, "ASKED", {"bracket": pathlib.Path("mine.toml"), "sample_time": None})
+    console().print("give a wider `bracket`, or `sample_time` 0.01; check `mass`, `end`")
+    assert capsys.readouterr().out == "give a wider --bracket, or --sample-time 0.01; check `mass`, `end`\n"
+    assert options.as_typed("`bracket`: knows no `alpha9`") == "--bracket mine.toml: knows no `alpha9`"
 
 
 def test_the_help_shows_each_text_whole(run):

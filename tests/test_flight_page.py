@@ -60,6 +60,12 @@ def test_the_page_says_what_was_found(tmp_path):
     assert len(text) < 100_000
 
 
+def test_names_of_arguments_are_code(tmp_path):
+    notes = ["(`begin` and `end` override)", "a ` alone", "`<b>`"]
+    text, _ = written(tmp_path / "flight.html", provenance={"notes": notes})
+    says(text, "(<code>begin</code> and <code>end</code> override)", "a ` alone", "<code>&lt;b&gt;</code>")
+
+
 def unpacked(line):
     middle, step, levels = line["values"]
     levels = np.frombuffer(base64.b64decode(levels), "<i2").astype(float)

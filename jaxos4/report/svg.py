@@ -1,5 +1,6 @@
 """Figures as SVG, in a page or as a file."""
 
+import itertools
 import math
 
 import numpy as np
@@ -41,8 +42,8 @@ def inline(figure: Figure, description: str) -> Markup:
     label = escape(" ".join(description.split()))
     drawn = f'<div class="panels" role="img" aria-label="{label}" style="{style}">{panels}</div>'
     drawn = f'<p class="legend">{legend}</p>{drawn}' if legend else drawn
-    for color, themed in _THEMED.items():  # of attributes: in a text, quotation marks are escaped
-        drawn = drawn.replace(f'"{color}"', f'"{themed}"')
+    for paint, color in itertools.product(("fill", "stroke"), _THEMED):  # in a text, quotation marks are escaped
+        drawn = drawn.replace(f'{paint}="{color}"', f'{paint}="{_THEMED[color]}"')
     return Markup(drawn)  # noqa: S704  # texts are escaped
 
 
