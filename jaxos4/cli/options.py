@@ -79,7 +79,9 @@ OneFlight = Annotated[Path, Argument(metavar="FLIGHT.csv", help="The recorded fl
 TrainedFlight = Annotated[Path, Argument(metavar="FLIGHT.csv", help="A flight with the inputs to train for.")]
 Log = Annotated[Path, Argument(metavar="LOG", help="A flight in one of the formats of docs/logs.md.")]
 Result = Annotated[Path, Argument(metavar="RESULT.json", help="A vehicle: a file of `jaxos4 estimate --out`.")]
-Designed = Annotated[_File, Argument(metavar="[RESULT.json]", help="The vehicle to fly; with it, --closed-loop.")]
+Designed = Annotated[
+    _File, Argument(metavar="[RESULT.json]", help="A vehicle of `estimate --out`; implies --closed-loop.")
+]
 Compared = Annotated[
     list[Path] | None, Argument(metavar="[RESULT.json...]", help="Results to compare. Without them: all estimators.")
 ]
@@ -144,7 +146,7 @@ FirstState = Annotated[InitialState, Option(help="free: estimated too; known: eq
 DesignedFirstState = Annotated[
     InitialState | None, Option(help="free: estimated too (default); known: equal to the first sample.")
 ]
-Window = Annotated[_Number, Option(help="Multiple shooting: length of a window [s]; all have initial states.")]
+Window = Annotated[_Number, Option(help="Multiple shooting: windows of this length [s], each with an initial state.")]
 Terms = Annotated[str | None, Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")]
 Begin = Annotated[_Number, Option("--begin", "--from", help="Real vehicle: first time to use [s].")]
 End = Annotated[_Number, Option("--end", "--to", help="Real vehicle: last time to use [s].")]
@@ -181,7 +183,9 @@ LoadSag = Annotated[_Number, Option(help="With --closed-loop: share of a command
 GyroCutoff = Annotated[_Number, Option(help="With --closed-loop: cut-off of the gyro's filter [Hz]. Default: none.")]
 GyroDelay = Annotated[_Number, Option(help="With --closed-loop: delay of the gyro [s]. Default: 0.")]
 LogEvery = Annotated[int | None, Option(help="With --closed-loop: controller runs in a sample of the log. Default: 1.")]
-Logged = Annotated[Sensors | None, Option(help="With --closed-loop: what is logged. Default: by max_rotor_speed.")]
+Logged = Annotated[
+    Sensors | None, Option(help="With --closed-loop: what is logged. Default: commands, if they can be.")
+]
 Slowest = Annotated[_Number, Option(help="Slowest rotor speed [rad/s].")]
 Fastest = Annotated[_Number, Option(help="Fastest rotor speed [rad/s].")]
 Slew = Annotated[_Number, Option(help="Fastest change of a rotor speed [rad/s^2].")]
