@@ -34,7 +34,7 @@ def estimates(data: xr.Dataset) -> Table:
                 rows.append((estimator, plain(value, 4), ends, plain(bound, 4), plain(ratio, 2)))
     headings = ("estimator", "estimate", "interval", "bound", "error / bound")
     caption = f"Each estimate with its interval of {100 * level:g} %, and the truth"
-    return Table("estimates", caption, headings, rows, ["From estimate, truth, half_width, bound, result."])
+    return Table(caption, headings, rows, ["From estimate, truth, half_width, bound, result."])
 
 
 def outcomes(data: xr.Dataset) -> list[str]:

@@ -133,15 +133,18 @@ def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: b
     differ = "; ".join(f"{', '.join(who)} see {seen}" for seen, who in study_tables.channels_by_estimator(data).items())
     differ = f" Not of the same channels: {differ}" if "; " in differ else ""
 
-    def drawn(name: str) -> list[Markup]:
+    def drawn(name: str) -> Markup:
         if name not in figures:
-            return []
+            return Markup()
         (title, caption), figure = _WORDS[name], figures[name]
         title += differ * (name == "overview")
-        return [picture(figure, f"{caption} Drawn in figures/{figure.stem}.svg.", title)]
+        return picture(figure, f"{caption} Drawn in figures/{figure.stem}.svg.", title)
 
     def shown(name: str) -> Markup:
-        return table(*tables[name]._replace(id=f"{name}-{number}"), estimators)
+        return table(f"{name}-{number}", *tables[name], estimators)
+
+    def more(name: str, *others: str) -> Markup:
+        return folded(f"Every number of the {name}", *map(shown, (name, *others)))
 
     def section(title: str, parts: list[Markup]) -> Section:
         return Section(f"{title.split()[0].lower()}-of-{number}", title, parts, level=3)
@@ -150,26 +153,19 @@ def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: b
     if of_one:
         outcomes = one_flight.outcomes(data)
         first.append(text(outcomes) if len(outcomes) > 1 else text(outcomes[0], "verdict"))
-        first += [*drawn("intervals"), shown("estimates")]
+        first += [drawn("intervals"), shown("estimates")]
     elif best := best_estimators(data):
         said = "; ".join(f"{who} at {scales}" for scales, who in best.items())
         first.append(text(f"Most accurate, within Monte-Carlo error: {said}.", "verdict"))
-    sections = [Section(f"scenario-{number}", label, [*first, *drawn("overview")])]
+    sections = [Section(f"scenario-{number}", label, [*first, drawn("overview")])]
     if not of_one:
         sections += [
-            section("Errors", [*drawn("error"), shown("error")]),
-            section(
-                "Efficiency", [*drawn("efficiency"), folded("Every number of the efficiency", shown("efficiency"))]
-            ),
-            section(
-                "Coverage",
-                [*drawn("coverage"), folded("Every number of the coverage", shown("coverage"), shown("levels"))],
-            ),
+            section("Errors", [drawn("error"), shown("error")]),
+            section("Efficiency", [drawn("efficiency"), more("efficiency")]),
+            section("Coverage", [drawn("coverage"), more("coverage", "levels")]),
         ]
-    last = [shown("results"), *_troubled(data)]
-    if has_zero and figures:
-        last.append(text("A logarithmic axis cannot show the noise scale 0: it is in the tables only.", "note"))
-    return [*sections, section("Results and rollouts", last)]
+    lost = "A logarithmic axis cannot show the noise scale 0: it is in the tables only." if has_zero and figures else ""
+    return [*sections, section("Results and rollouts", [shown("results"), *_troubled(data), text(lost, "note")])]
 
 
 def _troubled(data: xr.Dataset) -> list[Markup]:

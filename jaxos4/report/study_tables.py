@@ -34,7 +34,6 @@ Rows = list[str | tuple[str, ...]]
 class Table(NamedTuple):
     """A table of the page, see `page.table`."""
 
-    id: str
     caption: str
     headings: Sequence[str]
     rows: Sequence[str | Sequence[str]]
@@ -101,7 +100,7 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     def table(name: str, measure: str, found: xr.Dataset, headings: list[str], caption: str) -> Table:
         source = f"From estimate, truth, {'bound' if name == 'efficiency' else 'half_width'}, result (metrics.{name})."
         rows = _by_estimator(data, lambda at: _with_intervals(found.isel(at), measure))
-        return Table(name, caption, ("estimator", *headings), rows, [source])
+        return Table(caption, ("estimator", *headings), rows, [source])
 
     ratio = "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do"
     held = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
@@ -150,7 +149,7 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         headings.append(f"{name} [{'%' if not any(marked) else unit if all(marked) else f'%; marked: {unit}'}]")
     caption = "RMS error [% of the truth; where marked, in the parameter's unit]"
     source = "From estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)."
-    return Table("error", caption, headings, rows, [*notes, source])
+    return Table(caption, headings, rows, [*notes, source])
 
 
 def _result_table(data: xr.Dataset) -> Table:
@@ -166,7 +165,7 @@ def _result_table(data: xr.Dataset) -> Table:
     caption = "Flights by result, mean rollouts, and the hybrid's seed brackets that contain the truth [%]"
     source = "From result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)."
     headings = ("estimator", *headings, "rollouts", "seed hits")
-    return Table("results", caption, headings, _by_estimator(data, cells), [source])
+    return Table(caption, headings, _by_estimator(data, cells), [source])
 
 
 def best_estimators(data: xr.Dataset) -> dict[str, str]:
