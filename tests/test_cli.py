@@ -15,8 +15,9 @@ from pages import words
 from synthetic_results import vehicle_result
 
 import jaxos4
-from jaxos4.cli import main
+from jaxos4.cli import main, options
 from jaxos4.cli._app import app
+from jaxos4.cli._shared import console
 from jaxos4.networks import NetworkEstimator
 
 TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alpha6": 133.33333, "alpha8": 76.923077}
@@ -162,23 +163,23 @@ REFUSED = {
     "estimate flight.csv --airframe none": ["none", "os4"],
     "estimate flight.csv --airframe long.toml": ["long.toml"],
     "estimate flight.csv --bracket bad.toml": ["bad.toml"],
-    "estimate flight.csv --bracket swapped.toml": ["`bracket`", "alpha3"],
+    "estimate flight.csv --bracket swapped.toml": ["--bracket swapped.toml: ", "alpha3"],
     "estimate flight.csv --out none/e.json": ["none/e.json"],
     "estimate flight.csv --out .": ["."],
     "estimate flight.csv --out flight.csv": ["flight.csv", "overwrite"],
     "estimate flight.csv --validate flight.csv --out flight.csv": ["flight.csv", "overwrite"],
-    "estimate flight.csv --estimator rls --channels all": ["`channels`", "rls"],
-    "estimate flight.csv --estimator kalman --window 1": ["`window`", "kalman"],
-    "estimate flight.csv --estimator hybrid --window 1 --network x.net": ["`window`"],
-    "estimate flight.csv --window 0": ["`window`", "positive"],
-    "estimate flight.csv --window 0.01": ["`window`", "flight.csv"],
-    "estimate flight.csv --window 1 --initial-state known": ["`window`", "free"],
+    "estimate flight.csv --estimator rls --channels all": ["--channels", "rls"],
+    "estimate flight.csv --estimator kalman --window 1": ["--window", "kalman"],
+    "estimate flight.csv --estimator hybrid --window 1 --network x.net": ["--window"],
+    "estimate flight.csv --window 0": ["--window", "positive"],
+    "estimate flight.csv --window 0.01": ["--window", "flight.csv"],
+    "estimate flight.csv --window 1 --initial-state known": ["--window", "free"],
     "estimate flight.csv --validate none.csv": ["none.csv"],
-    "estimate rates.csv --channels all": ["rates.csv", "`channels`"],
+    "estimate rates.csv --channels all": ["rates.csv", "--channels"],
     "estimate rates.csv --estimator svsf": ["rates.csv", "p, q and r"],
     "estimate rates.csv --channels rates --validate angles.csv": ["angles.csv", "rates"],
     "estimate rates.csv --channels rates --initial-state known": ["rates.csv", "first sample", "r"],
-    "estimate places.csv --window 0.1": ["places.csv", "phi, theta, psi", "`channels` rates"],
+    "estimate places.csv --window 0.1": ["places.csv", "phi, theta, psi", "--channels rates"],
     "estimate flight.csv --estimator network --network flight.csv": ["not a whole network file"],
     "estimate flight.csv --estimator network --network none.net": ["none.net", "No such file"],
     "identifiability flight.csv --out flight.csv": ["flight.csv", "overwrite"],
@@ -187,9 +188,9 @@ REFUSED = {
     "simulate --out new.csv --duration -1": ["duration"],
     "simulate --out new.csv --duration 1e12": ["duration"],
     "simulate --out new.csv --seed 1" + "0" * 30: ["seed"],
-    "train flight.csv --out a.net --steps 0": ["`steps` must be", "at least 1"],
+    "train flight.csv --out a.net --steps 0": ["--steps must be", "at least 1"],
     "train flight.csv --out a.net --seed -1": ["--seed"],
-    "train flight.csv --out a.net --features raw --architecture cmac": ["`architecture`", '`features` "score"'],
+    "train flight.csv --out a.net --features raw --architecture cmac": ["--architecture", '--features "score"'],
     "train flight.csv --out flight.csv": ["would overwrite an input"],
     "train flight.csv --out missing/a.net": ["no such folder"],
     "estimate x.csv --model none": ["'published', 'corrected'"],
@@ -219,25 +220,25 @@ REFUSED = {
     f"{CLOSED} --noise 1": ["--noise", "leave it out"],
     "simulate --out new.csv --gust 3": ["--gust", "--closed-loop"],
     "simulate --out new.csv --sensors speeds": ["--sensors", "--closed-loop"],
-    f"{DESIGN} --duration 0": ["`duration`", "50 to 2500 samples"],
+    f"{DESIGN} --duration 0": ["--duration", "50 to 2500 samples"],
     f"{DESIGN} --duration 2 --fastest 150": ["cannot hover", "225.7"],
     f"{DESIGN} --duration 2 --rate -1": ["--rate", "0.001 to 1000"],
     f"{DESIGN} --slew 1e-300": ["--slew", "0.001 to 1e+08"],
     f"{DESIGN} --accuracy 0": ["--accuracy"],
-    f"{DESIGN} --bandwidth 100": ["`bandwidth`", "0.2 to 25 Hz"],  # by default 5 s, sampled every 0.01 s
+    f"{DESIGN} --bandwidth 100": ["--bandwidth", "0.2 to 25 Hz"],  # by default 5 s, sampled every 0.01 s
     f"{DESIGN} --out new.svg --figure new.svg": ["--out and --figure name one file"],
     f"{DESIGN} --figure new.png": ["--figure new.png", ".svg"],
     f"{DESIGN} --gust 5": ["--gust", "with --closed-loop; add that"],
-    f"{REFERENCES} --duration 1000": ["`duration`", "250 to 20000 samples"],
+    f"{REFERENCES} --duration 1000": ["--duration", "250 to 20000 samples"],
     f"{REFERENCES} --velocity 1e8": ["--velocity", "0.001 to 1000"],
     f"{REFERENCES} --distance 1e-9": ["--distance", "0.001 to 100000"],
-    f"{REFERENCES} --angle 2": ["`angle`", "at most 1"],
+    f"{REFERENCES} --angle 2": ["--angle", "at most 1"],
     f"{REFERENCES} --fastest 300": ["cannot hover"],
     f"{REFERENCES} --slew 5": ["--slew", "without --closed-loop"],
     f"{REFERENCES} --channels rates": ["--channels", "without --closed-loop"],
     f"{REFERENCES} --sensors commands --airframe os4": ["--sensors", "max_rotor_speed"],
     f"{EXPORT} --samples 2": ["--samples", "--out"],
-    f"{EXPORT} --samples -1 --out vehicle.xml": ["`samples`: must be an integer of at least 0", "-1"],
+    f"{EXPORT} --samples -1 --out vehicle.xml": ["--samples: must be an integer of at least 0", "-1"],
     f"{EXPORT} --samples 100001 --out vehicle.xml": ["--samples", "at most 100000"],
     f"{EXPORT} --seed -1": ["--seed", "-1"],
     f"{EXPORT} --out found.json": ["would overwrite an input"],
@@ -271,6 +272,13 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(run, inputs, mo
     before = {path: path.stat().st_mtime_ns for path in inputs.iterdir()}
     refused(run(*line.split()), *fragments)
     assert {path: path.stat().st_mtime_ns for path in inputs.iterdir()} == before
+
+
+def test_what_is_printed_names_options_as_they_are_typed(monkeypatch, capsys):
+    monkeypatch.setattr(options, "ASKED", {"bracket": pathlib.Path("mine.toml"), "sample_time": None})
+    console().print("give a wider `bracket`, or `sample_time` 0.01; check `mass`, `end`")
+    assert capsys.readouterr().out == "give a wider --bracket, or --sample-time 0.01; check `mass`, `end`\n"
+    assert options.as_typed("`bracket`: knows no `alpha9`") == "--bracket mine.toml: knows no `alpha9`"
 
 
 def test_the_help_shows_each_text_whole(run):
@@ -332,7 +340,7 @@ def test_networks_of_another_problem_are_refused(run, tmp_path, network_file):
     refused(run("estimate", "chirp.csv", *with_network), "chirp.csv", "another series of rotor speeds", "jaxos4 train")
     refused(run("estimate", flight, *with_network, "--model", "corrected"), "PublishedOS4, not CorrectedOS4")
     refused(run("estimate", flight, *with_network, "--airframe", "voos"), "another airframe")
-    refused(run("estimate", flight, "--network", network), "`network`", "ibss uses none")
+    refused(run("estimate", flight, "--network", network), "--network", "ibss uses none")
     (tmp_path / "bracket.toml").write_text("alpha1 = [-1.0, 0.0]\n")
-    refused(run("estimate", flight, *with_network, "--bracket", "bracket.toml"), "`bracket`")
+    refused(run("estimate", flight, *with_network, "--bracket", "bracket.toml"), "--bracket bracket.toml: ")
     refused(run("estimate", flight, *with_network, "--out", network), "would overwrite an input")

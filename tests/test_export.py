@@ -188,8 +188,8 @@ def test_the_parameters_of_drone_models_make_the_forces_of_the_vehicle(write):
 def test_an_inertia_that_no_rigid_body_has_is_given_on_demand_and_clamped(run, write):
     values = {name: VALUES[name] for name in ("alpha3", "alpha6")}
     path = write(vehicle_result(values, held={"alpha8": held(1e4)}))  # Iz = 1e-4, and Ix + Iy = 3.3e-5
-    refused(run("export", "found.json", "--to", "urdf"), "Iz was not identified and is a guess: give `inertia_z`")
-    refused(run("export", "found.json", "--to", "urdf", "--inertia-z", "-1"), "`inertia_z`: must be positive")
+    refused(run("export", "found.json", "--to", "urdf"), "Iz was not identified and is a guess: give --inertia-z")
+    refused(run("export", "found.json", "--to", "urdf", "--inertia-z", "-1"), "--inertia-z: must be positive")
     ix, iy = (1 / VALUES[name] for name in ("alpha3", "alpha6"))
     for given, used in ((3e-5, 3e-5), (1e-4, ix + iy), (1e-9, abs(ix - iy))):
         found = read_result(path, inertia_z=given)

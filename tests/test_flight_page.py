@@ -49,7 +49,7 @@ def test_the_page_says_what_was_found(tmp_path):
     says(
         shown,
         *("ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230", "57710 56710 to 58720 130"),
-        *("alpha6 1/(kg m^2) – 2.0e6 not identifiable: not excited", "alpha1 1 -0.8125 fixed: not identifiable"),
+        *("alpha6 1/(kg m^2) – 2.0e6 not identifiable: not excited", "fixed: not identifiable alpha1 1 -0.8125"),
         *("1.733e-05 1.704e-05 to 1.762e-05 if arms and mass are right", "p = 0.21", "377 starts"),
         *("0.248 0.73 ± 0.14 0.41 0.400 0.800", "known to less than half of the model"),
         *("jaxos4 estimate flight.csv --model flight --report flight.html", "t is not uniform", "sample time 0.004"),
@@ -58,6 +58,12 @@ def test_the_page_says_what_was_found(tmp_path):
     text, shown = written(tmp_path / "flight.html", **absent)
     assert not any(said in shown for said in ("Measured, predicted", "Skill", "Frequency response"))
     assert len(text) < 100_000
+
+
+def test_names_of_arguments_are_code(tmp_path):
+    notes = ["(`begin` and `end` override)", "a ` alone", "`<b>`"]
+    text, _ = written(tmp_path / "flight.html", provenance={"notes": notes})
+    says(text, "(<code>begin</code> and <code>end</code> override)", "a ` alone", "<code>&lt;b&gt;</code>")
 
 
 def unpacked(line):
@@ -156,6 +162,8 @@ def test_what_stands_behind_an_estimate_is_drawn(tmp_path):
         "Path",
         "alpha6, alpha3: -0.95",
     )
+    _, shown = written(tmp_path / "vehicle.html", correlations=correlations)
+    says(shown, "Residual: measured minus one-step prediction.")
 
 
 def test_the_figure_says_how_strongly_each_axis_answers(tmp_path):
@@ -241,7 +249,7 @@ def test_names_cannot_break_out_of_the_page_and_an_older_one_is_kept_if_it_canno
     assert shown.count("alert(1)") >= 6
     path.write_text("of before")
     with pytest.raises(AttributeError):
-        write_flight_page(path, msgspec.structs.replace(identified_vehicle(), held=None), title="")
+        write_flight_page(path, msgspec.structs.replace(identified_vehicle(), rigid_body=None), title="")
     assert path.read_text() == "of before"
     with pytest.raises(FileNotFoundError):
         write_flight_page(tmp_path / "none" / "a.html", identified_vehicle(), title="")

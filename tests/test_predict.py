@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import CRAZYFLIE, refused
+from pages import says, stands_alone, words
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from synthetic_results import provenance, row, vehicle_result
@@ -16,6 +17,7 @@ import jaxos4
 from jaxos4.airframe import airframe_table
 from jaxos4.closed_loop import Air, ClosedLoop, Sensors
 from jaxos4.closed_loop.flight import fly_standard
+from jaxos4.report.text import plain
 
 pytestmark = pytest.mark.usefixtures("all_optimised")
 
@@ -244,7 +246,7 @@ def test_a_parameter_that_is_not_identified_is_noted(write):
 def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     write(result())
     jaxos4.write_flight(flown(2), tmp_path / "log.csv", CRAZYFLIE)
-    files = ("--out", "out.nc", "--json", "out.json", "--figure", "out.svg")
+    files = ("--out", "out.nc", "--json", "out.json", "--figure", "out.svg", "--report", "out.html")
     code, out, err = run("predict", "found.json", "log.csv", "--horizon", "0.25", "--seed", "3", *files)
     assert (code, err) == (0, "")
     assert all(
@@ -256,6 +258,10 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     error = np.abs(dataset.rates - dataset.rates_measured).sel(rate="p").mean("start")
     np.testing.assert_allclose(error, written["quantities"]["p"]["error"])
     assert "<svg" in (tmp_path / "out.svg").read_text(encoding="utf-8")
+    page = (tmp_path / "out.html").read_text(encoding="utf-8")
+    stands_alone(page)
+    says(words(page), "Errors 0.25 s ahead, relative to", "jaxos4 predict found.json log.csv")
+    assert plain(written["quantities"]["attitude"]["error"][-1]) in words(page)
     assert run("predict", "found.json", "log.csv", "--horizon", "0.25", "--out", "out.csv", "--seed", "3")[0] == 0
     table = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
     np.testing.assert_allclose(table["qw"], dataset.attitude.sel(component="w").values.ravel(), rtol=1e-8)
@@ -290,12 +296,12 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
         (result(provenance=provenance(terms=["warp"])), (), ("found.json", "the term warp is not of")),
         (result(covariance=None), (), ("holds no estimate",)),
         (result({name: x for name, x in truth().items() if name != "x_drag"}), (), ("found.json", "has no x_drag")),
-        (result(), ("--horizon", "30"), ("log.csv", "`horizon`", "give at most")),
-        (result(), ("--sample-time", "0.001"), ("`sample_time` 0.001", "one sample every 0.01 s")),
-        (result(), ("--horizon", "nan"), ("`horizon`", "positive")),
-        (result(), ("--spacing", "-1"), ("`spacing`", "at least 0")),
-        (result(), ("--horizon", "1e-300"), ("log.csv", "`horizon`", "give at least that")),
-        (result(), ("--spacing", "1e-300"), ("log.csv", "`spacing`", "give at least that")),
+        (result(), ("--horizon", "30"), ("log.csv", "--horizon", "give at most")),
+        (result(), ("--sample-time", "0.001"), ("--sample-time 0.001", "one sample every 0.01 s")),
+        (result(), ("--horizon", "nan"), ("--horizon", "positive")),
+        (result(), ("--spacing", "-1"), ("--spacing", "at least 0")),
+        (result(), ("--horizon", "1e-300"), ("log.csv", "--horizon", "give at least that")),
+        (result(), ("--spacing", "1e-300"), ("log.csv", "--spacing", "give at least that")),
         (result(), ("--seed", "-1"), ("--seed",)),
         (result(), ("--out", "out.xlsx"), ("out.xlsx", ".nc or .csv")),
         (result(), ("--figure", "out.gif"), ("out.gif", ".svg")),

@@ -23,7 +23,7 @@ from jaxos4.report import error_csv, error_table, study_page, write_report
 from jaxos4.report.matplotlib_figures import as_pdf
 from jaxos4.report.study_tables import scenario_tables, scenarios
 from jaxos4.report.style import styles
-from jaxos4.report.text import DASH, percent, plain
+from jaxos4.report.text import DASH, plain, with_unit
 from jaxos4.study import metrics, read_results
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
@@ -47,7 +47,8 @@ def tables(text):
                 label, *numbers = row
                 for heading, cell in zip(headings[1:], numbers, strict=True):
                     place = group.findtext("th/span"), "".join(label.itertext()).strip(), heading
-                    cells[place] = cell.text.strip(), cell.findtext("small", ""), cell.findtext("span", "")
+                    number = cell.text.rstrip("†‡ \n")
+                    cells[place] = number, cell.findtext("small", ""), cell.text.removeprefix(number).strip()
     return found
 
 
@@ -152,6 +153,9 @@ def test_every_number_in_the_tables(study, page):
     levels, counts, hits = metrics.mean_coverage(data), metrics.result_counts(data), metrics.hit_rate(data)
     shown = set()
 
+    def percent(share):
+        return plain(100 * share)
+
     def check(table, row, column, one, measure, text=plain):
         found = page[table][row[0], row[1], column]
         shown.add((table, row, column))
@@ -221,13 +225,14 @@ def test_a_study_of_one_flight_shows_the_answer_and_no_statistics(tmp_path):
     half = one["half_width"].sel(level=0.95).values
     held = int((abs(one["estimate"] - one["truth"]).values <= half).sum())
     assert f"ibss at noise x 1: successful, {held} of 3 intervals contain the truth." in shown
-    for k, name in enumerate(study["parameter"].values):
-        row = {heading: cells["noise x 1, ibss", name, heading][0] for heading in ("truth", "estimate", "interval")}
+    for k, (name, unit) in enumerate(zip(study["parameter"].values, study["unit"].values, strict=True)):
+        given = f"{with_unit(name, unit)} at noise x {{}}, truth {plain(float(one['truth'][k]), 4)}"
+        row = {heading: cells[given.format(1), "ibss", heading][0] for heading in ("estimate", "interval")}
         value = float(one["estimate"][k])
         ends = f"{plain(value - half[k], 4)} to {plain(value + half[k], 4)}"
-        assert row == {"truth": plain(float(one["truth"][k]), 4), "estimate": plain(value, 4), "interval": ends}
-        assert cells["noise x 0, svsf", name, "estimate"][0] == DASH
-        assert cells["noise x 0, svsf", name, "interval"][0] == DASH
+        assert row == {"estimate": plain(value, 4), "interval": ends}
+        assert cells[given.format(0), "svsf", "estimate"][0] == DASH
+        assert cells[given.format(0), "svsf", "interval"][0] == DASH
     single = study.isel(scale=[1], estimator=[0])
     assert '<p class="verdict">ibss at noise x 1: successful, ' in write_report(single, tmp_path)[0].read_text()
 

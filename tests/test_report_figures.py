@@ -19,7 +19,7 @@ from jaxos4.report.comparison import forest
 from jaxos4.report.log_page import motors, spectra
 from jaxos4.report.panels import Band, Figure, Line, Panel, Scale, Words, spread
 from jaxos4.report.study_tables import scenarios
-from jaxos4.report.style import styles
+from jaxos4.report.style import INK, styles
 from jaxos4.report.svg import as_file, inline
 
 LOOK = styles(["ibss"])["ibss"]
@@ -119,6 +119,15 @@ def test_a_name_is_text_and_each_bar_has_its_ends():
     (bar,) = (mark for mark in marks if isinstance(mark, Line))
     np.testing.assert_array_equal(bar.y, [0, 2, np.nan])
     assert "<title>&lt;/text&gt;" in inline(figure, "")
+
+
+def test_colours_follow_the_theme_but_not_in_texts():
+    drawn = inline(Figure("one", [Panel(INK, [Line((0, 1), (0, 1), name=f'fill="{INK}"')])]), INK)
+    assert f'aria-label="{INK}"' in drawn
+    assert f">{INK}</text>" in drawn
+    assert f"fill=&#34;{INK}&#34;" in drawn
+    assert 'stroke="currentColor"' in drawn
+    assert f'stroke="{INK}"' not in drawn
 
 
 def of_pages():

@@ -10,7 +10,8 @@ from pages import printed, says, words
 from rich.console import Console
 from synthetic_identification import COLOURED, CONSTANTS, WHITE, WRONG, identified_flight, identified_vehicle
 
-from jaxos4.identification.results import Disturbance, ParameterEstimate, RigidBody, Validation
+from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
+from jaxos4.identification.uncertainty import PRIOR_NOTE
 from jaxos4.report import write_flight_page
 from jaxos4.report.text import DASH, Listing, plain
 
@@ -43,12 +44,12 @@ DIVERGED = {"result": "nonfinite_trajectory"}
         ({"rigid_body": RigidBody(CONSTANTS, 0.5, False)}, "no rigid body has such"),
         ({"validation": Validation("other.csv", None, None)}, "trajectory diverges before the flight ends"),
         (DIVERGED, "No estimate: the model's trajectory diverged"),
-        (DIVERGED, "(try --window"),
+        (DIVERGED, "(try `window`"),
     ],
 )
 def test_the_text_of_a_flight_warns_and_is_short_without_an_answer(changes, said):
     says(printed(identified_flight(**changes)), said)
-    assert "--window" not in printed(identified_flight(**DIVERGED, estimator="rls"))
+    assert "`window`" not in printed(identified_flight(**DIVERGED, estimator="rls"))
     assert printed(identified_flight(result="bracket_invalid")) == ""
     assert printed(identified_vehicle(verdicts={}, **DIVERGED)) == "note: t is not uniform"
 
@@ -57,7 +58,7 @@ def test_the_text_of_a_vehicle(tmp_path):
     says(
         printed(identified_vehicle()),
         *("alpha3 1/(kg m^2) 5.771e+04 [5.671e+04, 5.872e+04]", "fixed, not identifiable: alpha1 -0.8125."),
-        *("Ix 1.733e-05 +- 2.9e-07 (if arms and mass are right)", "(377 starts)", "0.50 s - +- -"),
+        *("Ix 1.733e-05 +- 2.9e-07 (if arms and mass are right)", "(377 starts)", "0.50 s – +- –"),
         "0.25 s 0.73 +- 0.14 0.73 +- 0.14 0.73 +- 0.14 0.41, 0.41, 0.41",
         "flight model (offset, damping), 32 s, a sample every 4 ms: successful, 812 rollouts",
     )
@@ -73,6 +74,11 @@ def test_the_text_of_a_vehicle(tmp_path):
     says(printed(identified_vehicle(parameters=late)), "note: motors are recorded 20 ms late (rotor_delay)")
     write_flight_page(tmp_path / "flight.html", identified_vehicle(parameters=late))
     says(words((tmp_path / "flight.html").read_text(encoding="utf-8")), "motors are recorded 20 ms late")
+    unseen = {"alpha1": FixedParameter(-0.56, "1", PRIOR_NOTE)}
+    says(
+        printed(identified_vehicle(held=unseen)),
+        "fixed, not identifiable from these flights; the uncertainty is included in the other intervals: alpha1 -0.56.",
+    )
     small = {"rotor_delay": msgspec.structs.replace(late["rotor_delay"], estimate=-0.004)}
     assert "late" not in printed(identified_vehicle(parameters=small))
 
@@ -96,16 +102,15 @@ def listed(listing, width):
 @given(rows=st.lists(st.tuples(NUMBERS, NUMBERS, NOTES), min_size=1, max_size=4), width=st.integers(20, 120))
 def test_no_cell_is_cut_and_a_wide_table_stays_as_wide_as_the_terminal_if_it_fits(rows, width):
     names = [f"thrust_gain_{i}" for i in range(len(rows))]
-    cells = [(name, low, f"[{low}, {high}]") for name, (low, high, _) in zip(names, rows, strict=True)]
-    notes = [note for *_, note in rows]
-    text = listed(Listing(("parameter", "estimate", "95 % interval"), cells, ("estimate",), notes), width)
+    cells = [(name, low, f"[{low}, {high}]", note) for name, (low, high, note) in zip(names, rows, strict=True)]
+    text = listed(Listing(("parameter", "estimate", "95 % interval", "note"), cells, ("estimate",)), width)
     assert "…" not in text
-    assert all(cell in text for row in cells for cell in row)
-    assert all(word in text for note in notes for word in note.split())
+    assert all(cell in text for row in cells for cell in row[:-1])
+    assert all(word in text for row in cells for word in row[-1].split())
     use = "rotor 1, 2, 3, 4 at rest or idle, for a long time, in the air"
-    lines = listed(Listing(("name", "use"), [("a", use)], wraps=("use",)), 40).splitlines()
+    lines = listed(Listing(("name", "use"), [("a", use)]), 40).splitlines()
     assert max(map(len, lines)) <= 40
     assert len(lines) > 3
-    listing = Listing(("name",), [("a",)], notes=["not excited"])
+    listing = Listing(("name", "note"), [("a", "not excited")])
     assert listed(listing, 40).splitlines()[-1].split() == ["a", "not", "excited"]
     assert "a: not" in listed(listing, 12)

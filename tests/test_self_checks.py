@@ -27,10 +27,11 @@ from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES, VELOCITY
 from jaxos4.logs import write_flight
 from jaxos4.recording import Recording, plausible, read_recording
-from jaxos4.recording.checks import CHECKS, channels, different_vehicles, self_checks
+from jaxos4.recording.checks import CHECKS, Evidence, agreement, channels, different_vehicles, self_checks
 from jaxos4.recording.checks.estimates import Measured, attitude_turns, batched
 from jaxos4.recording.checks.response import rotor_response
 from jaxos4.recording.motion import in_body_axes
+from jaxos4.recording.prepared import prepare
 from jaxos4.recording.stretches import cut
 
 INERTIAS = {"Ix", "Iy", "Iz"}
@@ -414,3 +415,20 @@ def test_rest_before_take_off_judges_scale_and_mounting_of_the_accelerometer(cas
     assert len(named) == bool(words)
     for word in words:
         assert word in named[0]
+
+
+def test_a_difference_of_two_clocks_is_one_lag(flights, monkeypatch):
+    """Gyro and accelerometer alone do not show which of the two clocks is wrong."""
+    delay = agreement._Delay((1, -1, 0, 0), -0.0131, 0.002, 0.004)
+    monkeypatch.setattr(agreement, "_delays", lambda _: ([delay], True))
+    found = agreement.sensor_clocks(Evidence(flights[0], CRAZYFLIE))
+    assert (found.cause, found.size) == ("the accelerometer lags the gyro", "13.1 +- 8.9 ms")
+
+
+def test_noisy_rotor_speeds_are_smoothed_and_noted(flights):
+    noise = np.random.default_rng(3).normal(0, 20, flights[1].omega.shape)
+    notes = prepare([flights[1]._replace(omega=flights[1].omega + noise)], CRAZYFLIE)[0].notes
+    (note,) = (note for note in notes if "noisy" in note)
+    assert re.fullmatch(
+        r"speeds.csv: rotor speeds are noisy \(2\d rad/s, \d+ % of their changes .*\) and were smoothed", note
+    )

@@ -12,7 +12,7 @@ import pytest
 from helpers import COMMAND, EACH, how_we_compile, start
 
 import jaxos4
-from jaxos4.cli import _shared, estimate
+from jaxos4.cli import estimate, options
 from jaxos4.closed_loop import LOGGED
 from jaxos4.design.task import CRITERIA
 from jaxos4.estimators import ESTIMATORS
@@ -133,7 +133,7 @@ def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_comma
         "Criterion": CRITERIA,
     }
     for name, table in tables.items():
-        kind = getattr(_shared, name)
+        kind = getattr(options, name)
         assert list(map(str, get_args(kind) or kind)) == list(table)
     defaults = {name: argument.default for name, argument in inspect.signature(estimate.train).parameters.items()}
     for name in ("noise", "steps", "features", "architecture"):

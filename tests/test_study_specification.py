@@ -47,6 +47,7 @@ WRONG_SPECIFICATIONS = [
     (AIRFRAME, "[airframe.mine] is not flown"),
     ('[input]\nmine = "mine.csv"', "`input` mine is not flown; name it in `excitations`"),
     (None, "No such file"),
+    *((text, "is empty; say at least what differs") for text in ("", "# flights = 3")),
     (b"\xff\xfe\x00", "not a TOML file"),
     ("flights = ", "not a TOML file"),
     ("a = " + "[" * 5000, "spec.toml"),

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
+from typer.models import OptionInfo
 
 from ..errors import InputError, TrainingError, printable
+from . import options
 from ._jax import NO_CACHE, platform_fault, prepare
-from ._shared import check_sizes
 from .estimate import estimate, train
 from .identified import export, predict
 from .information import identifiability, inspect
@@ -22,12 +23,14 @@ _EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:
     """The command, which prepares JAX first. Its arguments are parsed before: help and mistakes need no JAX."""
+    kinds = {name: getattr(kind, "__metadata__", (None,))[0] for name, kind in command.__annotations__.items()}
 
     @functools.wraps(command)
-    def run(*args, **kwargs) -> None:
-        check_sizes(kwargs)
+    def run(**given: Any) -> None:
+        options.ASKED |= {name: value for name, value in given.items() if isinstance(kinds[name], OptionInfo)}
+        options.check_sizes()
         prepare(batch=command is study)
-        command(*args, **kwargs)
+        command(**given)
 
     return run
 
@@ -57,6 +60,7 @@ def _jaxos4(
 
 def run_command() -> int:
     """Runs the command, and prints the error that ended it. Returns the exit code."""
+    options.ASKED.clear()
     try:
         code = app(prog_name="jaxos4", standalone_mode=False) or 0
         sys.stdout.flush()
@@ -64,7 +68,7 @@ def run_command() -> int:
     except BrokenPipeError:  # the reader of our output has gone
         code, what = 1, ""
     except (InputError, OSError, TrainingError) as error:
-        code, what = 1 if isinstance(error, TrainingError) else 2, " ".join(str(error).split())
+        code, what = 1 if isinstance(error, TrainingError) else 2, options.as_typed(" ".join(str(error).split()))
         if isinstance(error, OSError) and error.filename is not None:
             what = f"{error.filename}: {error.strerror}; give a path that can be used."
         elif isinstance(error, OSError) and error.strerror:

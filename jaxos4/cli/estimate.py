@@ -3,16 +3,15 @@
 import shlex
 import time
 from pathlib import Path
-from typing import Annotated
 
 import typer
-from typer import Argument, Option
 
 import jaxos4
 
+from .._files import read_toml
 from ..errors import InputError, named, printable
-from . import _shared as options
-from ._shared import check_outputs, command, end, stages, write_json
+from . import options
+from ._shared import check_outputs, command, console, end, stages, write_json
 
 _OS4, _PUBLISHED = "os4", "published"
 # The defaults of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
@@ -20,35 +19,25 @@ NOISE, STEPS = (0.1, 10.0), 4000
 
 
 def estimate(
-    flights: Annotated[list[Path], Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
-    estimator: options.EstimatorOption = None,
-    model: Annotated[
-        options.VehicleModel | None,
-        Option(help="Equations: as published, corrected, or of a real vehicle. Default: by the log."),
-    ] = None,
-    airframe: Annotated[
-        str | None,
-        Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Default: os4; a vehicle needs one."),
-    ] = None,
-    columns: options.ColumnsOption = None,
-    bracket: options.BracketOption = None,
-    channels: options.ChannelsOption = None,
-    initial_state: options.InitialStateOption = "free",
-    window: options.WindowOption = None,
-    network: Annotated[
-        Path | None, Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
-    ] = None,
-    validate: Annotated[Path | None, Option(help="Another flight: not fitted, but predicted.")] = None,
-    terms: Annotated[str | None, Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")] = None,
-    begin: Annotated[float | None, Option("--begin", "--from", help="Real vehicle: first time to use [s].")] = None,
-    end: Annotated[float | None, Option("--end", "--to", help="Real vehicle: last time to use [s].")] = None,
-    sample_time: Annotated[float | None, Option(help="Real vehicle: the sample time to average to [s].")] = None,
-    holdout: Annotated[float | None, Option(help="Real vehicle: the share to predict; default: 0.25.")] = None,
-    report: Annotated[Path | None, Option(help="An HTML report to write.")] = None,
-    out: options.OutOption = None,
-    verbose: Annotated[
-        bool, Option("--verbose", "-v", help="Real vehicle: all parameters, noise and predictions.")
-    ] = False,
+    flights: options.Flights,
+    estimator: options.Estimator = None,
+    model: options.VehicleEquations = None,
+    airframe: options.VehicleAirframe = None,
+    columns: options.Columns = None,
+    bracket: options.Bracket = None,
+    channels: options.FittedChannels = None,
+    initial_state: options.FirstState = "free",
+    window: options.Window = None,
+    network: options.Network = None,
+    validate: options.Validate = None,
+    terms: options.Terms = None,
+    begin: options.Begin = None,
+    end: options.End = None,
+    sample_time: options.SampleTime = None,
+    holdout: options.Holdout = None,
+    report: options.Page = None,
+    out: options.Json = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Estimate the parameters of a vehicle from its logs.
 
@@ -77,7 +66,7 @@ def estimate(
             subject,
             settings=settings_for(subject, asked),
             estimator=estimator,
-            bracket=options.read_bracket(bracket),
+            bracket=bracket and read_toml(bracket),
             network=network,
             validate=None if validate is None else read_recording(validate, vehicle, columns=columns),
             progress=progress,
@@ -107,45 +96,33 @@ def _subject(
 
 def _publish(found: "jaxos4.Identification", out: Path | None, report: Path | None, *, verbose: bool) -> None:
     """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
-    from rich.console import Console
-
-    console = Console()
     if out is not None:
         write_json(found.to_dict(), out)
     if report is not None:
         with stages("drawing"):
             jaxos4.report.write_flight_page(report, found)
-    jaxos4.report.print_identification(console, found, verbose=verbose)
+    shown = console()
+    jaxos4.report.print_identification(shown, found, verbose=verbose)
     if found.is_vehicle and found.has_answer and not verbose:
-        console.print("--verbose shows all parameters, the noise, and how well rates are predicted", highlight=False)
+        shown.print("--verbose shows all parameters, the noise, and how well rates are predicted")
     if report is not None:
-        console.print(f"report: {report}", markup=False, highlight=False)
+        shown.print(f"report: {report}")
     end(found.result)
 
 
 def train(
-    flight: Annotated[Path, Argument(metavar="FLIGHT.csv", help="A flight with the inputs to train for.")],
-    out: Annotated[Path, Option(help="The network file to write.")],
-    model: options.ModelOption = "published",
-    airframe: options.AirframeOption = "os4",
-    bracket: options.BracketOption = None,
-    initial_state: options.InitialStateOption = "free",
-    features: Annotated[options.Features, Option(help="What the network sees.")] = "score",
-    architecture: Annotated[
-        options.Architecture, Option(help="A multilayer perceptron, or CMAC: tables of weights.")
-    ] = "mlp",
-    noise: Annotated[
-        tuple[float, float],
-        Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
-    ] = NOISE,
-    channels: Annotated[
-        options.Channels | None,
-        Option(
-            help="The channels that the network sees. Default: the rates, and the attitude if a rate was not measured."
-        ),
-    ] = None,
-    steps: Annotated[int, Option(help="Number of training steps.")] = STEPS,
-    seed: options.SeedOption = 0,
+    flight: options.TrainedFlight,
+    out: options.NetworkOut,
+    model: options.Equations = "published",
+    airframe: options.Airframe = "os4",
+    bracket: options.Bracket = None,
+    initial_state: options.FirstState = "free",
+    features: options.SeenFeatures = "score",
+    architecture: options.NetworkKind = "mlp",
+    noise: options.TrainedNoise = NOISE,
+    channels: options.SeenChannels = None,
+    steps: options.Steps = STEPS,
+    seed: options.Seed = 0,
 ) -> None:
     """Train a network for the inputs of a flight.
 
@@ -156,22 +133,17 @@ def train(
         from ..models import MODELS
         from ..recording import read_recording
 
-        with named("options"):
+        with named(""):
             settings = jaxos4.NetworkEstimator(features=features, architecture=architecture, noise=noise, steps=steps)
         check_outputs(flight, airframe, bracket, out=out)
         progress("reading")
         subject = MODELS[model](jaxos4.load_airframe(airframe))
         recording = read_recording(flight, subject.airframe)
-    begin = time.perf_counter()
-    with stages("training the network"):
+        given = bracket and read_toml(bracket)
+        begin = time.perf_counter()
+        progress("training the network")
         network = train_network(
-            recording,
-            subject,
-            settings,
-            bracket=options.read_bracket(bracket),
-            channels=channels,
-            initial_state=initial_state,
-            seed=seed,
+            recording, subject, settings, bracket=given, channels=channels, initial_state=initial_state, seed=seed
         )
     jaxos4.save_network(network, out)
     for note in recording.notes:

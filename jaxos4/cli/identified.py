@@ -1,20 +1,18 @@
 """`jaxos4 export` and `jaxos4 predict`: an identified vehicle as a model for a simulator, and on another flight."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
-from typer import Argument, Option
 
 import jaxos4
 
 from .._files import write_file
 from ..errors import InputError
-from . import _shared as options
+from . import options
 from ._shared import (
     MANIFEST,
     check_folder,
     check_outputs,
+    command,
+    console,
     end,
     json_text,
     stages,
@@ -24,20 +22,12 @@ from ._shared import (
 
 
 def export(
-    result: Annotated[Path, Argument(metavar="RESULT.json", help="A file of `jaxos4 estimate --out`, of a vehicle.")],
-    to: Annotated[
-        options.Simulator, Option(help="MuJoCo (MJCF), RotorPy, SDF (Gazebo), drone_models (crazyflow) or URDF.")
-    ],
-    out: Annotated[
-        Path | None, Option(help="The file to write, or with --samples the folder. Default: standard output.")
-    ] = None,
-    samples: Annotated[
-        int, Option(help="Draw N vehicles from the uncertainty, one file each, with a manifest.", metavar="N")
-    ] = 0,
-    inertia_z: Annotated[
-        float | None, Option(help="Iz to use [kg m^2], as far as a rigid body can have it: for one that is a guess.")
-    ] = None,
-    seed: options.SeedOption = 0,
+    result: options.Result,
+    to: options.Target,
+    out: options.ExportOut = None,
+    samples: options.Samples = 0,
+    inertia_z: options.InertiaZ = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Write an identified vehicle for a simulator.
 
@@ -72,31 +62,30 @@ def export(
         write_file(out, written.text)
         typer.echo(f"{out}: {target.label}")
     for doubt in found.doubts:
-        typer.echo(doubt, err=True)
+        typer.echo(options.as_typed(doubt), err=True)
     for note in written.notes:
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(options.as_typed(f"note: {note}"), err=True)
     end(found.result)
 
 
 def predict(
-    result: Annotated[Path, Argument(metavar="RESULT.json", help="A vehicle: a file of `jaxos4 estimate --out`.")],
-    flight: Annotated[Path, Argument(metavar="LOG", help="The flight to predict.")],
-    columns: options.ColumnsOption = None,
-    horizon: Annotated[float, Option(help="How far ahead to predict [s].")] = 0.5,
-    sample_time: Annotated[
-        float | None, Option(help="The sample time to average to [s]. Default: that of the estimate.")
-    ] = None,
-    spacing: Annotated[float, Option(help="Time between two starts [s]; 0: from each sample.")] = 0.1,
-    seed: options.SeedOption = 0,
-    out: Annotated[Path | None, Option(help="The predictions, as netCDF (.nc) or CSV (.csv).")] = None,
-    json: Annotated[Path | None, Option(help="The errors, as JSON.")] = None,
-    figure: Annotated[Path | None, Option(help="A figure of the predictions (.svg).")] = None,
+    result: options.Result,
+    flight: options.Log,
+    columns: options.Columns = None,
+    horizon: options.Horizon = 0.5,
+    sample_time: options.AveragedTo = None,
+    spacing: options.Spacing = 0.1,
+    seed: options.Seed = 0,
+    out: options.Predictions = None,
+    json: options.Json = None,
+    figure: options.Figure = None,
+    report: options.Page = None,
 ) -> None:
     """Predict another flight with an identified vehicle.
 
     Compares the errors with those of constant rates and of a regression.
     """
-    check_outputs(result, flight, columns, out=out, json=json, figure=figure)
+    check_outputs(result, flight, columns, out=out, json=json, figure=figure, report=report)
     with stages("loading the library") as progress:
         from ..recording import read_recording
 
@@ -114,10 +103,10 @@ def predict(
             write_json(found.to_dict(), json)
         if figure is not None:
             jaxos4.report.write_prediction_figure(figure, found)
-    from rich.console import Console
-
-    console = Console()
-    jaxos4.report.print_prediction(console, found)
-    for path in filter(None, (out, json, figure)):
-        console.print(f"written: {path}", markup=False, highlight=False)
+        if report is not None:
+            jaxos4.report.write_prediction(report, found, command=command())
+    shown = console()
+    jaxos4.report.print_prediction(shown, found)
+    for path in filter(None, (out, json, figure, report)):
+        shown.print(f"written: {path}")
     end(vehicle.result)

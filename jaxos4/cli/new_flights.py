@@ -3,45 +3,16 @@
 import math
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
-from typer import Argument, Option
 
 import jaxos4
 
+from .._files import read_toml
 from ..errors import InputError, named
-from . import _shared as options
-from ._shared import check_outputs, end, stages
-
-OpenLoopModelOption = Annotated[options.Model | None, Option(help="Equations of motion. Default: published.")]
-DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
-SampleTimeOption = Annotated[float | None, Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.")]
-AccuracyOption = Annotated[
-    float | None,
-    Option(help="Wanted standard deviation [% of half a bracket]. Default: 1; with --closed-loop: 5 % of inertias."),
-]
-GustOption = Annotated[
-    float | None, Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5.")
-]
-LagOption = Annotated[float | None, Option(help="With --closed-loop: lag of the rotors [s]. Default: 0.05.")]
-DelayOption = Annotated[float | None, Option(help="With --closed-loop: delay of the commands [s]. Default: 0.01.")]
-LoadSagOption = Annotated[
-    float | None,
-    Option(help="With --closed-loop: share of a command that the battery loses for each further load of hover."),
-]
-GyroCutoffOption = Annotated[
-    float | None, Option(help="With --closed-loop: cut-off of the gyro's first-order filter [Hz]. Default: no filter.")
-]
-GyroDelayOption = Annotated[float | None, Option(help="With --closed-loop: delay of the gyro [s]. Default: 0.")]
-LogEveryOption = Annotated[
-    int | None, Option(help="With --closed-loop: runs of the controller in each sample of the log. Default: 1.")
-]
-SensorsOption = Annotated[
-    options.Sensors | None,
-    Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
-]
+from . import options
+from ._shared import check_outputs, console, end, stages
 
 # The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
 _OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": None, "noise": 0.0, "method": "euler"}
@@ -57,36 +28,26 @@ _RANGES |= {"load_sag": (0, 0.5), "gyro_cutoff": (0.1, 1e6), "gyro_delay": (0, 1
 
 
 def simulate(
-    out: Annotated[Path, Option(help="The flight file to write (CSV).")],
-    airframe: options.AirframeOption = "os4",
-    duration: DurationOption = None,
-    dt: SampleTimeOption = None,
-    seed: options.SeedOption = 0,
-    model: OpenLoopModelOption = None,
-    excitation: Annotated[options.Excitation | None, Option(help="Shape of the inputs. Default: multisine.")] = None,
-    speeds: Annotated[
-        Path | None, Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation.")
-    ] = None,
-    method: Annotated[
-        options.Method | None, Option(help="Integrator of the equations of motion. Default: euler.")
-    ] = None,
-    noise: Annotated[
-        float | None, Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
-    ] = None,
-    closed_loop: Annotated[
-        bool, Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
-    ] = False,
-    gust: GustOption = None,
-    lag: LagOption = None,
-    delay: DelayOption = None,
-    load_sag: LoadSagOption = None,
-    gyro_cutoff: GyroCutoffOption = None,
-    gyro_delay: GyroDelayOption = None,
-    log_every: LogEveryOption = None,
-    sensors: SensorsOption = None,
-    references: Annotated[
-        Path | None, Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones.")
-    ] = None,
+    out: options.FlightOut,
+    airframe: options.Airframe = "os4",
+    duration: options.Duration = None,
+    dt: options.Step = None,
+    seed: options.Seed = 0,
+    model: options.OpenLoopEquations = None,
+    excitation: options.Shape = None,
+    speeds: options.Speeds = None,
+    method: options.Integrator = None,
+    noise: options.Noise = None,
+    closed_loop: options.ClosedLoop = False,
+    gust: options.Gust = None,
+    lag: options.Lag = None,
+    delay: options.Delay = None,
+    load_sag: options.LoadSag = None,
+    gyro_cutoff: options.GyroCutoff = None,
+    gyro_delay: options.GyroDelay = None,
+    log_every: options.LogEvery = None,
+    sensors: options.Logged = None,
+    references: options.References = None,
 ) -> None:
     """Simulate a flight and write it as CSV.
 
@@ -145,49 +106,32 @@ def _open_loop(asked: dict[str, Any]) -> tuple["jaxos4.Flight", str]:
 
 
 def design(
-    out: Annotated[Path, Option(help="The CSV to write: rotor speeds; with --closed-loop: references.")],
-    result: Annotated[
-        Path | None,
-        Argument(metavar="[RESULT.json]", help="A vehicle: a file of `jaxos4 estimate --out`. With it, --closed-loop."),
-    ] = None,
-    airframe: options.AirframeOption = _PRESET,
-    closed_loop: Annotated[
-        bool, Option("--closed-loop", help="References for a real vehicle, which flies under its controller.")
-    ] = False,
-    model: OpenLoopModelOption = None,
-    duration: DurationOption = None,
-    dt: SampleTimeOption = None,
-    slowest: Annotated[float | None, Option(help="Slowest rotor speed [rad/s].")] = None,
-    fastest: Annotated[float | None, Option(help="Fastest rotor speed [rad/s].")] = None,
-    slew: Annotated[float | None, Option(help="Fastest change of a rotor speed [rad/s^2].")] = None,
-    angle: Annotated[
-        float | None, Option(help="Largest angle [rad]; with --closed-loop: of the references, by default 0.3.")
-    ] = None,
-    rate: Annotated[float | None, Option(help="Largest body rate [rad/s].")] = None,
-    velocity: Annotated[float | None, Option(help="Largest velocity [m/s].")] = None,
-    distance: Annotated[float | None, Option(help="Largest distance from the start [m].")] = None,
-    bandwidth: Annotated[
-        float | None, Option(help="Highest frequency [Hz]. Default: 4; with --closed-loop: 6.")
-    ] = None,
-    bracket: options.BracketOption = None,
-    channels: Annotated[options.Channels | None, Option(help="Channels that will be measured. Default: all.")] = None,
-    initial_state: Annotated[
-        options.InitialState | None, Option(help="free: estimated too; known: as the first sample. Default: free.")
-    ] = None,
-    criterion: Annotated[
-        options.Criterion | None,
-        Option(
-            help="A: the mean squared bound; D: the volume of the confidence ellipsoid; worst: the largest bound. "
-            "Default: A; with --closed-loop: D."
-        ),
-    ] = None,
-    accuracy: AccuracyOption = None,
-    gust: GustOption = None,
-    lag: LagOption = None,
-    delay: DelayOption = None,
-    sensors: SensorsOption = None,
-    figure: Annotated[Path | None, Option(help="SVG file: what to fly, and the bounds over time.")] = None,
-    seed: options.SeedOption = 0,
+    out: options.DesignOut,
+    result: options.Designed = None,
+    airframe: options.Airframe = _PRESET,
+    closed_loop: options.ClosedLoop = False,
+    model: options.OpenLoopEquations = None,
+    duration: options.Duration = None,
+    dt: options.Step = None,
+    slowest: options.Slowest = None,
+    fastest: options.Fastest = None,
+    slew: options.Slew = None,
+    angle: options.Angle = None,
+    rate: options.Rate = None,
+    velocity: options.Velocity = None,
+    distance: options.Distance = None,
+    bandwidth: options.Bandwidth = None,
+    bracket: options.Bracket = None,
+    channels: options.MeasuredChannels = None,
+    initial_state: options.DesignedFirstState = None,
+    criterion: options.BestBy = None,
+    accuracy: options.Accuracy = None,
+    gust: options.Gust = None,
+    lag: options.Lag = None,
+    delay: options.Delay = None,
+    sensors: options.Logged = None,
+    figure: options.Figure = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Design the most informative flight within limits.
 
@@ -205,14 +149,12 @@ def design(
         found = _find(asked, progress)
         progress("writing")
         found.task.write(found.designed, out)
-    from rich.console import Console
-
     from ..report.design import print_design, write_design
 
     if figure is not None:
         with stages("drawing"):
             write_design(found, asked["accuracy"] / 100, figure)
-    print_design(Console(highlight=False), found, asked["accuracy"] / 100)
+    print_design(console(), found, asked["accuracy"] / 100)
     samples = f"{found.designed.inputs.shape[0]} samples of {asked['dt']:g} s"
     kind, seconds = found.task.kind if closed_loop else f"{asked['model']} model", time.perf_counter() - begin
     typer.echo(f"{out}: {samples}, {kind}, criterion {found.task.criterion}, {seconds:.0f} s")
@@ -229,7 +171,7 @@ def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "jaxos4.Des
         duration=asked["duration"], dt=asked["dt"], bandwidth=asked["bandwidth"], key=asked["seed"]
     )
     settings |= {"criterion": asked["criterion"], "compare": True, "progress": progress}
-    intervals = options.read_bracket(asked["bracket"])
+    intervals = asked["bracket"] and read_toml(asked["bracket"])
     if asked["closed_loop"]:
         loop = make_loop(asked)
         settings |= options.given(angle=limits.pop("angle"))

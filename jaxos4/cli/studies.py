@@ -1,27 +1,27 @@
 """`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
 
-import shlex
 import time
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
-from typer import Argument, Option
 
 import jaxos4
 
 from .._files import write_file
 from .._xla import add_flags
-from ..errors import InputError, in_words, printable
-from ._shared import ESTIMATORS, check_outputs, stages
+from ..errors import InputError, in_words
+from ..estimators import ESTIMATORS
+from . import options
+from ._shared import check_outputs, command, console, stages
 
 
 def study(
-    specification: Annotated[Path, Argument(metavar="SPEC.toml", help="The specification of the study.")],
-    out: Annotated[Path, Option(help="Folder of the study: a new one, or one to resume.")],
-    dry_run: Annotated[bool, Option("--dry-run", help="Only show the plan.")] = False,
-    scheduler: Annotated[str | None, Option(help="Address of a Dask scheduler. Default: this machine.")] = None,
+    specification: options.Specification,
+    out: options.StudyOut,
+    dry_run: options.DryRun = False,
+    scheduler: options.Scheduler = None,
 ) -> None:
     """Run a noise study, or resume it.
 
@@ -54,13 +54,11 @@ def run_with_bar(wanted: "jaxos4.study.Study", out: Path, *, device: str | None 
 
 
 def _print_plan(wanted: "jaxos4.study.Study", out: Path) -> None:
-    from rich.console import Console
-
     from ..report.text import Listing
 
     rows = jaxos4.study.plan(wanted, out)
     table = [(estimator, *map(str, counts)) for estimator, counts in rows.items()]
-    Listing(("estimator", "cells", "flights"), table, ("cells", "flights")).print_on(Console(highlight=False))
+    Listing(("estimator", "cells", "flights"), table, ("cells", "flights")).print_on(console())
     cells, flights = (sum(column) for column in zip(*rows.values(), strict=True))
     device = jaxos4.study.device_name()
     typer.echo(f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device}.")
@@ -79,12 +77,7 @@ def _connected(address: str):
 
 
 def report(
-    source: Annotated[Path, Argument(metavar="SOURCE", help="The folder of a study, or a file of `estimate --out`.")],
-    out: Annotated[Path | None, Option(help="Of a file: the page to write. Default: beside it, as .html.")] = None,
-    csv: Annotated[
-        Path | None, Option(help="Of a study: errors, bounds, efficiency and coverage as a table (CSV).")
-    ] = None,
-    pdf: Annotated[bool, Option("--pdf", help="Of a study: the figures as PDF too.")] = False,
+    source: options.Reported, out: options.PageOut = None, csv: options.Csv = None, pdf: options.Pdf = False
 ) -> None:
     """Make the page of a result, or the report of a study.
 
@@ -127,15 +120,10 @@ def report(
 
 
 def compare(
-    results: Annotated[
-        list[Path] | None,
-        Argument(
-            metavar="[RESULT.json...]", help="Files of `estimate --out` to compare. Without them: all estimators."
-        ),
-    ] = None,
-    page: Annotated[Path | None, Option("--report", help="With results: an HTML page to write.")] = None,
-    out: Annotated[Path | None, Option(help="The folder to write. Default: comparison, or comparison-quick.")] = None,
-    quick: Annotated[bool, Option("--quick", help="Only body rates, 128 flights and four estimators.")] = False,
+    results: options.Compared = None,
+    report: options.Page = None,
+    out: options.ComparisonOut = None,
+    quick: options.Quick = False,
 ) -> None:
     """Compare results of repeated flights, or all estimators.
 
@@ -144,8 +132,8 @@ def compare(
     if results:
         if quick or out is not None:
             raise InputError(f"{'--quick' if quick else '--out'}: is for a comparison of estimators; leave it out.")
-        _compare_results(results, page)
-    elif page is not None:
+        _compare_results(results, report)
+    elif report is not None:
         raise InputError("--report: is for a comparison of results; give the files of `jaxos4 estimate --out`.")
     else:
         _compare_estimators(out, quick=quick)
@@ -155,15 +143,12 @@ def _compare_results(results: list[Path], page: Path | None) -> None:
     """Exit code 1 if the results differ."""
     check_outputs(*results, report=page)
     with stages("loading the library") as progress:
-        from rich.console import Console
-
         progress("reading")
         found = jaxos4.compare_results(results)
         if page is not None:
             progress("drawing")
-            command = shlex.join(["jaxos4", "compare", *map(str, results), "--report", str(page)])
-            jaxos4.report.write_comparison(page, found, command=printable(command))
-    jaxos4.report.print_comparison(Console(), found)
+            jaxos4.report.write_comparison(page, found, command=command())
+    jaxos4.report.print_comparison(console(), found)
     if page is not None:
         typer.echo(f"report: {page}")
     if found.different:
@@ -175,8 +160,6 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
     add_flags(brief=quick)
     with stages("loading the library"):
-        from rich.console import Console
-
         from ..report.study_tables import count_outcomes
         from ..report.text import print_whole
 
@@ -184,7 +167,7 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     dataset = run_with_bar(comparison(quick=quick), directory)
     with stages("drawing"):
         page, *_ = jaxos4.report.write_report(dataset, directory)
-    print_whole(Console(highlight=False), jaxos4.report.error_table(dataset))
+    print_whole(console(), jaxos4.report.error_table(dataset))
     typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")
 

@@ -5,7 +5,11 @@ from .identification_page import (
 )
 from .log_page import write_log_page as write_log_page
 from .plots import Plots as Plots
-from .prediction import print_prediction as print_prediction, write_prediction_figure as write_prediction_figure
+from .prediction import (
+    print_prediction as print_prediction,
+    write_prediction as write_prediction,
+    write_prediction_figure as write_prediction_figure,
+)
 from .study_page import write_report as write_report
 from .study_tables import error_csv as error_csv, error_table as error_table
 from .terminal import (

@@ -4,18 +4,17 @@ import math
 import os
 from collections.abc import Iterator
 
-import numpy as np
+from markupsafe import Markup
 from rich.console import Console
 
-from .._files import check_writable, write_file
 from ..airframe import INERTIAS
 from ..comparison import ComparedQuantity, Comparison
 from ..identification.verdict import ADVICE, RESERVED, STATUSES, headline
 from ..logs.table import counted
-from .page import Folded, Part, Picture, Row, Section, Table, Text, number, page, span
+from .page import Section, folded, picture, table, text, write_page
 from .panels import Band, Figure, Line, Panel, Scale, across
 from .style import BOUND_DASHES, FAINT, INK, Style, style
-from .text import DASH, Listing, plain, say
+from .text import DASH, Listing, plain, say, span, with_unit
 
 
 def print_comparison(console: Console, found: Comparison) -> None:
@@ -28,27 +27,16 @@ def print_comparison(console: Console, found: Comparison) -> None:
     say(console, agreement(found))
     count, rows = len(found.names), []
     for each in found.quantities:
-        low, high = map(plain, each.ci95)
-        interval = DASH if math.isnan(each.value) else f"{low} to {high}"
-        unit = "" if each.unit == "1" else each.unit
-        rows.append(
-            (
-                each.name,
-                f"{sum(each.used)} of {count}",
-                plain(each.value),
-                interval,
-                unit,
-                plain(each.p, 2),
-                *judged(found, each),
-            )
-        )
+        interval, unit = DASH if math.isnan(each.value) else span(each.ci95, 3), "" if each.unit == "1" else each.unit
+        values = f"{sum(each.used)} of {count}", plain(each.value), interval, unit, plain(each.p, 2)
+        rows.append((each.name, *values, *judged(found, each)))
     headings = ("quantity", "used", "pooled", "95 % interval", "unit", "p", "agreement", "pooled value")
     Listing(headings, rows, ("used", "pooled", "p")).print_on(console)
     shown = [each for each in found.quantities if each.unit == "kg m^2" or each in found.different]
     for each in shown:
         rows = list(quantity_cells(found, each))
-        headings = (f"{each.name} [{each.unit}]", "estimate", "95 % interval")
-        Listing(headings, [row[:-1] for row in rows], ("estimate",), [row[-1] for row in rows]).print_on(console)
+        headings = (with_unit(each.name, each.unit), "estimate", "95 % interval", "note")
+        Listing(headings, rows, ("estimate",)).print_on(console)
     for place, (name, flights) in enumerate(zip(found.names, found.flights, strict=True), start=1):
         say(console, f"result {place}: {name}, of {flights}")
     of_inertias = [reason for reason in found.reasons if reason.startswith(INERTIAS)]
@@ -56,7 +44,7 @@ def print_comparison(console: Console, found: Comparison) -> None:
         say(console, f"{reason}.")
     if len(of_inertias) < len(found.reasons):
         others = counted(len(found.reasons) - len(of_inertias), "reason")
-        say(console, f"{others} about other quantities: on the page of --report")
+        say(console, f"{others} about other quantities: on the page")
     for note in found.notes:
         say(console, f"note: {note}")
     say(console, f"p: the probability that results of one value scatter this much or more. {SHARED}")
@@ -92,10 +80,9 @@ def quantity_cells(found: Comparison, each: ComparedQuantity) -> Iterator[tuple[
         if answer is None:
             yield name, DASH, "", "not estimated"
             continue
-        low, high = map(plain, answer.ci95)
         status = "" if answer.verdict is None else ADVICE[answer.verdict.status]
         said = status if used or not answer.trusted else "no interval"
-        yield name, plain(answer.value), f"{low} to {high}", said if used else f"not counted: {said}"
+        yield name, plain(answer.value), span(answer.ci95, 3), said if used else f"not counted: {said}"
     if math.isfinite(each.reference):
         yield "airframe's file", plain(each.reference), "", ""
 
@@ -127,58 +114,52 @@ def forest(found: Comparison, look: Style) -> Figure:
                 marks += [across([place], *([end] for end in row.ci95), color=color, width=1.8 if used else 1.2)]
                 marks += [Line([row.value], [place], color, 0, marker="o", size=6, hollow=not used)]
                 marks += [Line([], [], color, 1.8, marker="o", hollow=not used, name=name)]
-        unit = "" if each.unit == "1" else f" [{each.unit}]"
-        title = f"{each.name}{unit}{': differ' if each in found.different else ''}"
+        title = with_unit(each.name, each.unit) + ": differ" * (each in found.different)
         panels.append(Panel(title, marks, x, y, height=70 + 20 * count))
     return Figure("forest", panels)
 
 
 def write_comparison(path: str | os.PathLike[str], found: Comparison, *, command: str = "") -> None:
     """Writes the page of a comparison, completely or not at all. `command`: that makes it again. Raises `OSError`."""
-    check_writable(path)
-    said, count = " ".join(headline(found.statuses).values()), len(found.reasons)
-    top: list[Part] = [Text(f"{said} {agreement(found)}", f"verdict{' warning' if found.different else ''}")]
+    count = len(found.reasons)
+    said = f"{' '.join(headline(found.statuses).values())} {agreement(found)}"
+    top = [text(said, f"verdict{' warning' if found.different else ''}")]
     if count:
-        lines = Text([f"{line}." for line in found.reasons])
-        top.append(Folded(f"{count} reason{'s' if count > 1 else ''}", [lines], id="reasons"))
-    if found.notes:
-        top.append(Text([f"{note}." for note in found.notes], id="notes"))
-    top.append(Text(found.next_flight[0].upper() + found.next_flight[1:], id="next"))
-    sections = [
-        Section("forest", "Each quantity in each result", _forest(found), "Figure"),
-        Section("pooled", "Pooled values", [_pooled(found)], "Pooled"),
-        Section("each", "Each result", [_each(found)], "Each result"),
-    ]
-    about = (
-        f"The same quantities in {len(found.names)} results, each with its 95 % interval; whether the results agree, "
-        "and their pooled value."
-    )
-    text = page(
+        lines = text([f"{line}." for line in found.reasons])
+        top.append(folded(f"{count} reason{'s' if count > 1 else ''}", lines, id="reasons"))
+    top.append(text([f"{note}." for note in found.notes], id="notes"))
+    top.append(text(found.next_flight[0].upper() + found.next_flight[1:], id="next"))
+    write_page(
+        path,
         title=f"{len(found.names)} results compared",
-        about=about,
+        about=f"The same quantities in {len(found.names)} results, each with its 95 % interval; whether the results "
+        "agree, and their pooled value.",
         top=top,
-        sections=sections,
+        sections=[
+            Section("forest", "Each quantity in each result", _forest(found), "Figure"),
+            Section("pooled", "Pooled values", [_pooled(found)], "Pooled"),
+            Section("each", "Each result", [_each(found)], "Each result"),
+        ],
         command=command,
         provenance=[(f"result {place}", name) for place, name in enumerate(found.names, start=1)],
     )
-    write_file(path, text)
 
 
-def _forest(found: Comparison) -> list[Part]:
+def _forest(found: Comparison) -> list[Markup]:
     if not any(any(each.answers) for each in found.quantities):
         return []
     of = enumerate(zip(found.names, found.flights, strict=True), start=1)
     caption = f"{'; '.join(f'{place}: {name}, of {flights}' for place, (name, flights) in of)}."
-    return [Picture(forest(found, style(0)), f"Each quantity in each result, with 95 % intervals. {caption}")]
+    return [picture(forest(found, style(0)), f"Each quantity in each result, with 95 % intervals. {caption}")]
 
 
-def _pooled(found: Comparison) -> Part:
+def _pooled(found: Comparison) -> Markup:
     rows = []
     for each in found.quantities:
-        ends = span(each.ci95) if np.isfinite(each.value) else ""
+        ends = span(each.ci95) if math.isfinite(each.value) else ""
         used = f"{sum(each.used)} of {len(found.names)}"
-        tested = number(each.chi2, 3), number(each.p, 2)
-        rows.append(Row.of(each.name, each.unit, used, number(each.value), ends, *tested, *judged(found, each)))
+        tested = plain(each.chi2), plain(each.p, 2)
+        rows.append((each.name, each.unit, used, plain(each.value, 4), ends, *tested, *judged(found, each)))
     note = (
         "The mean of the results that count, weighted by 1 / variance. p: the probability that results of one value "
         "scatter this much or more (chi-squared). If they scatter more than their intervals say, the pooled interval "
@@ -186,16 +167,11 @@ def _pooled(found: Comparison) -> Part:
         f"{100 * found.level:g} % of comparisons. {SHARED}"
     )
     headings = ("quantity", "unit", "used", "pooled", "95 % interval", "chi²", "p", "agreement", "pooled value")
-    return Table("pooled-table", "Pooled value of each quantity", headings, [("", rows)], [note], wide=True)
+    return table("pooled-table", "Pooled value of each quantity", headings, rows, [note])
 
 
-def _each(found: Comparison) -> Part:
-    groups = [
-        (
-            each.name if each.unit == "1" else f"{each.name} [{each.unit}]",
-            [Row.of(*cells) for cells in quantity_cells(found, each)],
-        )
-        for each in found.quantities
-    ]
-    headings = ("result", "estimate", "95 % interval", "note")
-    return Table("each-table", "Each quantity in each result", headings, groups)
+def _each(found: Comparison) -> Markup:
+    rows: list[str | tuple[str, ...]] = []
+    for each in found.quantities:
+        rows += [with_unit(each.name, each.unit), *quantity_cells(found, each)]
+    return table("each-table", "Each quantity in each result", ("result", "estimate", "95 % interval", "note"), rows)

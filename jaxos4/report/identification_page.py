@@ -3,26 +3,23 @@
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
+from markupsafe import Markup
 
-from .._files import check_writable, write_file
-from .._templates import templates
 from ..airframe import INERTIAS
 from ..errors import printable
-from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification
 from ..identification.verdict import headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from . import identification_figures as figures
 from .identification_signals import BAND, identified_signals
-from .page import Entry, Part, Picture, Row, Section, Signals, Table, Text, number, page, span
+from .page import Section, picture, signals, table, template, text, write_page
 from .style import Style, styles
-from .terminal import quantity_rows, warning_lines, why_no_value
-from .text import DASH, plain
+from .terminal import next_lines, notes_of, quantity_rows, share, warning_lines, why_no_value
+from .text import DASH, plain, span
 
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
@@ -34,17 +31,16 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
 
     `title`: by default the names of the logs.
     """
-    check_writable(path)
     look, used = styles([found.estimator])[found.estimator], found.provenance
     cost = "" if found.cost is None else f", cost {plain(found.cost)}"
     how = f"{found.estimator}, {found.model} model, {found.result.replace('_', ' ')}, {found.rollouts} rollouts"
-    top: list[Part] = [Text(verdict(found), "verdict" if found.successful else "verdict warning")]
-    top += [Text(lines, "verdicts") for lines in [warning_lines(found)] if lines]
-    top += [Text(each[0].upper() + each[1:], id="next") for each in _next(found)]
-    signals, notes = _signals(found, look), [*used.notes, *filter(None, [found.motor_clock])]
+    top = [text(verdict(found), "verdict" if found.successful else "verdict warning")]
+    top.append(text(warning_lines(found)))
+    top += [text(each[0].upper() + each[1:], id="next") for each in next_lines(found)]
+    drawn, notes = _signals(found, look), notes_of(found)
     sections = [
         Section("quantities", "Physical quantities", _quantities(found), "Quantities"),
-        Section("predictions", "Measured, predicted, residual", [*signals, Text(notes)] if signals else (), "Signals"),
+        Section("predictions", "Measured, predicted, residual", drawn and [*drawn, text(notes)], "Signals"),
         Section("vehicle", "Identified vehicle", [_vehicle(found, look)], "Vehicle"),
         Section("sample-times", "Moment of inertia against sample time", _sample_times(found, look)),
         Section("estimates", "Parameters", [_parameters(found)], "Parameters"),
@@ -55,33 +51,37 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         Section("skills", "Skill of predictions", _skill(found), "Skill"),
         Section("responses", "Frequency response", _response(found, look), "Response"),
     ]
-    text = page(
+    write_page(
+        path,
         title=title or ", ".join(printable(Path(name).name) for name in found.logs),
         about=f"Parameters of a quadrotor from its recorded flights: {how}, {plain(found.seconds)} s{cost}.",
         top=top,
         sections=sections,
+        end=[] if drawn else [text(notes)],
         command=used.command or "",
-        notes=() if signals else notes,
         provenance=[
-            (name.replace("_", " "), _text(x))
+            (
+                name.replace("_", " "),
+                x if isinstance(x, str) else DASH if x is None else json.dumps(x, ensure_ascii=False),
+            )
             for name, x in msgspec.to_builtins(used).items()
             if name not in _ELSEWHERE
         ],
+        has_signals=bool(drawn),
     )
-    write_file(path, text)
 
 
-def _quantities(found: Identification) -> list[Part]:
+def _quantities(found: Identification) -> list[Markup]:
     p = found.rigid_body.consistency_p
     tested = [] if p is None else [f"Test whether the alphas are those of one rigid body: p = {plain(p, 2)}."]
-    rows = [Row.of(name, unit, value, ends, note) for (name, value, ends, unit), note in quantities(found)]
+    rows = [(name, unit, value, ends, note) for name, value, ends, unit, note in quantities(found)]
     headings = ("quantity", *_ESTIMATE, "note")
     caption = "Estimates with their 95 % intervals"
-    return [Table("quantities-table", caption, headings, [("", rows)], tested)] if rows else []
+    return [table("quantities-table", caption, headings, rows, tested)]
 
 
-def _signals(found: Identification, look: Style) -> list[Part]:
-    if not (signals := identified_signals(found, look)):
+def _signals(found: Identification, look: Style) -> list[Markup]:
+    if not (drawn := identified_signals(found, look)):
         return []
     words = "Dashes: measured; line: predicted; horizontal: time [s], without gaps. "
     if found.predictions is not None:
@@ -97,21 +97,21 @@ def _signals(found: Identification, look: Style) -> list[Part]:
         )
     elif found.fit:
         words += "The flight is simulated from its first sample with the estimated parameters, so that errors add up."
-    return [Signals(signals, words, choice="Show")]
+    return [signals(drawn, words, choice="Show")]
 
 
-def _vehicle(found: Identification, look: Style) -> Part:
+def _vehicle(found: Identification, look: Style) -> Markup:
     center = centers_of_mass(found)
     where = [f"{x.axis} {plain(1e3 * x.value)} ± {plain(NINETY_FIVE * (1e3 * x.std), 2)} mm" for x in center]
     known = f"{', '.join(where)} (95 %), if all rotors are alike" if center else "not estimated"
-    return Picture(
+    return picture(
         figures.vehicle(found.airframe, found.rigid_body.constants, center, look),
         "Left: rotors with their number and the direction in which they turn; the cross: centre of mass, "
         f"{known}. Right: moments of inertia.",
     )
 
 
-def _sample_times(found: Identification, look: Style) -> list[Part]:
+def _sample_times(found: Identification, look: Style) -> list[Markup]:
     if not found.sample_times:
         return []
     figure = figures.inertias_by_sample_time(found.sample_times, found.provenance.sample_time, look)
@@ -119,38 +119,37 @@ def _sample_times(found: Identification, look: Style) -> list[Part]:
         "The same flight, fitted with several sample times. Short samples contain the vibration of the sensors, long "
         "samples hide motion. A moment of inertia that depends on the sample time is not to be trusted."
     )
-    return [Picture(figure, caption)]
+    return [picture(figure, caption)]
 
 
-def _parameters(found: Identification) -> Part:
-    rows = [
-        Row.of(name, x.unit, number(x.estimate), span(x.ci95), number(x.bound, 2), x.note)
-        for name, x in found.parameters.items()
-    ]
-    rows += [
-        Row.of(name, x.unit, number(x.value), "", "", f"fixed: {x.note}", reference=True)
-        for name, x in found.held.items()
-    ]
+def _parameters(found: Identification) -> Markup:
+    rows: list[str | tuple[str, ...]] = []
+    for name, x in found.parameters.items():
+        within = f"\nbracket {span(x.bracket)}" if x.bracket else ""
+        rows.append((name, x.unit, plain(x.estimate, 4), span(x.ci95) + within, plain(x.bound, 2), x.note))
+    for why in dict.fromkeys(x.note for x in found.held.values()):
+        of_why = {name: x for name, x in found.held.items() if x.note == why}
+        rows += [f"fixed: {why}", *((name, x.unit, plain(x.value, 4), "", "", "") for name, x in of_why.items())]
     note = (
         "Bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found. A dash: not "
-        "identifiable. Fixed: not estimated, but kept at this value; the note says why."
+        "identifiable. Fixed: not estimated, but kept at this value."
     )
     if found.widened:
         factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
         note += f" Parts of the flights disagree, so that these intervals were widened by the factor: {factors}."
     headings = ("parameter", *_ESTIMATE, "bound", "note")
-    return Table("parameters", "Estimated parameters, then fixed parameters", headings, [("", rows)], [note])
+    return table("parameters", "Estimated parameters, then fixed parameters", headings, rows, [note])
 
 
-def _posteriors(found: Identification, look: Style) -> list[Part]:
-    parts: list[Part] = []
+def _posteriors(found: Identification, look: Style) -> list[Markup]:
+    parts = []
     if (figure := figures.priors(found, look)) is not None:
         prior = " The bracket is the prior: its half-width is one standard deviation." if found.is_vehicle else ""
         caption = (
             "An interval as long as its bracket means that the flight adds nothing; one at an end or outside, that the "
             f"bracket may be wrong.{prior}"
         )
-        parts.append(Picture(figure, caption))
+        parts.append(picture(figure, caption))
     if found.covariance is not None and len(found.covariance) > 1:
         pairs = ", ".join(f"{one} and {other} ({value:.2f})" for one, other, value in figures.strongest(found))
         most = f" Strongest: {pairs}. This flight cannot separate such parameters." if pairs else ""
@@ -158,18 +157,18 @@ def _posteriors(found: Identification, look: Style) -> list[Part]:
             "Correlations of the estimates: marks as large as the correlation. A name stands at the end of its row, "
             f"and where its column begins.{most}"
         )
-        parts.append(Picture(figures.correlation_matrix(found, look), caption))
+        parts.append(picture(figures.correlation_matrix(found, look), caption))
     return parts
 
 
-def _residuals(found: Identification) -> list[Part]:
-    parts: list[Part] = []
+def _residuals(found: Identification) -> list[Markup]:
+    parts = []
     if found.fit:
         headings = ("channel", "unit", "fit [%]", "RMS", "level", "neighbours", "p, white", "p, inputs")
         rows = [
-            Row.of(
-                *(name, x.unit, number(x.percent, 3), number(x.rms, 3), number(x.level, 3)),
-                *(number(each, 2) for each in (x.correlation, x.white_p, x.input_p)),
+            (
+                *(name, x.unit, plain(x.percent, 3), plain(x.rms, 3), plain(x.level, 3)),
+                *(plain(each, 2) for each in (x.correlation, x.white_p, x.input_p)),
             )
             for name, x in found.fit.items()
         ]
@@ -177,7 +176,7 @@ def _residuals(found: Identification) -> list[Part]:
             "Fit: 100 is a perfect prediction, 0 as good as the mean. Level: mean square of the residuals over that of "
             "the noise. p: the probability of such residuals if the model is right."
         )
-        parts.append(Table("fit", "Fit of each channel", headings, [("", rows)], [note]))
+        parts.append(table("fit", "Fit of each channel", headings, rows, [note]))
     if found.correlations is not None:
         what = (
             "Residual: measured minus one-step prediction. The controller reacts to residuals, so that correlations at "
@@ -190,19 +189,19 @@ def _residuals(found: Identification) -> list[Part]:
             "roll, pitch and yaw, at a positive lag before the residual. "
         )
         figure = figures.residual_figure(found.correlations)
-        parts.append(Picture(figure, caption + what))
+        parts.append(picture(figure, caption + what))
     return parts
 
 
-def _path(found: Identification, look: Style) -> list[Part]:
+def _path(found: Identification, look: Style) -> list[Markup]:
     if found.traces is None or not np.isfinite(found.traces.position).any():
         return []
-    return [Picture(figures.path(found.traces, look), "The path of the vehicle, with one scale on both axes.")]
+    return [picture(figures.path(found.traces, look), "The path of the vehicle, with one scale on both axes.")]
 
 
-def _disturbances(found: Identification) -> list[Part]:
+def _disturbances(found: Identification) -> list[Markup]:
     rows = [
-        Row.of(name, x.unit, *(number(each, 2) for each in (x.strength, x.correlation_time, x.sensor)))
+        (name, x.unit, *(plain(each, 2) for each in (x.strength, x.correlation_time, x.sensor)))
         for name, x in found.disturbances.items()
     ]
     headings = ("channel", "unit", "strength", "correlation time [s]", "sensor noise [rad/s, m/s²]")
@@ -211,22 +210,19 @@ def _disturbances(found: Identification) -> list[Part]:
         "parameters, because the controller reacts to it."
     )
     caption = "Disturbances of each channel, which the model does not explain"
-    return [Table("disturbances-table", caption, headings, [("", rows)], [note])] if rows else []
+    return [table("disturbances-table", caption, headings, rows, [note])]
 
 
-def _skill(found: Identification) -> list[Part]:
+def _skill(found: Identification) -> list[Markup]:
     if (skill := found.skill) is None:
         return []
-    groups = []
+    rows: list[str | tuple[str, ...]] = []
     for name, rate in (("p", skill.p), ("q", skill.q), ("r", skill.r)):
-        rows = []
+        rows.append(name)
         for i, horizon in enumerate(skill.horizons):
-            std = "" if rate.std[i] is None else f"± {_share(rate.std[i])}"
-            sizes = number(rate.rmse[i], 3), number(rate.persistence[i], 3)
-            rows.append(
-                Row.of(plain(horizon), Entry(_share(rate.skill[i]), std), _share(rate.equation_error[i]), *sizes)
-            )
-        groups.append((name, rows))
+            std = "" if rate.std[i] is None else f"\n± {share(rate.std[i])}"
+            shares = f"{share(rate.skill[i])}{std}", share(rate.equation_error[i])
+            rows.append((plain(horizon), *shares, plain(rate.rmse[i]), plain(rate.persistence[i])))
     note = (
         "1 - (RMSE / persistence)²: 1 is perfect, 0 is as good as the assumption that rates stay constant "
         "(persistence), and below 0 is worse. ±: one standard error, estimated by leaving out a tenth of the flight at "
@@ -234,10 +230,10 @@ def _skill(found: Identification) -> list[Part]:
     )
     headings = ("ahead [s]", "skill", "equation error", "RMSE [rad/s]", "persistence [rad/s]")
     starts = f", {skill.starts} starts" if skill.starts else ""
-    return [Table("skill", f"Skill by rate and horizon{starts}", headings, groups, [note])]
+    return [table("skill", f"Skill by rate and horizon{starts}", headings, rows, [note])]
 
 
-def _response(found: Identification, look: Style) -> list[Part]:
+def _response(found: Identification, look: Style) -> list[Markup]:
     if found.response is None:
         return []
     gains = []
@@ -253,40 +249,34 @@ def _response(found: Identification, look: Style) -> list[Part]:
         "itself and the disturbance's. A gain of 2: the vehicle reacts twice as strongly as the model. A gain other "
         "than 1 shows that the model is wrong; a gain of 1 does not prove it right, because the same flight was fitted."
     )
-    figure = figures.frequency_responses(found.response, look)
-    picture = Picture(figure, caption)
-    return [Text(f"{'; '.join(gains)}."), picture]
+    return [text(f"{'; '.join(gains)}."), picture(figures.frequency_responses(found.response, look), caption)]
 
 
-def quantities(found: Identification) -> list[tuple[tuple[str, ...], str]]:
-    """The cells of each quantity, and of each moment of inertia even if it was not identified; and a note on each."""
-    every, rows = physical_quantities(found), []
-    for row, cells, note in zip(every, *quantity_rows(every), strict=True):
-        own = found.parameters.get(row.name.replace(" ", "_"))
+def quantities(found: Identification) -> list[tuple[str, ...]]:
+    """The cells of each quantity, and of each moment of inertia even if it was not identified; the last is a note."""
+    rows = []
+    for *cells, note in quantity_rows(physical_quantities(found)):
+        own = found.parameters.get(cells[0].replace(" ", "_"))
         said = dict.fromkeys([note, "" if own is None else own.note])
-        rows.append((cells, "; ".join(filter(None, said))))
-    listed = {cells[0] for cells, _ in rows}
+        rows.append((*cells, "; ".join(filter(None, said))))
+    listed = {row[0] for row in rows}
     for name, row in {} if found.is_vehicle else found.rigid_body.constants.items():
         if name not in listed:  # a J_R of -3 kg m^2 would be read as a value
             half = NINETY_FIVE * row.std
-            interval = f"{row.estimate - half:.4g} to {row.estimate + half:.4g}"
-            rows.append(((name, DASH, interval, row.unit), why_no_value(row)))
+            rows.append(
+                (name, DASH, f"{row.estimate - half:.4g} to {row.estimate + half:.4g}", row.unit, why_no_value(row))
+            )
     for name in INERTIAS:
         if name in found.verdicts and name not in listed:
-            rows.append(((name, DASH, "", "kg m^2"), found.verdicts[name].status))
-    return sorted(rows, key=lambda row: INERTIAS.index(row[0][0]) if row[0][0] in INERTIAS else len(INERTIAS))
+            rows.append((name, DASH, "", "kg m^2", found.verdicts[name].status))
+    return sorted(rows, key=lambda row: INERTIAS.index(row[0]) if row[0] in INERTIAS else len(INERTIAS))
 
 
 def identification_html(found: Identification) -> str:
     """Verdict, physical quantities and reservations, for a notebook."""
-    rows = list(zip(*quantity_rows(physical_quantities(found)), strict=True))
-    lines = [*warning_lines(found), *(f"note: {note}" for note in found.provenance.notes), *_next(found)]
-    template = templates("jaxos4.report").get_template("summary.html.j2")
-    return template.render(verdict=verdict(found), rows=rows, lines=lines)
-
-
-def _next(found: Identification) -> list[str]:
-    return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
+    lines = [*warning_lines(found), *(f"note: {note}" for note in notes_of(found)), *next_lines(found)]
+    rows = quantity_rows(physical_quantities(found))
+    return template("summary.html.j2").render(verdict=verdict(found), rows=rows, lines=lines)
 
 
 def verdict(found: Identification) -> str:
@@ -296,11 +286,3 @@ def verdict(found: Identification) -> str:
     if found.verdicts:
         return " ".join(headline(statuses_of(found.verdicts)).values())
     return "No quantity was judged." if found.successful else f"Not to be trusted: {meaning(found.result)}."
-
-
-def _text(x: Any) -> str:
-    return x if isinstance(x, str) else DASH if x is None else json.dumps(x, ensure_ascii=False)
-
-
-def _share(value: float | None) -> str:
-    return DASH if value is None else f"{value:.2f}"

@@ -1,6 +1,8 @@
 """The signals of an identification on the time axis of its page."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,14 +14,12 @@ from ..flight import STATE_NAMES, STATE_UNITS
 from ..identification.results import Identification
 from ..models.state import CASCADE_ORDER
 from .style import BOUND_DASHES, Style, style
-from .timeline import Axis, Line, Panel, View, signals, spans
+from .timeline import Axis, line, panel, signals, spans, view
 
 BAND = 0.95
 """The share of the errors that the band of the predictions holds."""
 # Channels of an OS4 that are shown together, in cascade order.
 _GROUPS = {"rates": (0, 1, 2), "attitude": (3, 4, 5), "position": (6, 8, 10), "velocity": (7, 9, 11)}
-
-Times = Float[np.ndarray, " samples"]
 
 
 def identified_signals(found: Identification, look: Style) -> str:
@@ -36,7 +36,7 @@ def identified_signals(found: Identification, look: Style) -> str:
     time, known = axis.place(traces.time, traces.log), np.asarray(np.isfinite(traces.measured).any(axis=1))
     if traces.predicted.shape[1]:
         views = [
-            View(name, time, [_panel(i, traces.measured[:, i], traces.predicted[:, i], look) for i in group])
+            view(name, time, _panels(traces.measured, traces.predicted, look, group))
             for name, group in _GROUPS.items()
             if group[0] < traces.predicted.shape[1]
         ]
@@ -48,12 +48,14 @@ def identified_signals(found: Identification, look: Style) -> str:
         shaded = spans(time, known)
         # Of the samples that were held out, the first is kept, as missing: the line breaks there.
         kept = known | np.diff(known, prepend=False)
-        before = View("", time[kept], [_panel(i, traces.measured[kept, i], None, look) for i in range(3)])
+        before = view("", time[kept], _panels(traces.measured[kept], None, look))
     else:
-        views = [View("rates", time, [_panel(i, traces.measured[:, i], None, look) for i in range(3)])]
+        views = [view("rates", time, _panels(traces.measured, None, look))]
     names = [printable(Path(name).name) for name in (*found.logs, validate)]
-    common = View("", time, _common(traces))
-    return signals(axis, [common] * bool(common.panels), views, before=before, shown=shown, shaded=shaded, names=names)
+    common = view("", time, _common(traces))
+    return signals(
+        axis, [common] * bool(common["panels"]), views, before=before, shown=shown, shaded=shaded, names=names
+    )
 
 
 def _axis(traces: Traces, ahead: Predictions | None) -> Axis:
@@ -65,39 +67,48 @@ def _axis(traces: Traces, ahead: Predictions | None) -> Axis:
     return Axis.of(time[order], log[order])
 
 
-def _panel(channel: int, measured: Times, predicted: Times | None, look: Style, half: float = 0.0) -> Panel:
-    """Measured and predicted values of a channel, counted in cascade order, and the residual below."""
-    column = CASCADE_ORDER[channel]
-    lines = [Line("measured", measured)] + ([] if predicted is None else [Line("predicted", predicted, look)])
-    return Panel(f"{STATE_NAMES[column]} [{STATE_UNITS[column]}]", lines, half, residual=predicted is not None)
+def _panels(
+    measured: Float[np.ndarray, "samples _"],
+    predicted: Float[np.ndarray, "samples _"] | None,
+    look: Style,
+    channels: Sequence[int] = (0, 1, 2),
+    half: Float[np.ndarray, " channels"] | None = None,
+) -> list[dict[str, Any]]:
+    """Measured and predicted values of channels, counted in cascade order, each with the residual below."""
+    panels = []
+    for i in channels:
+        column, lines = CASCADE_ORDER[i], [line("measured", measured[:, i])]
+        lines += [] if predicted is None else [line("predicted", predicted[:, i], look)]
+        title = f"{STATE_NAMES[column]} [{STATE_UNITS[column]}]"
+        panels.append(panel(title, lines, half=0.0 if half is None else float(half[i]), residual=predicted is not None))
+    return panels
 
 
-def _common(traces: Traces) -> list[Panel]:
+def _common(traces: Traces) -> list[dict[str, Any]]:
     """The inputs, and the disturbances of a vehicle."""
     panels = []
     if np.isfinite(traces.rotors).any():
-        rotors = [Line(f"rotor {i + 1}", column, style(i)) for i, column in enumerate(traces.rotors.T)]
-        panels.append(Panel("inputs [rad/s]", rotors))
+        rotors = [line(f"rotor {i + 1}", column, style(i)) for i, column in enumerate(traces.rotors.T)]
+        panels.append(panel("inputs [rad/s]", rotors))
     gusts = [
-        Line(name, each, style(i)) for i, (name, each) in enumerate(zip("pqr", traces.disturbance.T, strict=False))
+        line(name, each, style(i)) for i, (name, each) in enumerate(zip("pqr", traces.disturbance.T, strict=False))
     ]
     # At the ends of a log the filters err much: a few samples would hide all others.
     known = np.abs(traces.disturbance[np.isfinite(traces.disturbance)])
     reach = 1.3 * float(np.quantile(known, 0.99)) if known.size else 0.0
-    return [*panels, Panel("gusts [rad/s²]", gusts, reach=reach)] if gusts else panels
+    return [*panels, panel("gusts [rad/s²]", gusts, reach=reach)] if gusts else panels
 
 
-def _horizon(traces: Traces, ahead: Predictions, place: int, axis: Axis, look: Style) -> View:
+def _horizon(traces: Traces, ahead: Predictions, place: int, axis: Axis, look: Style) -> dict[str, Any]:
     """The predictions so far ahead. The line breaks between predictions that are not of one stretch."""
     horizon, half, breaks = float(ahead.horizons[place]), prediction_band(ahead)[place], ahead.breaks
     start = axis.place(traces.start_time + horizon, traces.start_log)
     start = np.insert(start, breaks, (start[breaks - 1] + start[breaks]) / 2)
     measured, predicted = (np.insert(x[:, place], breaks, np.nan, axis=0) for x in (ahead.measured, ahead.predicted))
-    panels = [_panel(i, measured[:, i], predicted[:, i], look, float(half[i])) for i in range(3)]
-    return View(f"{horizon:.3g} s ahead", start, panels)
+    return view(f"{horizon:.3g} s ahead", start, _panels(measured, predicted, look, half=half))
 
 
-def _trajectories(traces: Traces, ahead: Predictions, paths: Predictions, axis: Axis, look: Style) -> View:
+def _trajectories(traces: Traces, ahead: Predictions, paths: Predictions, axis: Axis, look: Style) -> dict[str, Any]:
     """The predictions from each start, of which one is chosen, beside all that was measured meanwhile."""
     place = np.searchsorted(ahead.start, paths.start)
     begin, log = traces.start_time[place], traces.start_log[place]
@@ -110,8 +121,8 @@ def _trajectories(traces: Traces, ahead: Predictions, paths: Predictions, axis: 
         np.concatenate([paths.initial[:, None], each, np.full((place.size, 1, 3), np.nan)], axis=1)[kept]
         for each in (paths.measured, paths.predicted)
     )
-    panels = [_panel(i, measured[:, i], predicted[:, i], look) for i in range(3)]
-    return View("from one start", axis.place((begin[:, None] + horizons)[kept], log[start]), panels, start)
+    time = axis.place((begin[:, None] + horizons)[kept], log[start])
+    return view("from one start", time, _panels(measured, predicted, look), start)
 
 
 def prediction_band(ahead: Predictions) -> Float[np.ndarray, "horizons 3"]:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
+from markupsafe import Markup
 
-from .._files import check_writable, write_file
+from .._files import check_writable
 from ..airframe import MOTIONS, Airframe
 from ..errors import InputError, printable
 from ..flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY, Flight
@@ -19,7 +20,7 @@ from ..recording.inspection import Inspection, inspect_log
 from ..recording.prepared import prepare
 from ..recording.stretches import Stretch, cut
 from . import timeline
-from .page import Part, Picture, Row, Section, Signals, Table, Text, number, page
+from .page import Section, picture, signals, table, text, write_page
 from .panels import Band, Figure, Line, Panel, Scale
 from .style import BOUND_DASHES, style
 from .terminal import part_rows, unit_of
@@ -70,8 +71,10 @@ def write_log_page(
     shown, block = logged(recording, found)
     label = recording.facts.format.label if recording.facts.format else "recording"
     sampled = f"{found.samples} samples, one every {plain(1e3 * found.sample_time)} ms"
-    top: list[Part] = [Text(verdict(found), f"verdict{' warning' if found.refusals else ''}")]
-    top += [Text([f"Cannot identify a vehicle: {line}." for line in found.refusals])] if found.refusals else []
+    top = [
+        text(verdict(found), f"verdict{' warning' if found.refusals else ''}"),
+        text([f"Cannot identify a vehicle: {line}." for line in found.refusals]),
+    ]
     caption = (
         "Horizontal: time [s]. Grey: not usable, for the reason in the table of parts. The options above the figure "
         "name the part that is in sight, for jaxos4 estimate."
@@ -79,64 +82,63 @@ def write_log_page(
     if block > 1:
         blocks = f"{plain(1e3 * recording.dt * block)} ms"
         caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
-    seen = Signals(shown, caption, range=True)
+    seen = signals(shown, caption, names_part=True)
     commands = recording.commanded and full == 1
     sections = [
-        Section("signals", "Logged signals", [seen, Text(fitted(recording, airframe), id="fitted")], "Signals"),
+        Section("signals", "Logged signals", [seen, text(fitted(recording, airframe), id="fitted")], "Signals"),
         Section("checks", "Failed checks", _checks(found), "Checks"),
         Section("parts", "Parts that can be used", [_parts(found)], "Parts"),
         Section("measured", "Sampling, gaps and ranges", [_measured(found, commands)], "Measured"),
         Section("motors", "Motors and their limits", _motors(flown, full), "Motors"),
         Section("spectra", "Vibration", _spectra(flown, band), "Spectra"),
     ]
-    text = page(
+    write_page(
+        path,
         title=printable(Path(recording.name).name),
         about=f"{label}, {found.begin:.2f} to {found.end:.2f} s, {sampled}. Nothing was fitted.",
         top=top,
         sections=sections,
         command=command,
-        notes=found.notes,
+        end=[text(found.notes)],
         provenance=[("log", recording.name)],
+        has_signals=True,
     )
-    write_file(path, text)
 
 
-def _checks(found: Inspection) -> list[Part]:
+def _checks(found: Inspection) -> list[Markup]:
+    status = {True: "contradicted", False: "concerned"}
     rows = [
-        Row.of(
-            *(", ".join(each.quantities), "contradicted" if each.contradicted else "concerned"),
-            *(each.cause, each.size, each.remedy),
-        )
+        (", ".join(each.quantities), status[each.contradicted], each.cause, each.size, each.remedy)
         for each in found.findings
     ]
     headings = ("quantity", "", "cause", "size", "what to do")
-    return [Table("checks-table", "Checks that found something", headings, [("", rows)], wide=True)] if rows else []
+    return [table("checks-table", "Checks that found something", headings, rows)]
 
 
-def _parts(found: Inspection) -> Part:
-    rows = [Row.of(*cells) for cells in part_rows(found, _LONGEST)]
+def _parts(found: Inspection) -> Markup:
+    rows = part_rows(found, _LONGEST)
     shorter = len(found.parts) - len(rows)
     note = (
         "Roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s]. An axis that is weak "
         f"or none is not identified by this part.{f' {shorter} shorter parts are not listed.' if shorter else ''}"
     )
     headings = ("from [s]", "to [s]", "use", *MOTIONS)
-    return Table("parts-table", "Parts of the log in order of time", headings, [("", rows)], [note])
+    return table("parts-table", "Parts of the log in order of time", headings, rows, [note])
 
 
-def _measured(found: Inspection, commands: bool) -> Part:
+def _measured(found: Inspection, commands: bool) -> Markup:
     rows = [
-        Row.of(
-            *(name, unit_of(name, commands), number(one.rate), number(1e3 * one.longest_gap, 3)),
-            *(number(one.least), number(one.most)),
+        (
+            *(name, unit_of(name, commands), plain(one.rate, 4), plain(1e3 * one.longest_gap, 3)),
+            *(plain(one.least, 4), plain(one.most, 4)),
         )
         for name, one in found.measured.items()
     ]
     headings = ("channel", "unit", "rate [Hz]", "longest gap [ms]", "least", "largest")
-    return Table("measured-table", "What was measured, and how often", headings, [("", rows)])
+    return table("measured-table", "What was measured, and how often", headings, rows)
 
 
-def _motors(flown: Sequence[Recording], full: float) -> list[Part]:
+def _motors(flown: Sequence[Recording], full: float) -> list[Markup]:
     if not flown:
         return []
     kind = "command, as a share of full scale" if full == 1 else "speed [rad/s]"
@@ -144,10 +146,10 @@ def _motors(flown: Sequence[Recording], full: float) -> list[Part]:
         f"The share of the usable time that each motor spends at each {kind}. Motors at a limit cannot answer the "
         "controller, and their parts are not used."
     )
-    return [Picture(motors(flown, full), caption)]
+    return [picture(motors(flown, full), caption)]
 
 
-def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> list[Part]:
+def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> list[Markup]:
     if not flown or (figure := spectra(flown, band)) is None:
         return []
     turns = (
@@ -158,7 +160,7 @@ def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> li
         "above is vibration; vibration above half the sampling rate folds down into the motion, and no setting removes "
         "it."
     )
-    return [Picture(figure, caption)]
+    return [picture(figure, caption)]
 
 
 def verdict(found: Inspection) -> str:
@@ -196,13 +198,13 @@ def logged(recording: Recording, found: Inspection) -> tuple[str, int]:
     time, _, block = every[0]
     values = np.hstack([fewer for _, fewer, _ in every])
     for title, _, names in groups:
-        lines = (timeline.Line(name, values[:, width + i], style(i)) for i, name in enumerate(names))
-        panels.append(timeline.Panel(title, [line for line in lines if np.isfinite(line.values).any()]))
+        columns = ((name, values[:, width + i], style(i)) for i, name in enumerate(names))
+        panels.append(timeline.panel(title, [timeline.line(*each) for each in columns if np.isfinite(each[1]).any()]))
         width += len(names)
     axis = timeline.Axis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
     begin = recording.time[0]
     shaded = [(part.begin - begin, part.end - begin) for part in found.parts if not part.usable]
-    return timeline.signals(axis, [timeline.View("", time - begin, panels)], shaded=shaded), block
+    return timeline.signals(axis, [timeline.view("", time - begin, panels)], shaded=shaded), block
 
 
 def _sensed(recording: Recording, which: Int[np.ndarray, " columns"]) -> Float[np.ndarray, "samples columns"]:
@@ -229,7 +231,7 @@ def bridged(
 def fitted(recording: Recording, airframe: Airframe | None) -> str:
     """The parts that `jaxos4 estimate` would fit and hold out, in words."""
     if airframe is None:
-        return "Give the airframe (--airframe) to see here what would be fitted, and what held out."
+        return "Give the `airframe` to see here what would be fitted, and what held out."
     if recording.commanded and not airframe.has_full_scale:
         what = "this log has commands, and the rotor speed of full command is not known"
         return f"Nothing can be fitted: {what}; set max_rotor_speed [rad/s] in the airframe's file."

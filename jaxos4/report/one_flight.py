@@ -4,13 +4,10 @@ import numpy as np
 import xarray as xr
 
 from ..study import metrics
-from .page import Entry, Row, Table
 from .panels import Figure, Line, Panel, Scale, across
-from .study_tables import names, positive_scales, scale_labels, shown_level
+from .study_tables import Rows, Table, names, positive_scales, scale_labels, shown_level
 from .style import styles
-from .text import DASH, plain
-
-_HEADINGS = ("parameter", "unit", "truth", "estimate", "interval", "bound", "error / bound")
+from .text import DASH, plain, span, with_unit
 
 
 def is_of_one(data: xr.Dataset) -> bool:
@@ -19,23 +16,25 @@ def is_of_one(data: xr.Dataset) -> bool:
 
 
 def estimates(data: xr.Dataset) -> Table:
-    """Truth, estimate, interval and bound of each parameter, in groups of one noise scale and estimator."""
-    groups, units, error = [], names(data, "unit"), metrics.normalised_error(data).isel(flight=0)
+    """Estimate, interval and bound of each estimator, in groups of one noise scale and parameter with its truth."""
+    rows: Rows = []
+    error, level = metrics.normalised_error(data), shown_level(data)
+    half = data["half_width"].sel(level=level)
+    shown = (data["estimate"], data["estimate"] - half, data["estimate"] + half, data["bound"], error)
     for i, scale in enumerate(scale_labels(data)):
-        for j, estimator in enumerate(names(data, "estimator")):
-            at, one = {"scale": i, "estimator": j}, data.isel(scale=i, estimator=j, flight=0)
-            half = one["half_width"].sel(level=shown_level(data))
-            shown = (one["truth"], one["estimate"], one["estimate"] - half, one["estimate"] + half, one["bound"])
-            rows = []
-            for k, name in enumerate(names(data, "parameter")):
-                truth, value, low, high, bound = (plain(float(each.isel(parameter=k)), 4) for each in shown)
-                ends = DASH if np.isnan(half.values[k]) else f"{low} to {high}"
-                cells = (units[k], truth, value, ends, bound, plain(float(error.isel(at | {"parameter": k})), 2))
-                rows.append(Row(name, tuple(map(Entry, cells)), j))
-            groups.append((f"{scale}, {estimator}", rows))
-    caption = f"Each estimate, its interval of {100 * shown_level(data):g} %, and the truth"
-    source = "From estimate, truth, half_width, bound, result."
-    return Table("estimates", caption, _HEADINGS, groups, [source])
+        for k, (name, unit) in enumerate(zip(names(data, "parameter"), names(data, "unit"), strict=True)):
+            at = {"scale": i, "parameter": k, "flight": 0}
+            truth = float(data["truth"].isel(at, missing_dims="ignore"))
+            rows.append(f"{with_unit(name, unit)} at {scale}, truth {plain(truth, 4)}")
+            for j, estimator in enumerate(names(data, "estimator")):
+                value, low, high, bound, ratio = (
+                    float(each.isel(at | {"estimator": j}, missing_dims="ignore")) for each in shown
+                )
+                ends = DASH if np.isnan(low) else span((low, high))
+                rows.append((estimator, plain(value, 4), ends, plain(bound, 4), plain(ratio, 2)))
+    headings = ("estimator", "estimate", "interval", "bound", "error / bound")
+    caption = f"Each estimate with its interval of {100 * level:g} %, and the truth"
+    return Table(caption, headings, rows, ["From estimate, truth, half_width, bound, result."])
 
 
 def outcomes(data: xr.Dataset) -> list[str]:

@@ -1,106 +1,18 @@
 """HTML pages that need no other file: sections of texts, tables, figures and signals."""
 
+import functools
+import os
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
+from .._files import write_file
 from .._templates import templates
 from .panels import Figure, Line
 from .style import Style
 from .svg import inline, swatch
-from .text import DASH, plain
-
-
-class Entry(NamedTuple):
-    """A number as text, with its interval and its mark."""
-
-    text: str
-    interval: str = ""
-    mark: str = ""
-
-
-class Row(NamedTuple):
-    """A row of a table: its name and its cells.
-
-    `estimator`: the number of the estimator whose row it is, which the page hides with it. `reference`: not estimated.
-    """
-
-    name: str
-    cells: Sequence[Entry]
-    estimator: int | None = None
-    reference: bool = False
-
-    @classmethod
-    def of(cls, name: str, *cells: str | Entry, reference: bool = False) -> "Row":
-        """A row of texts."""
-        return cls(name, [Entry(cell) if isinstance(cell, str) else cell for cell in cells], reference=reference)
-
-
-class Table(NamedTuple):
-    """A table. On a narrow screen each row is a card, in which headings stand above cells; if `wide`, on a tablet too.
-
-    - `headings`: of all columns, some with a unit: `"rate [Hz]"`.
-    - `groups`: rows below a name; an empty one: no group.
-    - `notes`: paragraphs below the table.
-    """
-
-    id: str
-    caption: str
-    headings: Sequence[str]
-    groups: Sequence[tuple[str, Sequence[Row]]]
-    notes: Sequence[str] = ()
-    wide: bool = False
-    kind = "table"
-
-
-class Picture(NamedTuple):
-    """A figure with its caption, whose first sentence is what a screen reader says."""
-
-    figure: Figure
-    caption: str
-    title: str = ""
-    kind = "picture"
-
-    @property
-    def drawn(self) -> Markup:
-        """The figure as SVG."""
-        return inline(self.figure, self.title or self.caption.split(". ")[0])
-
-
-class Signals(NamedTuple):
-    """Signals on a time axis, see `timeline.py`.
-
-    `choice`: the name of the list of views. `range`: whether the part in sight is named, for the command line.
-    """
-
-    signals: str
-    caption: str
-    choice: str = ""
-    range: bool = False
-    kind = "signals"
-
-
-class Text(NamedTuple):
-    """A paragraph, or a list of sentences. `look`: a class of the style sheet `page.css`."""
-
-    text: str | Sequence[str]
-    look: str = ""
-    id: str = ""
-    kind = "text"
-
-
-class Folded(NamedTuple):
-    """Parts that a click on the `summary` shows."""
-
-    summary: str
-    parts: Sequence["Part"]
-    id: str = ""
-    is_open: bool = False
-    kind = "folded"
-
-
-Part = Table | Picture | Signals | Text | Folded
+from .text import WORDED
 
 
 class Section(NamedTuple):
@@ -108,56 +20,100 @@ class Section(NamedTuple):
 
     id: str
     title: str
-    parts: Sequence[Part]
+    parts: Sequence[Markup]
     link: str = ""
     level: int = 2
 
 
-def page(
+def with_code(text: str) -> Markup:
+    """A text in which names between backticks are code."""
+    parts = str(escape(text)).split("`")
+    if len(parts) % 2 == 0:  # a backtick without its pair
+        return escape(text)
+    return Markup("".join(f"<code>{x}</code>" if i % 2 else x for i, x in enumerate(parts)))  # noqa: S704  # escaped
+
+
+@functools.cache
+def template(name: str) -> Any:
+    """A template of this folder. Its filter `code`: `with_code`."""
+    found = templates("jaxos4.report")
+    found.filters["code"], found.globals["worded"] = with_code, WORDED
+    return found.get_template(name)
+
+
+def _part(kind: str, *given: Any) -> Markup:
+    return getattr(template("parts.html.j2").module, kind)(*given)
+
+
+def table(
+    id: str,
+    caption: str,
+    headings: Sequence[str],
+    rows: Sequence[str | Sequence[str]],
+    notes: Sequence[str] = (),
+    estimators: Sequence[str] = (),
+) -> Markup:
+    """A table; nothing without rows. On a narrow screen each row is a card, in which headings stand above cells.
+
+    - `headings`: of all columns, some with a unit: `"rate [Hz]"`.
+    - `rows`: the name of each row and its cells; a text instead of a row is the name of the rows below it. The second
+      line of a cell is small.
+    - `notes`: paragraphs below the table.
+    - `estimators`: those of the page's bar, which hides the rows that have their names.
+    """
+    return _part("table", id, caption, headings, rows, notes, estimators) if rows else Markup()
+
+
+def picture(figure: Figure, caption: str, title: str = "") -> Markup:
+    """A figure with its caption, whose first sentence is what a screen reader says."""
+    return _part("picture", figure.stem, inline(figure, title or caption.split(". ")[0]), caption, title)
+
+
+def signals(drawn: str, caption: str, *, choice: str = "", names_part: bool = False) -> Markup:
+    """Signals on a time axis, see `timeline.py`.
+
+    `choice`: the name of the list of views. `names_part`: whether the part in sight is named, for the command line.
+    """
+    return _part("signals", drawn, caption, choice, names_part)
+
+
+def text(given: str | Sequence[str], look: str = "", id: str = "") -> Markup:
+    """A paragraph, or a list of sentences; nothing if there are none. `look`: a class of the style sheet `page.css`."""
+    return _part("text", given, look, id) if given else Markup()
+
+
+def folded(summary: str, *parts: Markup, id: str = "", is_open: bool = False) -> Markup:
+    """Parts that a click on the `summary` shows."""
+    return _part("folded", summary, parts, id, is_open)
+
+
+def write_page(
+    path: str | os.PathLike[str],
     *,
     title: str,
     about: str,
-    top: Sequence[Part],
+    top: Sequence[Markup],
     sections: Sequence[Section],
+    end: Sequence[Markup] = (),
     command: str = "",
-    notes: Sequence[str] = (),
     provenance: Sequence[tuple[str, str]] = (),
-    after: Sequence[Part] = (),
     estimators: dict[str, Style] | None = None,
-) -> str:
-    """A page of sections below its `title`, what it is `about`, and the parts at the `top`.
+    has_signals: bool = False,
+) -> None:
+    """Writes a page, completely or not at all: its `title`, what it is `about`, the `top`, sections, how it was made.
 
-    - `command`, `notes`, `provenance`, `after`: its end. Text: labels and values.
+    Sections without parts are left out.
+
+    - `command`, `end`, `provenance`: the last section. Provenance: labels and values.
     - `estimators`: which the bar shows and hides, instead of links to the sections.
+
+    **Raises:** `OSError`.
     """
-    samples = {
+    swatches = {
         name: Markup(swatch(Line([], [], look.color, dash=look.dash, marker=look.marker)))  # noqa: S704  # our own
         for name, look in (estimators or {}).items()
     }
-    has_signals = any(isinstance(part, Signals) for section in sections for part in section.parts)
-    return (
-        templates("jaxos4.report")
-        .get_template("page.html.j2")
-        .render(
-            title=title,
-            about=about,
-            top=top,
-            sections=[each for each in sections if each.parts],
-            command=command,
-            notes=notes,
-            provenance=provenance,
-            after=after,
-            swatches=samples,
-            has_signals=has_signals,
-        )
-    )
-
-
-def number(value: float | None, digits: int = 4) -> str:
-    """A number with so many digits, or a dash."""
-    return DASH if value is None else plain(value, digits)
-
-
-def span(ends: Sequence[float | None] | None) -> str:
-    """An interval in words; empty if there is none."""
-    return "" if ends is None else " to ".join(map(number, ends))
+    filled = [each for each in sections if any(each.parts)]
+    given = {"title": title, "about": about, "top": top, "sections": filled, "end": end, "command": command}
+    given |= {"provenance": provenance, "swatches": swatches, "has_signals": has_signals}
+    write_file(path, template("page.html.j2").render(given))

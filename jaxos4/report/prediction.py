@@ -1,4 +1,4 @@
-"""The prediction of a flight: the table that `jaxos4 predict` prints, and its figure."""
+"""The prediction of a flight: the table that `jaxos4 predict` prints, its figure, and its page."""
 
 import os
 
@@ -6,45 +6,57 @@ import numpy as np
 from rich.console import Console
 
 from .._files import write_file
+from ..analysis.prediction import decisive_horizon
 from ..forecast import QUANTITIES, FlightPrediction
 from ..rotations import euler_angles
+from .page import Section, picture, table, text, write_page
 from .panels import Band, Figure, Line, Panel, Scale
-from .style import BOUND_DASHES, style
+from .style import BOUND_DASHES, FAINT, INK, style
 from .svg import as_file
-from .text import Listing, percent, plain, say
+from .text import Listing, plain, say
+
+_LONGEST = 10.0  # s; the figure shows this much of a flight, but two horizons at least
+_HEADINGS = ("quantity", "unit", "ahead", "error", "unaware", "constant", "regression", "in band %")
+_WORDS = (
+    "error: mean absolute error; sum: over all horizons. unaware: without the disturbance that the filters know at the "
+    "start. constant: velocity and rates stay as they are. in band: inside the 95 % band."
+)
 
 
 def print_prediction(console: Console, found: FlightPrediction) -> None:
     """Prints notes, and errors by quantity: at a fifth, half and all of the horizon, and summed over all horizons."""
     for note in found.notes:
         say(console, f"note: {note}")
-    last = found.horizons.size - 1
-    places = sorted({max(round(share * (last + 1)) - 1, 0) for share in (0.2, 0.5, 1.0)})
-    rows = []
+    Listing(_HEADINGS, _rows(found), _HEADINGS[3:]).print_on(console)
+    say(console, _WORDS)
+    if found.missing:
+        say(console, f"not measured, and so not compared: {', '.join(found.missing)}.")
+    say(console, f"{found.found} predicts {found.flight}, {_size(found)}")
+
+
+def _size(found: FlightPrediction) -> str:
+    return f"{found.time.size} starts, {found.horizons.size} steps to {found.horizons[-1]:.3g} s"
+
+
+def _rows(found: FlightPrediction) -> list[tuple[str, ...]]:
+    last, rows = found.horizons.size, []
+    places = sorted({max(round(share * last) - 1, 0) for share in (0.2, 0.5, 1.0)})
     for name, quality in found.quality.items():
         row = name, QUANTITIES[name][0]
         for i in places:
-            errors = [plain(x[i]) for x in quality[:-1]]
-            rows.append((*row, f"{found.horizons[i]:.2f} s", *errors, percent(quality.coverage[i])))
+            shares = plain(100 * quality.coverage[i])
+            rows.append((*row, f"{found.horizons[i]:.2f} s", *(plain(x[i]) for x in quality[:-1]), shares))
         rows.append((*row, "sum", *(plain(x) for x in quality.sums.values()), ""))
-    errors = ("error", "unaware", "constant", "regression", "in band %")
-    Listing(("quantity", "unit", "ahead", *errors), rows, errors).print_on(console)
-    say(
-        console,
-        "error: mean absolute error; sum: over all horizons. unaware: without the disturbance that the filters know at "
-        "the start. constant: velocity and rates stay as they are. in band: inside the 95 % band.",
-    )
-    if found.missing:
-        say(console, f"not measured, and so not compared: {', '.join(found.missing)}.")
-    steps = f"{found.time.size} starts, {last + 1} steps to {found.horizons[-1]:.3g} s"
-    say(console, f"{found.found} predicts {found.flight}, {steps}")
+    return rows
 
 
-def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction, *, most: float = 10.0) -> None:
-    """Writes measured lines, and predictions with their band from starts one horizon apart, as SVG. Raises `OSError`.
+def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction) -> None:
+    """Writes the figure of measured and predicted signals as SVG. Raises `OSError`."""
+    write_file(path, as_file(predicted_signals(found)))
 
-    `most`: the longest time that it shows [s], but two horizons at least.
-    """
+
+def predicted_signals(found: FlightPrediction) -> Figure:
+    """Measured lines, and predictions with their band from starts one horizon apart."""
     columns = [("roll [rad]", 6), ("pitch [rad]", 7), ("yaw [rad]", 8)]
     columns += [(f"{axis} [rad/s]", 9 + i) for i, axis in enumerate("pqr")]
     if "velocity" not in found.missing:
@@ -52,7 +64,7 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
     shown, times = [], found.time.tolist()
     for start, time in enumerate(times):
         is_free = not shown or time >= times[shown[-1]] + found.horizons[-1]
-        if is_free and time + found.horizons[-1] <= times[0] + max(most, 2 * found.horizons[-1]):
+        if is_free and time + found.horizons[-1] <= times[0] + max(_LONGEST, 2 * found.horizons[-1]):
             shown.append(start)
     # Lines break between predictions.
     x = np.pad(found.time[shown, None] + found.horizons, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
@@ -77,4 +89,72 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
         low, high = float(np.nanmin(lines)), float(np.nanmax(lines))
         room = 0.4 * (high - low) + 1e-3
         panels.append(Panel(title, marks, Scale(label="time [s]"), Scale(ends=(low - room, high + room))))
-    write_file(path, as_file(Figure("prediction", panels)))
+    return Figure("prediction", panels)
+
+
+def errors_ahead(found: FlightPrediction) -> Figure:
+    """The error of each quantity against the time ahead, beside those of the simple predictions."""
+    panels, x = [], Scale(label="ahead [s]")
+    looks = (("this vehicle", style(0).color, 2.2, 0), ("constant rates", INK, 1.4, 2), ("regression", FAINT, 1.4, 1))
+    for name, quality in found.quality.items():
+        values = (quality.error, quality.constant, quality.regression)
+        marks = [
+            Line(found.horizons, y, color, width, BOUND_DASHES[dash], name=label)
+            for y, (label, color, width, dash) in zip(values, looks, strict=True)
+            if np.isfinite(y).any()
+        ]
+        panels.append(Panel(f"{name}: error [{QUANTITIES[name][0]}]", marks, x))
+    return Figure("errors", panels)
+
+
+def headline(found: FlightPrediction) -> str:
+    """How much better the vehicle predicts than the better simple prediction, a quarter of a second ahead."""
+    place = decisive_horizon(found.horizons, np.ones(found.horizons.size, bool))
+    simple = {name: np.fmin(x.constant[place], x.regression[place]) for name, x in found.quality.items()}
+    shares = {name: 100 * x.error[place] / simple[name] for name, x in found.quality.items() if simple[name] > 0}
+    if not shares:
+        return "Nothing was measured that a prediction can be compared with."
+    said = ", ".join(f"{name} {share:.0f} %" for name, share in shares.items())
+    worse = ", ".join(name for name, share in shares.items() if share >= 100)
+    ahead = (
+        f"Errors {found.horizons[place]:.2g} s ahead, relative to constant rates or a regression, whichever is better"
+    )
+    return f"{ahead}: {said}.{f' Not predicted better: {worse}.' if worse else ''}"
+
+
+def write_prediction(path: str | os.PathLike[str], found: FlightPrediction, *, command: str = "") -> None:
+    """Writes the page of a prediction, completely or not at all. `command`: that makes it again. Raises `OSError`."""
+    rows, group = list[str | tuple[str, ...]](), ""
+    for name, unit, *cells in _rows(found):
+        rows += [f"{name} [{unit}]"] * (group != name)
+        rows.append(tuple(cells))
+        group = name
+    drawn = picture(
+        predicted_signals(found),
+        "Each prediction starts from the measured state and uses the recorded motors. Shown: the first "
+        f"{max(_LONGEST, 2 * found.horizons[-1]):.3g} s.",
+    )
+    grown = picture(
+        errors_ahead(found),
+        "Mean absolute error by the time ahead. The vehicle helps where its line is below those of constant rates and "
+        "of the regression.",
+    )
+    notes = [f"not measured, and so not compared: {', '.join(found.missing)}."] * bool(found.missing)
+    write_page(
+        path,
+        title=f"{found.flight}, predicted",
+        about=f"Another flight, predicted with the vehicle of {found.found}: {_size(found)}.",
+        top=[text(headline(found), "verdict"), text([*found.notes, *notes])],
+        sections=[
+            Section("errors", "Errors by time ahead", [grown], "Errors"),
+            Section("prediction", "Measured and predicted", [drawn], "Signals"),
+            Section(
+                "quantities",
+                "All errors",
+                [table("errors-table", "Mean absolute errors", _HEADINGS[2:], rows, [_WORDS])],
+                "Table",
+            ),
+        ],
+        command=command,
+        provenance=[("result", found.found), ("flight", found.flight), ("seed", str(found.seed))],
+    )

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from markupsafe import Markup
 
 from .._files import check_writable, write_file
 from ..logs.table import counted
 from ..study import metrics
 from . import one_flight, study_tables
-from .page import Folded, Part, Picture, Section, Text, page
+from .page import Section, folded, picture, table, text, write_page
 from .panels import Figure, Line, Panel, Scale, across, spread
 from .study_tables import ScenarioData, best_estimators, bounds, error_unit, names, positive_scales, scenarios
 from .style import BOUND_DASHES, Style, styles
@@ -72,30 +73,29 @@ def write_report(dataset: xr.Dataset, directory: Path, *, pdf: bool = False) -> 
         drawn += figures.values()
     attributes = {name: str(x) for name, x in dataset.attrs.items()}
     specification = attributes.get("specification", "")
-    text = page(
-        title=attributes.get("title", "") or "A study",
-        about=_about(dataset),
-        top=_trouble(dataset),
-        sections=sections,
-        command=_AGAIN if specification else "",
-        provenance=[(shown, attributes[name]) for name, shown in _PROVENANCE.items() if name in attributes],
-        after=_after(specification),
-        estimators=styles(names(dataset, "estimator")),
-    )
-    folder.mkdir(exist_ok=True)
-    if specification:
-        write_file(directory / _SPECIFICATION, specification)
     files = {folder / f"{figure.stem}.svg": as_file(figure) for figure in drawn}
     if pdf:
         from .matplotlib_figures import as_pdf  # a second
 
         files |= {folder / f"{figure.stem}.pdf": as_pdf(figure) for figure in drawn}
-    else:  # those of another run would not be of these figures
-        for figure in drawn:
-            (folder / f"{figure.stem}.pdf").unlink(missing_ok=True)
+    folder.mkdir(exist_ok=True)
+    if specification:
+        write_file(directory / _SPECIFICATION, specification)
+    for figure in () if pdf else drawn:  # those of another run would not be of these figures
+        (folder / f"{figure.stem}.pdf").unlink(missing_ok=True)
     for path, content in files.items():
         write_file(path, content)
-    write_file(target, text)
+    write_page(
+        target,
+        title=attributes.get("title", "") or "A study",
+        about=_about(dataset),
+        top=_trouble(dataset),
+        sections=sections,
+        end=_end(specification),
+        command=_AGAIN if specification else "",
+        provenance=[(shown, attributes[name]) for name, shown in _PROVENANCE.items() if name in attributes],
+        estimators=styles(names(dataset, "estimator")),
+    )
     return [target, *files]
 
 
@@ -110,81 +110,80 @@ def _about(dataset: xr.Dataset) -> str:
     return about + of_one * one_flight.is_of_one(dataset)
 
 
-def _trouble(dataset: xr.Dataset) -> list[Part]:
+def _trouble(dataset: xr.Dataset) -> list[Markup]:
     """Cells that were not run, and those that failed; scenarios without figures."""
     (missing, cells), (failed, listed) = study_tables.cells_not_run(dataset), study_tables.failed_cells(dataset)
-    parts: list[Part] = []
+    parts = []
     if missing:
         runs = "; the command at the end of the page runs them" * ("specification" in dataset.attrs)
-        parts.append(Text(f"Incomplete: {missing} of {cells} cells have not been run yet{runs}.", "warning"))
+        parts.append(text(f"Incomplete: {missing} of {cells} cells have not been run yet{runs}.", "warning"))
     if failed:
-        parts += [Text(f"{failed} of {cells} cells failed:", "warning"), Text(listed)]
+        parts += [text(f"{failed} of {cells} cells failed:", "warning"), text(listed)]
     if (count := len(list(scenarios(dataset)))) > MOST_DRAWN:
-        parts.append(Text(f"The first {MOST_DRAWN} scenarios have figures; all {count} have tables.", "note"))
+        parts.append(text(f"The first {MOST_DRAWN} scenarios have figures; all {count} have tables.", "note"))
     return parts
 
 
 def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: bool) -> list[Section]:
     """The sections of one scenario."""
     number, label, data = scenario
-    of_one = one_flight.is_of_one(data)
+    of_one, estimators = one_flight.is_of_one(data), names(data, "estimator")
     tables = {"estimates": one_flight.estimates(data)} if of_one else {}
     tables |= study_tables.scenario_tables(data)
     differ = "; ".join(f"{', '.join(who)} see {seen}" for seen, who in study_tables.channels_by_estimator(data).items())
     differ = f" Not of the same channels: {differ}" if "; " in differ else ""
 
-    def picture(name: str) -> list[Part]:
+    def drawn(name: str) -> Markup:
         if name not in figures:
-            return []
+            return Markup()
         (title, caption), figure = _WORDS[name], figures[name]
         title += differ * (name == "overview")
-        return [Picture(figure, f"{caption} Drawn in figures/{figure.stem}.svg.", title)]
+        return picture(figure, f"{caption} Drawn in figures/{figure.stem}.svg.", title)
 
-    def table(name: str) -> Part:
-        one = tables[name]
-        return one._replace(id=f"{name}-{number}", wide=len(one.headings) > 7)
+    def shown(name: str) -> Markup:
+        return table(f"{name}-{number}", *tables[name], estimators)
 
-    def section(title: str, parts: list[Part]) -> Section:
+    def more(name: str, *others: str) -> Markup:
+        return folded(f"Every number of the {name}", *map(shown, (name, *others)))
+
+    def section(title: str, parts: list[Markup]) -> Section:
         return Section(f"{title.split()[0].lower()}-of-{number}", title, parts, level=3)
 
-    first: list[Part] = []
+    first = []
     if of_one:
         outcomes = one_flight.outcomes(data)
-        first.append(Text(outcomes) if len(outcomes) > 1 else Text(outcomes[0], "verdict"))
-        first += [*picture("intervals"), table("estimates")]
+        first.append(text(outcomes) if len(outcomes) > 1 else text(outcomes[0], "verdict"))
+        first += [drawn("intervals"), shown("estimates")]
     elif best := best_estimators(data):
         said = "; ".join(f"{who} at {scales}" for scales, who in best.items())
-        first.append(Text(f"Most accurate, within Monte-Carlo error: {said}.", "verdict"))
-    sections = [Section(f"scenario-{number}", label, [*first, *picture("overview")])]
+        first.append(text(f"Most accurate, within Monte-Carlo error: {said}.", "verdict"))
+    sections = [Section(f"scenario-{number}", label, [*first, drawn("overview")])]
     if not of_one:
-        ratio, shares = [table("efficiency")], [table("coverage"), table("levels")]
         sections += [
-            section("Errors", [*picture("error"), table("error")]),
-            section("Efficiency", [*picture("efficiency"), Folded("Every number of the efficiency", ratio)]),
-            section("Coverage", [*picture("coverage"), Folded("Every number of the coverage", shares)]),
+            section("Errors", [drawn("error"), shown("error")]),
+            section("Efficiency", [drawn("efficiency"), more("efficiency")]),
+            section("Coverage", [drawn("coverage"), more("coverage", "levels")]),
         ]
-    last = [table("results"), *_troubled(data)]
-    if has_zero and figures:
-        last.append(Text("A logarithmic axis cannot show the noise scale 0: it is in the tables only.", "note"))
-    return [*sections, section("Results and rollouts", last)]
+    lost = "A logarithmic axis cannot show the noise scale 0: it is in the tables only." if has_zero and figures else ""
+    return [*sections, section("Results and rollouts", [shown("results"), *_troubled(data), text(lost, "note")])]
 
 
-def _troubled(data: xr.Dataset) -> list[Part]:
+def _troubled(data: xr.Dataset) -> list[Markup]:
     total, listed = study_tables.troubled_flights(data)
     first = f"; the first {len(listed)}" if len(listed) < total else ""
     note = "These flights are counted in the table above, but not in errors, efficiency and coverage."
     summary = f"{counted(total, 'flight')} without a successful result{first}"
-    return [Folded(summary, [Text(listed), Text(note, "note")], is_open=True)] if total else []
+    return [folded(summary, text(listed), text(note, "note"), is_open=True)] if total else []
 
 
-def _after(specification: str) -> list[Part]:
+def _end(specification: str) -> list[Markup]:
     note = (
         "All numbers on this page are computed from results.nc in this folder, by the functions of "
         "jaxos4.study.metrics that the captions name. Errors include flights with the result successful or "
         "unidentifiable. An unidentifiable estimate is a real estimate, but no better than its bracket."
     )
-    written = [Folded("Specification", [Text(specification, "verbatim")], is_open=True)] if specification else []
-    return [*written, Text(note, "note")]
+    shown = Markup("<pre>{}</pre>").format(specification)
+    return [*[folded("Specification", shown, is_open=True)] * bool(specification), text(note, "note")]
 
 
 def draw(scenario: ScenarioData, *, several: bool = False) -> dict[str, Figure]:
@@ -198,9 +197,9 @@ def draw(scenario: ScenarioData, *, several: bool = False) -> dict[str, Figure]:
 def errors(data: xr.Dataset) -> Figure | None:
     """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
     data = positive_scales(data)
-    if not data.sizes["scale"]:
-        return None
     found, best, x, panels = metrics.estimator_error(data), metrics.bound_error(data), data["scale"].values, []
+    if not found["absolute"].notnull().any():
+        return None
     seen_by, dots = bounds(data), {"marker": "" if len(x) > 1 else "s", "size": 4}
     for place, name in enumerate(names(data, "parameter")):
         kind, unit, why = error_unit(data, place)
@@ -212,15 +211,15 @@ def errors(data: xr.Dataset) -> Figure | None:
         ]
         title, subtitle = f"{name} [{unit}]", f"absolute: {why}" if why else ""
         panels.append(Panel(title, marks, _scales(x), Scale("log"), 270, 220, subtitle))
-    return _if_known("error", panels, found["absolute"])
+    return Figure("error", panels, columns=4)
 
 
 def efficiency(data: xr.Dataset) -> Figure | None:
     """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
     data = positive_scales(data)
-    if not data.sizes["scale"]:
-        return None
     found, scales, panels = metrics.efficiency(data), data["scale"].values, []
+    if not found["efficiency"].notnull().any():
+        return None
     values, low, high = (_by(found[each], "parameter", "estimator", "scale") for each in ("efficiency", "low", "high"))
     for place, name in enumerate(names(data, "parameter")):
         marks = [Line(_EVERYWHERE, (1, 1), width=1.5)]
@@ -231,15 +230,11 @@ def efficiency(data: xr.Dataset) -> Figure | None:
         panels.append(Panel(name, marks, _scales(scales), Scale("log"), 270, 220))
     ends = [end for panel in panels for end in panel.fitted().y.ends or ()]
     panels = [panel._replace(y=Scale("log", (min(ends), max(ends)))) for panel in panels]
-    return _if_known("efficiency", panels, found["efficiency"])
+    return Figure("efficiency", panels, columns=4)
 
 
 def _by(values: xr.DataArray, *axes: str) -> np.ndarray:
     return values.transpose(*axes).values
-
-
-def _if_known(stem: str, panels: list[Panel], values: xr.DataArray) -> Figure | None:
-    return Figure(stem, panels, columns=4) if values.notnull().any() else None
 
 
 def coverage(data: xr.Dataset) -> Figure | None:

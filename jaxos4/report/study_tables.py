@@ -4,7 +4,7 @@ import csv
 import io
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..study import OUTCOMES, metrics
-from .page import Entry, Row, Table
-from .text import DASH, Listing, percent, plain
+from .text import DASH, Listing, plain
 
 _PHRASES = {
     "model": "{} model",
@@ -29,6 +28,16 @@ _PHRASES = {
 # The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
 _MARKS = ("", "†", "‡")
 _MOST_LISTED = 20
+Rows = list[str | tuple[str, ...]]
+
+
+class Table(NamedTuple):
+    """A table of the page, see `page.table`."""
+
+    caption: str
+    headings: Sequence[str]
+    rows: Sequence[str | Sequence[str]]
+    notes: Sequence[str] = ()
 
 
 class ScenarioData(NamedTuple):
@@ -88,12 +97,10 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     parameters, level = names(data, "parameter"), shown_level(data)
     levels = [f"{100 * x:g} %" for x in data["level"].values]
 
-    def table(
-        name: str, measure: str, found: xr.Dataset, text: Callable[[float], str], headings: list[str], caption: str
-    ) -> Table:
+    def table(name: str, measure: str, found: xr.Dataset, headings: list[str], caption: str) -> Table:
         source = f"From estimate, truth, {'bound' if name == 'efficiency' else 'half_width'}, result (metrics.{name})."
-        rows = _by_estimator(data, lambda at: _with_intervals(found.isel(at), measure, text))
-        return Table(name, caption, ("estimator", *headings), rows, [source])
+        rows = _by_estimator(data, lambda at: _with_intervals(found.isel(at), measure))
+        return Table(caption, ("estimator", *headings), rows, [source])
 
     ratio = "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do"
     held = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
@@ -101,9 +108,9 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     covered = metrics.coverage(data).sel(level=level)
     return {
         "error": _error_table(data),
-        "efficiency": table("efficiency", "efficiency", metrics.efficiency(data), plain, parameters, ratio),
-        "coverage": table("coverage", "coverage", covered, percent, parameters, held),
-        "levels": table("mean_coverage", "coverage", metrics.mean_coverage(data), percent, levels, means),
+        "efficiency": table("efficiency", "efficiency", metrics.efficiency(data), parameters, ratio),
+        "coverage": table("coverage", "coverage", 100 * covered, parameters, held),
+        "levels": table("mean_coverage", "coverage", 100 * metrics.mean_coverage(data), levels, means),
         "results": _result_table(data),
     }
 
@@ -117,35 +124,32 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
     """RMS errors in percent of the truth, with rows for the bounds and for the centre of the bracket."""
     found, best, middle = metrics.estimator_error(data), metrics.bound_error(data), metrics.center_error(data)
 
-    def cells(of: xr.Dataset) -> tuple[Entry, ...]:
+    def row(name: str, of: xr.Dataset) -> tuple[str, ...]:
         reasons = of["reason"].values.astype(int)
         values = np.where(reasons > 0, of["absolute"].values, of["percent"].values)
         marks = ("" if np.isnan(value) else _MARKS[reason] for value, reason in zip(values, reasons, strict=True))
-        return tuple(Entry(plain(value, digits), mark=mark) for value, mark in zip(values, marks, strict=True))
+        return (name, *(f"{plain(value, digits)}{mark}" for value, mark in zip(values, marks, strict=True)))
 
-    groups = []
+    rows: Rows = []
     for place, label in enumerate(scale_labels(data)):
-        least = [
-            Row(f"bound, {x}", cells(best.isel(scale=place, estimator=at)), reference=True)
-            for x, at in bounds(data).items()
-        ]
+        rows.append(label)
+        rows += [row(f"bound, {x}", best.isel(scale=place, estimator=at)) for x, at in bounds(data).items()]
         every = enumerate(names(data, "estimator"))
-        rows = [Row(name, cells(found.isel(scale=place, estimator=at)), at) for at, name in every]
-        groups.append((label, [*least, *rows, Row("bracket centre", cells(middle.isel(scale=place)), reference=True)]))
-    used = {cell.mark for _, rows in groups for row in rows for cell in row.cells}
+        rows += [row(name, found.isel(scale=place, estimator=at)) for at, name in every]
+        rows.append(row("bracket centre", middle.isel(scale=place)))
+    columns = list(zip(*(each[1:] for each in rows if isinstance(each, tuple)), strict=True))
     notes = (
         f"{mark} absolute error, in the parameter's unit: {reason}, so a percentage is meaningless."
         for mark, reason in zip(_MARKS, metrics.NO_PERCENTAGE, strict=True)
-        if mark and mark in used
+        if mark and any(mark in cell for column in columns for cell in column)
     )
     headings = ["estimator"]
-    for place, (name, unit) in enumerate(zip(names(data, "parameter"), names(data, "unit"), strict=True)):
-        column = [row.cells[place] for _, rows in groups for row in rows if row.cells[place].text != DASH]
-        marked = [bool(cell.mark) for cell in column]
+    for name, unit, column in zip(names(data, "parameter"), names(data, "unit"), columns, strict=True):
+        marked = [cell.endswith(_MARKS[1:]) for cell in column if cell != DASH]
         headings.append(f"{name} [{'%' if not any(marked) else unit if all(marked) else f'%; marked: {unit}'}]")
     caption = "RMS error [% of the truth; where marked, in the parameter's unit]"
     source = "From estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)."
-    return Table("error", caption, headings, groups, [*notes, source])
+    return Table(caption, headings, rows, [*notes, source])
 
 
 def _result_table(data: xr.Dataset) -> Table:
@@ -153,16 +157,15 @@ def _result_table(data: xr.Dataset) -> Table:
     counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
     occurs = np.flatnonzero((counts > 0).any([name for name in counts.dims if name != "code"]).values)
 
-    def cells(at: dict[str, int]) -> tuple[Entry, ...]:
-        hit = _with_intervals(hits.isel(at).expand_dims("parameter"), "hit_rate", percent)
-        numbers = [Entry(str(int(number))) for number in counts.isel(at).values[occurs]]
-        return (*numbers, Entry(plain(float(spent.isel(at)))), *hit)
+    def cells(at: dict[str, int]) -> tuple[str, ...]:
+        hit = _with_intervals(100 * hits.isel(at).expand_dims("parameter"), "hit_rate")
+        return (*(f"{count:.0f}" for count in counts.isel(at).values[occurs]), plain(float(spent.isel(at))), *hit)
 
     headings = [names(counts, "code")[place].replace("_", " ") for place in occurs]
     caption = "Flights by result, mean rollouts, and the hybrid's seed brackets that contain the truth [%]"
     source = "From result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)."
     headings = ("estimator", *headings, "rollouts", "seed hits")
-    return Table("results", caption, headings, _by_estimator(data, cells), [source])
+    return Table(caption, headings, _by_estimator(data, cells), [source])
 
 
 def best_estimators(data: xr.Dataset) -> dict[str, str]:
@@ -241,20 +244,19 @@ def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
     return int(missing.sum()), missing.size
 
 
-def _by_estimator(
-    data: xr.Dataset, cells: Callable[[dict[str, int]], tuple[Entry, ...]]
-) -> list[tuple[str, list[Row]]]:
+def _by_estimator(data: xr.Dataset, cells: Callable[[dict[str, int]], tuple[str, ...]]) -> Rows:
     """A row for each noise scale and estimator; `cells` gives the row's cells from its indices."""
-    estimators = list(enumerate(names(data, "estimator")))
-    return [
-        (label, [Row(name, cells({"scale": scale, "estimator": at}), at) for at, name in estimators])
-        for scale, label in enumerate(scale_labels(data))
-    ]
+    rows: Rows = []
+    for scale, label in enumerate(scale_labels(data)):
+        rows.append(label)
+        rows += [(name, *cells({"scale": scale, "estimator": i})) for i, name in enumerate(names(data, "estimator"))]
+    return rows
 
 
-def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Entry, ...]:
-    rows = (map(text, row) for row in zip(*(one[part].values for part in (measure, "low", "high")), strict=True))
-    return tuple(Entry(value, "" if DASH in (low, high) else f"{low} to {high}") for value, low, high in rows)
+def _with_intervals(one: xr.Dataset, measure: str) -> tuple[str, ...]:
+    """Numbers, each with its interval on a second line."""
+    rows = (map(plain, row) for row in zip(*(one[part].values for part in (measure, "low", "high")), strict=True))
+    return tuple(value if DASH in (low, high) else f"{value}\n{low} to {high}" for value, low, high in rows)
 
 
 def count_outcomes(dataset: xr.Dataset) -> str:
@@ -272,9 +274,8 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
         table, rows = _error_table(scenario.data, digits=2), []
         headings = [heading.partition(" [")[0] for heading in table.headings[1:]]
         blank = [""] * len(headings)
-        for label, group in table.groups:
-            rows += [["", *blank]] * bool(rows) + [[label, *blank]]
-            rows += [[row.name, *(cell.text + cell.mark for cell in row.cells)] for row in group]
+        for row in table.rows:
+            rows += [["", *blank]] * bool(rows) + [[row, *blank]] if isinstance(row, str) else [row]
         listing = Listing(["", *headings], rows, headings, apart=1)  # 80 columns must do
         parts += [Text(f"RMS error [%], {scenario.label}"), listing.table()]
         notes |= dict.fromkeys(table.notes[:-1])  # the last one says how the page's numbers are computed

@@ -1,5 +1,6 @@
 """Figures as SVG, in a page or as a file."""
 
+import itertools
 import math
 
 import numpy as np
@@ -41,8 +42,8 @@ def inline(figure: Figure, description: str) -> Markup:
     label = escape(" ".join(description.split()))
     drawn = f'<div class="panels" role="img" aria-label="{label}" style="{style}">{panels}</div>'
     drawn = f'<p class="legend">{legend}</p>{drawn}' if legend else drawn
-    for color, themed in _THEMED.items():
-        drawn = drawn.replace(color, themed)
+    for paint, color in itertools.product(("fill", "stroke"), _THEMED):  # in a text, quotation marks are escaped
+        drawn = drawn.replace(f'{paint}="{color}"', f'{paint}="{_THEMED[color]}"')
     return Markup(drawn)  # noqa: S704  # texts are escaped
 
 
@@ -75,7 +76,7 @@ def swatch(mark: Line | Band) -> str:
     """A sample of a mark in 32 x 16 pixels: the content of an element `<svg>`."""
     if isinstance(mark, Band):
         return f'<rect y="2" width="32" height="12" fill="{mark.color}" fill-opacity="{mark.opacity}"/>'
-    sample, ends = mark._replace(width=min(mark.width, 3.0), size=min(mark.size, 9.0)), np.array([0.0, 32.0])
+    sample, ends = mark._replace(width=min(mark.width, 3.0), size=min(max(mark.size, 6.0), 9.0)), np.array([0.0, 32.0])
     return _stroke(ends, np.full(2, 8.0), sample) + _marks(ends[1:] / 2, np.array([8.0]), sample)
 
 

@@ -24,7 +24,7 @@ from ..identification.verdict import (
 )
 from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
-from .text import Listing, plain, say
+from .text import DASH, Listing, plain, say
 
 _WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
@@ -46,20 +46,24 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
     `verbose`: for a vehicle, also all parameters, the noise and the quality of predictions. An OS4 always has its
     parameters.
     """
-    sections = [_quantities, _reasons, _notes]
-    if not found.is_vehicle:
-        sections = [_reasons, _notes, _parameters, _fit, _inertias, _validation]
-    elif verbose:
-        sections += [_parameters, _held, _inertias, _of_vehicle]
+    notes = [f"note: {note}" for note in notes_of(found)]
+    parts = [*warning_lines(found), *notes]
+    if not found.has_answer:
+        parts = [*notes, *_failure(found)]
+    elif not found.is_vehicle:
+        parts += [*_parameters(found), *_fit(found), *_inertias(found), *_validation(found)]
+    else:
+        parts = [*_quantities(found), *parts]
+        parts += [*_parameters(found), *_held(found), *_inertias(found), *_of_vehicle(found)] if verbose else []
     if found.has_answer:
+        parts += [_summary(found), *next_lines(found)]
         for status, sentence in headline(statuses_of(found.verdicts)).items():
             say(console, sentence, _COLOURS[status])
-    for section in (*sections, _summary, _next) if found.has_answer else (_notes, _failure):
-        for part in section(found):
-            if isinstance(part, Listing):
-                part.print_on(console)
-            else:
-                say(console, part)
+    for part in parts:
+        if isinstance(part, Listing):
+            part.print_on(console)
+        else:
+            say(console, part)
 
 
 def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:
@@ -69,26 +73,20 @@ def identification_summary(found: Identification, *, verbose: bool = False, widt
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
 
-def quantity_rows(rows: Sequence[PhysicalQuantity]) -> tuple[list[tuple[str, ...]], list[str]]:
-    """The cells of physical quantities (name, estimate, interval, unit), and a note on each."""
-    cells, notes = [], []
-    for row in rows:
-        low, high = row.ci95
-        unit = "" if row.unit == "1" else row.unit
-        cells.append((row.name, f"{row.value:.4g}", f"{low:.4g} to {high:.4g}", unit))
-        status = "" if row.verdict is None or row.trusted else row.verdict.status
-        notes.append("; ".join(filter(None, (status, row.condition))))
-    return cells, notes
+def quantity_rows(quantities: Sequence[PhysicalQuantity]) -> list[tuple[str, ...]]:
+    """The cells of physical quantities: name, estimate, interval, unit, and a note."""
+    rows = []
+    for each in quantities:
+        status = "" if each.verdict is None or each.trusted else each.verdict.status
+        note = "; ".join(filter(None, (status, each.condition)))
+        unit = "" if each.unit == "1" else each.unit
+        rows.append((each.name, f"{each.value:.4g}", " to ".join(f"{end:.4g}" for end in each.ci95), unit, note))
+    return rows
 
 
 def _quantities(found: Identification) -> Section:
-    cells, notes = quantity_rows(physical_quantities(found))
-    if cells:
-        yield Listing(("quantity", "estimate", "95 % interval", "unit"), cells, ("estimate",), notes)
-
-
-def _reasons(found: Identification) -> Section:
-    yield from warning_lines(found)
+    if rows := quantity_rows(physical_quantities(found)):
+        yield Listing(("quantity", "estimate", "95 % interval", "unit", "note"), rows, ("estimate",))
 
 
 def warning_lines(found: Identification) -> list[str]:
@@ -101,10 +99,9 @@ def warning_lines(found: Identification) -> list[str]:
     return [*reason_lines(found.verdicts, found.doubts), *[lacking] * bool(wide)]
 
 
-def _notes(found: Identification) -> Section:
-    yield from (f"note: {note}" for note in found.provenance.notes)
-    if found.motor_clock:
-        yield f"note: {found.motor_clock} (rotor_delay)"
+def notes_of(found: Identification) -> list[str]:
+    """What was changed and noticed, and the clock of the motors if it is not the gyro's."""
+    return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
 
 
 def _failure(found: Identification) -> Section:
@@ -113,7 +110,7 @@ def _failure(found: Identification) -> Section:
     shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
     yield (
         "No estimate: the model's trajectory diverged wherever the search went. The vehicle may do something that "
-        f"the model lacks{' (try --window, or a shorter window)' if shoots else ''}, or the airframe's constants "
+        f"the model lacks{' (try `window`, or a shorter one)' if shoots else ''}, or the airframe's constants "
         "or the units of the flight are wrong."
     )
 
@@ -128,9 +125,9 @@ def _parameters(found: Identification) -> Section:
             low, high = row.ci95
             bound = "-" if row.bound is None else f"{row.bound:.2g}"
             cells = [f"{row.estimate:.{digits}g}", f"[{low:.{digits}g}, {high:.{digits}g}]", bound]
-        rows.append((name, row.unit, *cells[: 2 + of_os4]))
-    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_os4)
-    yield Listing(headings, rows, ("estimate", "bound"), [row.note for row in found.parameters.values()])
+        rows.append((name, row.unit, *cells[: 2 + of_os4], row.note))
+    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_os4, "note")
+    yield Listing(headings, rows, ("estimate", "bound"))
     limits = [
         f"{plain(1 / row.noise_limit, 2)} ({name})"
         for name, row in found.parameters.items()
@@ -237,29 +234,30 @@ def _of_vehicle(found: Identification) -> Section:
     )
     rates = (skill.p, skill.q, skill.r)
     for i, horizon in enumerate(skill.horizons):
-        cells = [f"{_share(rate.skill[i])} +- {_share(rate.std[i])}" for rate in rates]
-        table.append((f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates)))
+        cells = [f"{share(rate.skill[i])} +- {share(rate.std[i])}" for rate in rates]
+        table.append((f"{horizon:.2f} s", *cells, ", ".join(share(rate.equation_error[i]) for rate in rates)))
     yield Listing(("ahead", "p", "q", "r", "equation error: p, q, r"), table)
 
 
-def _summary(found: Identification) -> Section:
+def _summary(found: Identification) -> str:
     used = found.provenance
     if found.is_vehicle:
         how = f"flight model ({', '.join(used.terms or ())}), {used.fitted_seconds:.0f} s, a sample every "
         how, digits = f"{how}{1e3 * used.sample_time:g} ms", 0
     else:
         how, digits = f"{found.model} model, {used.channels} channels", 1
-    yield f"{found.estimator}, {how}: {found.result}, {found.rollouts} rollouts, {found.seconds:.{digits}f} s"
+    return f"{found.estimator}, {how}: {found.result}, {found.rollouts} rollouts, {found.seconds:.{digits}f} s"
 
 
-def _next(found: Identification) -> Section:
-    if found.verdicts:
-        yield next_flight([found], spreads_of(found))
+def next_lines(found: Identification) -> list[str]:
+    """What to fly next, if anything was judged."""
+    return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
 
 
-def _share(value: float | None) -> str:
+def share(value: float | None) -> str:
+    """A skill: 1 is perfect, and it may be far below 0."""
     if value is None:
-        return "-"
+        return DASH
     return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"
 
 
@@ -296,7 +294,7 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
         console.print(f"note: {note}")
     rows = part_rows(found, most)
     headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
-    Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
+    Listing(headings, rows, numbers).print_on(console)
     if len(found.parts) > len(rows):
         console.print(f"and {len(found.parts) - len(rows)} shorter parts")
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
@@ -320,10 +318,9 @@ def print_information(console: Console, found: FlightInformation) -> None:
     for name, row in found.parameters.items():
         bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
         limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
-        rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit))
+        rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit, row.note))
     numbers = ("bound", "others known", "of bracket", "noise limit")
-    notes = [row.note for row in found.parameters.values()]
-    Listing(("parameter", "unit", *numbers), rows, numbers, notes).print_on(console)
+    Listing(("parameter", "unit", *numbers, "note"), rows, numbers).print_on(console)
     console.print(
         "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
         "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "

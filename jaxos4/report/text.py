@@ -13,10 +13,13 @@ from rich.text import Text
 DASH = "–"
 
 
-def plain(value: float, digits: int = 3) -> str:
-    """A number with `digits` significant digits, and a power of ten if it is very small or large. NaN is a dash."""
-    if not math.isfinite(value):
-        return DASH if math.isnan(value) else f"{value:g}"
+def plain(value: float | None, digits: int = 3) -> str:
+    """A number with `digits` significant digits, and a power of ten if it is very small or large.
+
+    NaN and `None` are a dash.
+    """
+    if value is None or not math.isfinite(value):
+        return DASH if value is None or math.isnan(value) else f"{value:g}"
     if value == 0:
         return "0"
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
@@ -26,55 +29,58 @@ def plain(value: float, digits: int = 3) -> str:
     return f"{round(value, digits - 1 - exponent):.{max(digits - 1 - exponent, 0)}f}"
 
 
-def percent(share: float) -> str:
-    """A share in percent, without the sign %. NaN is a dash."""
-    return DASH if math.isnan(share) else f"{100 * share:.1f}"
+def span(ends: Sequence[float | None] | None, digits: int = 4) -> str:
+    """An interval in words; empty if there is none."""
+    return "" if ends is None else " to ".join(plain(end, digits) for end in ends)
+
+
+WORDED = ("note", "use", "cause", "size", "what to do", "pooled value")
+"""The headings of columns of words, whose cells can have several lines."""
+_WORDS = 20  # characters; the least width of such a column, if its words are as long: a narrower one is hard to read
 
 
 class Listing(NamedTuple):
     """A table as text.
 
     - `right`: the headings of the columns that are aligned to the right.
-    - `notes`: a note for each row, about the item in its first cell; an empty string if there is none.
-    - `wraps`: the headings of the columns of words. Their cells can have several lines.
     - `apart`: the number of blanks between columns.
-    - `words`: the least width of a column of words, if they are as long: a narrower one would be hard to read.
     """
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
     right: Sequence[str] = ()
-    notes: Sequence[str] = ()
-    wraps: Sequence[str] = ()
     apart: int = 2
-    words: int = 20
 
     def print_on(self, console: Console) -> None:
-        """Prints the table. Notes are its last column, or lines below it if the terminal is too narrow."""
-        if any(self.notes):
-            rows = [[*row, note] for row, note in zip(self.rows, self.notes, strict=True)]
-            with_notes = Listing([*self.headings, "note"], rows, self.right, wraps=[*self.wraps, "note"]).table()
-            if _needed_width(with_notes) <= console.width:
-                print_whole(console, with_notes)
-                return
-        print_whole(console, self.table())
-        names: dict[str, list[str]] = {}
-        for row, note in zip(self.rows, self.notes, strict=False):
-            names.setdefault(note, []).append(row[0])
-        for note in filter(None, names):
-            say(console, f"{', '.join(names[note])}: {note}")
+        """Prints the table. A last column of notes becomes lines below it if the terminal is too narrow."""
+        has_notes, names = self.headings[-1] == "note", dict[str, list[str]]()
+        for row in self.rows if has_notes else ():
+            names.setdefault(row[-1], []).append(row[0])
+        names.pop("", None)
+        if not has_notes or (names and _needed_width(self.table()) <= console.width):
+            print_whole(console, self.table())
+            return
+        short = Listing(self.headings[:-1], [row[:-1] for row in self.rows], self.right, self.apart)
+        print_whole(console, short.table())
+        for note, rows in names.items():
+            say(console, f"{', '.join(rows)}: {note}")
 
     def table(self) -> Table:
-        """The table without its notes."""
+        """The table with all its columns."""
         padding = (0, self.apart - 1, 0, 0)
         table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=padding)
         for i, heading in enumerate(self.headings):
-            widest, wraps = max(len(row[i]) for row in (self.headings, *self.rows)), heading in self.wraps
-            width, justify = min(widest, self.words) if wraps else widest, "right" if heading in self.right else "left"
+            widest, wraps = max(len(row[i]) for row in (self.headings, *self.rows)), heading in WORDED
+            width, justify = min(widest, _WORDS) if wraps else widest, "right" if heading in self.right else "left"
             table.add_column(heading, justify=justify, no_wrap=not wraps, min_width=width)
         for row in self.rows:
             table.add_row(*map(Text, row))
         return table
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A name with its unit, such as "Ix [kg m^2]"; a number has none."""
+    return name if unit == "1" else f"{name} [{unit}]"
 
 
 def say(console: Console, line: str, style: str | None = None) -> None:

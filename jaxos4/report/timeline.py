@@ -13,43 +13,6 @@ from .style import Style
 _LEVELS = 65_000  # of a packed number, which takes two bytes
 
 
-class Line(NamedTuple):
-    """A signal: its name, a value for each time of its view (NaN: none), and its look; `None`: as measured ones."""
-
-    label: str
-    values: Float[np.ndarray, " samples"]
-    look: Style | None = None
-
-
-class Panel(NamedTuple):
-    """Signals on one axis.
-
-    - `title`: with the unit.
-    - `half`: half the width of a band around the last line, in the same unit; 0: no band.
-    - `residual`: whether a panel below shows the first line minus the last.
-    - `reach`: where the axis ends, up and down; 0: at the largest value.
-    """
-
-    title: str
-    lines: Sequence[Line]
-    half: float = 0.0
-    residual: bool = False
-    reach: float = 0.0
-
-
-class View(NamedTuple):
-    """Panels of the same samples.
-
-    - `time`: of each sample on the axis [s], see `Axis.place`.
-    - `start`: of a prediction from many starts, the number of that of each sample. Those from a chosen one are drawn.
-    """
-
-    name: str
-    time: Float[np.ndarray, " samples"]
-    panels: Sequence[Panel]
-    start: Int[np.ndarray, " samples"] | None = None
-
-
 class Axis(NamedTuple):
     """A time axis without gaps, from 0. It is made of pieces, each an uninterrupted part of a log.
 
@@ -115,12 +78,55 @@ def thinned(
     return time[places].ravel(), ends.reshape(2 * begin.size, -1), block
 
 
+def line(label: str, values: Float[np.ndarray, " samples"], look: Style | None = None) -> dict[str, Any]:
+    """A signal: its name, a value for each time of its view (NaN: none), and its look; `None`: as measured ones."""
+    color, dash = (None, [3.0, 3.0]) if look is None else (look.color, [1.6 * length for length in look.dash[1]])
+    return {"label": label, "values": values, "color": color, "dash": dash}
+
+
+def panel(
+    title: str, lines: Sequence[dict[str, Any]], *, half: float = 0.0, residual: bool = False, reach: float = 0.0
+) -> dict[str, Any]:
+    """Signals on one axis.
+
+    - `title`: with the unit.
+    - `half`: half the width of a band around the last line, in the same unit; 0: no band.
+    - `residual`: whether a panel below shows the first line minus the last.
+    - `reach`: where the axis ends, up and down; 0: at the largest value.
+    """
+    return {"title": title, "lines": lines, "half": half, "residual": residual, "reach": reach}
+
+
+def view(
+    name: str,
+    time: Float[np.ndarray, " samples"],
+    panels: Sequence[dict[str, Any]],
+    start: Int[np.ndarray, " samples"] | None = None,
+) -> dict[str, Any]:
+    """Panels of the same samples, packed.
+
+    - `time`: of each sample on the axis [s], see `Axis.place`.
+    - `start`: of a prediction from many starts, the number of that of each sample. Those from a chosen one are drawn.
+    """
+    kept = np.isfinite(time)
+    order = np.flatnonzero(kept)[np.argsort(time[kept], kind="stable")]
+    return {
+        "name": name,
+        "time": _in_text(time[order].astype("<f4")),
+        "start": None if start is None else _in_text(start[order].astype("<i2")),
+        "panels": [
+            one | {"lines": [each | {"values": _packed(each["values"][order])} for each in one["lines"]]}
+            for one in panels
+        ],
+    }
+
+
 def signals(
     axis: Axis,
-    common: Sequence[View],
-    views: Sequence[View] = (),
+    common: Sequence[dict[str, Any]],
+    views: Sequence[dict[str, Any]] = (),
     *,
-    before: View | None = None,
+    before: dict[str, Any] | None = None,
     shown: int = 0,
     shaded: Sequence[tuple[float, float]] = (),
     names: Sequence[str] = (),
@@ -133,44 +139,13 @@ def signals(
     """
     several = np.ptp(axis.log) > 0
     pieces = [[*(float(x) for x in row[:3]), names[int(row[3])] if several else ""] for row in zip(*axis, strict=True)]
-    return json.dumps(
-        {
-            "pieces": pieces,
-            "shaded": [[round(x, 4) for x in each] for each in shaded],
-            "before": None if before is None else _view(before),
-            "views": [_view(each) for each in views],
-            "common": [_view(each) for each in common],
-            "shown": shown,
-        }
-    )
+    grey = [[round(x, 4) for x in each] for each in shaded]
+    drawn = {"pieces": pieces, "shaded": grey, "before": before, "views": views, "common": common, "shown": shown}
+    return json.dumps(drawn)
 
 
-def _view(view: View) -> dict[str, Any]:
-    kept = np.isfinite(view.time)
-    order = np.flatnonzero(kept)[np.argsort(view.time[kept], kind="stable")]
-    return {
-        "name": view.name,
-        "time": base64.b64encode(view.time[order].astype("<f4").tobytes()).decode(),
-        "start": None if view.start is None else base64.b64encode(view.start[order].astype("<i2").tobytes()).decode(),
-        "panels": [
-            {
-                "title": panel.title,
-                "half": panel.half,
-                "residual": panel.residual,
-                "reach": panel.reach,
-                "lines": [
-                    {
-                        "label": line.label,
-                        "values": _packed(line.values[order]),
-                        "color": None if line.look is None else line.look.color,
-                        "dash": [3.0, 3.0] if line.look is None else [1.6 * x for x in line.look.dash[1]],
-                    }
-                    for line in panel.lines
-                ],
-            }
-            for panel in view.panels
-        ],
-    }
+def _in_text(numbers: np.ndarray) -> str:
+    return base64.b64encode(numbers.tobytes()).decode()
 
 
 def _packed(values: Float[np.ndarray, " samples"]) -> list[Any]:
@@ -179,4 +154,4 @@ def _packed(values: Float[np.ndarray, " samples"]) -> list[Any]:
     low, high = (float(f(values[finite])) for f in (np.min, np.max)) if finite.any() else (0.0, 0.0)
     step = (high - low) / _LEVELS or 1.0
     levels = np.where(finite, np.rint((np.where(finite, values, low) - low) / step) - _LEVELS // 2, -(1 << 15))
-    return [low + step * (_LEVELS // 2), step, base64.b64encode(levels.astype("<i2").tobytes()).decode()]
+    return [low + step * (_LEVELS // 2), step, _in_text(levels.astype("<i2"))]

@@ -225,7 +225,10 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 def load_study(path: Path) -> Study:
     """Reads the specification of a study from a TOML file. Raises `InputError`; `OSError` if it cannot be read."""
-    table = read_toml(path)
+    if not (table := read_toml(path)):
+        raise InputError(
+            f"{path}: is empty; say at least what differs from the default study, such as `flights = 100`."
+        )
     try:
         table = table | _inputs(table, Path(path).parent)
         study = msgspec.convert(table, Study)
