@@ -56,7 +56,7 @@ SOLVER = jaxos4.FilterError(tolerance=1e-3)
 def data_of(flight, sample_time):
     """As `jaxos4.identify` prepares it, so that all fits are one program."""
     settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=sample_time, holdout=0.0)
-    return prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings).data[0]
+    return prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings)[0]
 
 
 @eqx.filter_jit

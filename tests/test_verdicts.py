@@ -15,7 +15,8 @@ from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification import verdict
-from jaxos4.identification.answers import Solution, vehicle_constants
+from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.checks import judge_vehicle
 from jaxos4.identification.doubts import doubts_of_log, few_parts, stronger_or_weaker
 from jaxos4.identification.doubts_of_values import consequences, doubts_of_values
 from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
@@ -183,16 +184,15 @@ def fitted():
     """A flight of the OS4 in gusts as `simulate --closed-loop` flies it by default, with longer samples."""
     flight = flown(OS4, duration=20.0, seed=5, gust=5.0, name="os4.csv")
     settings = jaxos4.VehicleSettings(sample_time=0.032)
-    case = prepare_vehicle([flight], OS4, settings)
-    data = case.data[0]
+    (data,) = prepare_vehicle([flight], OS4, settings)
     optimum = search(jaxos4.FilterError(tolerance=1e-3), data.likelihood)
-    return case, Solution(data, corrected(optimum, data))
+    return data, corrected(optimum, data)
 
 
 @pytest.mark.slow
 def test_a_parameter_at_another_value_moves_the_others(fitted):
     """The cost rises by as much as the parameter says. The thrust is the scale of the inertias."""
-    answer = fitted[1].answer
+    answer = fitted[1]
     names, values = answer.problem.unknowns.names, np.asarray(answer.estimate.parameters)
     constants = {"Iy": Constant(1 / values[5], 1e-4, "kg m^2")}
 
@@ -269,8 +269,8 @@ def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
 
 
 def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
-    case, solution = fitted
-    vehicle = case.check(solution, lambda stage: None)
+    data, answer = fitted
+    vehicle = judge_vehicle(data, answer, (), "filter-error")
     assert vehicle.successful
     for name, truth in zip(("Ix", "Iy"), np.asarray(OS4.inertia).tolist(), strict=False):
         row = vehicle.rigid_body.constants[name]
@@ -279,7 +279,7 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
         assert "if arms and mass are right" in vehicle.verdicts[name].value
         assert abs(row.estimate - truth) < 3 * row.std
     assert vehicle.verdicts["Iz"].status == MISSING
-    known = vehicle_constants(solution.answer._replace(fixed={})).constants["Iz"]
+    known = vehicle_constants(answer._replace(fixed={})).constants["Iz"]
     assert known.note == "if mass and the ratio of drag to thrust, 0.024 m, are right"
     assert "fly more yaw" in vehicle.verdicts["Iz"].reasons[0]
     assert "s ahead" in vehicle.verdicts["predictions"].value
@@ -293,7 +293,7 @@ def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
     table = dict.fromkeys(("alpha3", "alpha6", "alpha8", "thrust_gain", "rotor_delay"), row)
     constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy", "Iz")}
-    found = vehicle_quantities(fitted[1].answer, table, constants, None, [])
+    found = vehicle_quantities(fitted[1], table, constants, None, [])
     wider = [each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations if "wider" in each]
     assert wider == [
         "Ix is 2.5 times the guess; check `mass` and `rotor_positions`, or give a wider `bracket`",

@@ -1,37 +1,26 @@
-"""`Answer`: an estimate with intervals; its parameters, moments of inertia, and residuals of channels as tables."""
+"""`Answer`: an estimate with intervals; its parameters, and the moments of inertia of a vehicle, as tables."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import Parameters
-from ..airframe import AXES, INERTIAS, INVERSES, MOTIONS, YAW, Airframe
+from ..airframe import AXES, INVERSES, YAW, Airframe
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.evaluation import Evaluation
 from ..analysis.inertia import fit_inertia
 from ..bracket import is_identifiable
 from ..estimate import Estimate
-from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.abstract import PARAMETER_NAMES
 from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
-from ..models.state import CASCADE_ORDER
 from ..models.terms import follows_commands
 from ..shooting import ShootingProblem
 from .data import Data
-from .results import (
-    ChannelFit,
-    Constant,
-    Disturbance,
-    FixedParameter,
-    ParameterEstimate,
-    RigidBody,
-    SampleTime,
-    has_answer,
-)
+from .results import Constant, Disturbance, FixedParameter, ParameterEstimate, RigidBody, has_answer
 from .search import Optimum
 from .tables import finite_or_none
 
@@ -58,7 +47,7 @@ class Answer(NamedTuple):
 
     Only of a flight of an OS4:
 
-    - `evaluation`: the flight simulated at the estimate; `None` without an answer.
+    - `evaluation`, `diagnostics`: the flight simulated at the estimate, and its residuals; `None` without an answer.
 
     Only of a vehicle:
 
@@ -73,6 +62,7 @@ class Answer(NamedTuple):
     bound: Float[np.ndarray, " parameters"]
     rollouts: int
     evaluation: Evaluation | None = None
+    diagnostics: Diagnostics | None = None
     optimum: Optimum | None = None
     fixed: dict[str, FixedParameter] = {}
     disturbances: dict[str, Disturbance] = {}
@@ -100,16 +90,20 @@ class Answer(NamedTuple):
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.fixed]
 
 
-class Solution(NamedTuple):
-    """The fitted data, and the answer.
-
-    - `data`: of a vehicle, at the chosen sample time.
-    - `sample_times`: the answers at all sample times that belong together; empty for an OS4.
-    """
-
-    data: Data
-    answer: Answer
-    sample_times: tuple[SampleTime, ...] = ()
+def shared_fields(data: Data, answer: Answer, estimator: str) -> dict[str, Any]:
+    """The fields of a result that an OS4 and a vehicle fill in the same way. `estimator`: its name."""
+    free = answer.free
+    covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
+    return {
+        "estimator": estimator,
+        "rollouts": answer.rollouts,
+        "cost": finite_or_none(answer.estimate.cost),
+        "provenance": data.provenance,
+        "covariance": covariance.tolist() if np.isfinite(covariance).all() else None,
+        "airframe": answer.problem.model.airframe,
+        "estimate": answer.estimate,
+        "problem": answer.problem,
+    }
 
 
 def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {}) -> dict[str, ParameterEstimate]:
@@ -183,18 +177,6 @@ def overwhelmed(answer: Answer) -> dict[str, str]:
     return weak
 
 
-def rigid_body(answer: Answer) -> RigidBody:
-    """The moments of inertia of an OS4 that explain the estimate best; none if they are not identifiable."""
-    model, estimate = answer.problem.model, answer.estimate
-    rigid = fit_inertia(model, estimate.parameters, estimate.covariance)
-    values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
-    if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
-        return RigidBody()
-    table = zip((*INERTIAS, "J_R"), values.tolist(), std.tolist(), strict=True)
-    constants = {name: Constant(value, error, UNIT) for name, value, error in table}
-    return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
-
-
 def thrust_excess(answer: Answer) -> float:
     """By which share the thrust exceeds that of the airframe at the same speeds; 0 if the logs do not show it."""
     model, values = answer.problem.model, np.asarray(answer.estimate.parameters)
@@ -253,22 +235,3 @@ def vehicle_constants(answer: Answer) -> RigidBody:
         return RigidBody(constants)
     rigid = fit_inertia(CorrectedOS4(model.airframe), alpha, covariance)
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
-
-
-def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str, ChannelFit]:
-    """The diagnostics of each measured channel, by its name."""
-    return {
-        STATE_NAMES[column]: ChannelFit(
-            rms=float(diagnostics.rms[i]),
-            unit=STATE_UNITS[column],
-            percent=finite_or_none(diagnostics.percent[i]),
-            level=float(diagnostics.level[i]),
-            level_p=float(diagnostics.level_p[i]),
-            correlation=float(diagnostics.colour[i]),
-            white_p=float(diagnostics.white_p[i]),
-            input_correlation=dict(zip(MOTIONS, diagnostics.input_correlation[i].tolist(), strict=True)),
-            input_p=float(diagnostics.input_p[i]),
-        )
-        for i, column in enumerate(CASCADE_ORDER[: problem.size])
-        if diagnostics.count[i] > 2
-    }

@@ -85,20 +85,19 @@ def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping
 
 
 def at_lowest(
-    optimum: Optimum,
-    data: Data[InnovationsProblem],
-    estimator: AbstractEstimator,
-    *,
-    progress: Progress = silent,
+    answer: Answer, data: Data[InnovationsProblem], estimator: AbstractEstimator, *, progress: Progress = silent
 ) -> Answer:
-    """The answer at the lowest minimum that was found, its intervals corrected by the profile too.
+    """Profiles the likelihood, starts again at any lower minimum, and widens the intervals accordingly.
 
-    A search that did not converge has no profile.
+    A search that did not converge has no profile. `answer`: by `corrected`, of a search by the `estimator`.
     """
+    optimum = answer.optimum
+    if optimum is None:
+        return answer
     for left in reversed(range(MAX_MINIMA)):
-        answer, factors, lower = corrected(optimum, data), {}, None
         if not optimum.converged:
             return answer
+        factors, lower = {}, None
         poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.whole.count])
         for place in sorted({*INVERSES} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
@@ -117,10 +116,11 @@ def at_lowest(
         same = data.likelihood.with_noise_feedthrough(counted)  # costs compare in the same likelihood only
         other = search(estimator, same, start=lower, progress=progress)
         rollouts, is_lower = optimum.rollouts + other.rollouts, has_answer(other.estimate) and other.cost < optimum.cost
-        optimum = other._replace(restarts=optimum.restarts + 1) if is_lower else optimum
-        optimum = optimum._replace(rollouts=rollouts)
         if not is_lower:
+            optimum = optimum._replace(rollouts=rollouts)
             break
+        optimum = other._replace(restarts=optimum.restarts + 1, rollouts=rollouts)
+        answer = corrected(optimum, data)
     return corrected(optimum._replace(is_lowest=False), data)
 
 
