@@ -10,7 +10,7 @@ import numpy as np
 
 from ..airframe import AXES, INERTIAS, YAW, Airframe
 from ..errors import InputError, named, printable
-from ..identification.results import Identification
+from ..identification.results import Identification, VehicleIdentification
 from ..models.flight_model import without_recording
 from ..result_file import vehicle_result
 from .spread import DRAG, Spread, spread_of
@@ -172,7 +172,7 @@ def _given_note(found: Identified, inertia_z: float) -> str:
     return note
 
 
-def _parts(file: Identification, *, significant: float = 3.0) -> tuple[dict[str, float], list[str], list[str]]:
+def _parts(file: VehicleIdentification, *, significant: float = 3.0) -> tuple[dict[str, float], list[str], list[str]]:
     """Values by name, the names of those that were estimated, and notes.
 
     `significant`: by how many standard deviations an inertia of the rotors must differ from 0, and a thrust curve from

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..airframe import AXES, INERTIAS, YAW, Airframe
 from ..identification.answers import GUESSED_DRAG, SCALE_ERROR, UNIT, ratio_error
-from ..identification.results import Identification
+from ..identification.results import VehicleIdentification
 from ..identification.verdict import CONTRADICTED, IDENTIFIED, MAX_SHARE, RESERVED
 from ..linalg import covariance_root
 from ..models.flight_model import without_recording
@@ -61,7 +61,7 @@ class Spread(NamedTuple):
 
 @np.errstate(all="ignore")  # what is not finite gives no possible vehicle
 def spread_of(
-    file: Identification, values: Mapping[str, float], estimated: Sequence[str], vehicle: RigidVehicle
+    file: VehicleIdentification, values: Mapping[str, float], estimated: Sequence[str], vehicle: RigidVehicle
 ) -> Spread:
     """The Gaussian of a result.
 
@@ -131,7 +131,7 @@ def _slopes(
 
 
 def _sizes(
-    file: Identification, mean: Mapping[str, float], parameters: Sequence[str]
+    file: VehicleIdentification, mean: Mapping[str, float], parameters: Sequence[str]
 ) -> dict[str, tuple[str, float, float]]:
     """The verdict on each moment of inertia and parameter, of what its moves are shares, and how wide a guess is."""
     terms = {x.name: (term.quantity, x.half_width) for term in TERMS.values() for x in term.parameters}
@@ -146,7 +146,7 @@ def _sizes(
     return sizes
 
 
-def _reservations(file: Identification, quantity: str, *, spared: bool = False) -> tuple[float, bool]:
+def _reservations(file: VehicleIdentification, quantity: str, *, spared: bool = False) -> tuple[float, bool]:
     """How far the reservations may move a quantity, as a share, and whether its verdict refuses it.
 
     `spared`: whether one doubt that refuses it does not count.

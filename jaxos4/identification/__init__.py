@@ -3,5 +3,9 @@
 from .assess import FlightInformation as FlightInformation, assess as assess
 from .identify import identify as identify, settings_for as settings_for
 from .problem import FlightSettings as FlightSettings
-from .results import Identification as Identification
+from .results import (
+    Identification as Identification,
+    OS4Identification as OS4Identification,
+    VehicleIdentification as VehicleIdentification,
+)
 from .vehicle import VehicleSettings as VehicleSettings

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._custom_types import Parameters
+from .._custom_types import Parameters, finite_or_none
 from ..airframe import AXES, INVERSES, YAW, Airframe
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.evaluation import Evaluation
@@ -18,11 +18,11 @@ from ..models.abstract import PARAMETER_NAMES
 from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
 from ..models.terms import follows_commands
+from ..results import has_answer
 from ..shooting import ShootingProblem
 from .data import Data
-from .results import Constant, Disturbance, FixedParameter, ParameterEstimate, RigidBody, has_answer
+from .results import Constant, Disturbance, FixedParameter, ParameterEstimate, RigidBody
 from .search import Optimum
-from .tables import finite_or_none
 
 UNIT = "kg m^2"
 NEGATIVE_NOTE = "negative, which is impossible; set to 0"
@@ -72,7 +72,7 @@ class Answer(NamedTuple):
     @property
     def answered(self) -> bool:
         """Whether there is an estimate at all."""
-        return has_answer(self.estimate)
+        return has_answer(self.estimate.result)
 
     @property
     def negative(self) -> dict[str, tuple[float, float]]:

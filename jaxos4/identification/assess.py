@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from .._custom_types import finite_or_none
 from ..analysis.evaluation import evaluate
 from ..analysis.identifiability import Identifiability, identifiability
 from ..estimators import IBSS
@@ -14,7 +15,6 @@ from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
 from .os4 import fit_os4
 from .problem import FlightSettings, Intervals, bracket_of, os4_problem
-from .tables import finite_or_none
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Array
 
-from .._custom_types import Numeric, as_float
+from .._custom_types import Numeric, as_float, finite_or_none
 from .._xla import compiled_cheaply
 from ..airframe import AXES, PITCH, ROLL, YAW
 from ..analysis.diagnostics import Correlations, residual_correlations
@@ -29,9 +29,8 @@ from .answers import Answer, overwhelmed, parameter_table, shared_fields, vehicl
 from .data import Data, HeldOut, Progress, silent
 from .doubts import doubts_of_log, doubts_of_vehicle
 from .quantities import vehicle_quantities
-from .results import Identification, PredictionSkill, RateSkill, RigidBody, SampleTime
+from .results import PredictionSkill, RateSkill, RigidBody, SampleTime, VehicleIdentification
 from .search import Optimum
-from .tables import finite_or_none
 from .verdict import judge
 
 # Predictions that a result keeps: those of four minutes, 200 kB of a page.
@@ -47,15 +46,14 @@ def judge_vehicle(
     estimator: str,
     *,
     progress: Progress = silent,
-) -> Identification:
+) -> VehicleIdentification:
     """The result of a vehicle, checked against the airframe, other sample times, and measurements that were not fitted.
 
     `sample_times`: that of the answer is among them. `estimator`: its name.
     """
     progress("checking the answer")
     search, optimum = str(result_names(answer.estimate.result)), answer.optimum
-    found = Identification(
-        model="flight",
+    found = VehicleIdentification(
         parameters={},
         result=search,
         doubts=tuple(doubts_of_log(data.findings)),

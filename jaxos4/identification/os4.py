@@ -8,7 +8,7 @@ import jax
 import msgspec
 import numpy as np
 
-from .._custom_types import as_float
+from .._custom_types import as_float, finite_or_none
 from ..airframe import INERTIAS, MOTIONS
 from ..analysis.diagnostics import Diagnostics, residual_correlations, residual_diagnostics
 from ..analysis.evaluation import evaluate, robust_covariance
@@ -27,7 +27,7 @@ from ..networks import TrainedNetwork
 from ..networks.file import load_network
 from ..networks.for_flight import GivenNetwork, network_for, network_provenance
 from ..recording.checks import KINEMATIC, self_checks
-from ..results import result_names
+from ..results import has_answer, result_names
 from ..shooting import ShootingProblem, padded
 from .answers import UNIT, Answer, parameter_table, shared_fields
 from .data import (
@@ -45,8 +45,7 @@ from .data import (
 from .doubts import doubts_of_log, doubts_of_os4
 from .problem import FlightSettings, Intervals, bracket_of, os4_problem
 from .quantities import os4_quantities
-from .results import COLOURED, ChannelFit, Constant, Identification, RigidBody, Validation, has_answer
-from .tables import finite_or_none
+from .results import COLOURED, ChannelFit, Constant, OS4Identification, RigidBody, Validation
 from .verdict import CONTRADICTED, judge
 
 MAX_PASSES = 3  # in which noise levels are found from residuals, before the last estimate
@@ -165,7 +164,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
     estimates = [search(problem, 0)]
     for number in range(1, MAX_PASSES + 2):
         last, before = estimates[-1], np.asarray(problem.sigma)
-        if not has_answer(last):
+        if not has_answer(last.result):
             break
         problem = problem.reweighted(evaluate(problem, last.parameters, last.initial_state).errors)
         settled = (np.abs(np.asarray(problem.sigma) / before - 1) < SETTLED).all()
@@ -176,7 +175,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
         if is_last:
             break
     estimate, rollouts = estimates[-1], sum(int(each.rollouts) for each in estimates)
-    if not has_answer(estimate):
+    if not has_answer(estimate.result):
         return Answer(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
     evaluation = evaluate(problem, estimate.parameters, estimate.initial_state)
     diagnostics = residual_diagnostics(evaluation)
@@ -188,7 +187,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
     return Answer(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, evaluation, diagnostics)
 
 
-def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> Identification:
+def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> OS4Identification:
     """The result of the flight of an OS4 that an estimator searched: with rigid body, doubts and verdicts."""
     name, _ = name_and_class(estimator)
     names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
@@ -206,7 +205,7 @@ def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> Ident
         name: msgspec.structs.replace(row, noise_limit=limits[name])
         for name, row in parameter_table(answer, estimator.prior, missing).items()
     }
-    found = Identification(
+    found = OS4Identification(
         model=class_name(answer.problem.model, MODELS),
         parameters=table,
         result=search,

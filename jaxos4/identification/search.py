@@ -12,11 +12,11 @@ from jaxtyping import ArrayLike, Float
 
 from ..estimate import AbstractEstimator, Estimate
 from ..models.abstract import Parameter
-from ..results import result_names
+from ..results import has_answer, result_names
 from ..shooting import InnovationsProblem, Parts, Unknowns
 from ..shooting.gains import LogNoise
 from .data import Progress, silent
-from .results import Disturbance, has_answer
+from .results import Disturbance
 
 NEGATIVE = 2.0  # standard deviations below 0 from which a parameter that must not be negative is fixed at 0
 NEAR_PLAIN = 12.0  # standard deviations; further from its plain value, a parameter is never tried there
@@ -117,7 +117,7 @@ def search(
     if start is not None:
         first = jax.block_until_ready(estimator(likelihood.starting_from(start)))
         spent = int(first.rollouts)
-    if first is None or not has_answer(first):
+    if first is None or not has_answer(first.result):
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
     optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
@@ -152,14 +152,14 @@ def _at_plain_values(estimator: AbstractEstimator, before: Optimum, progress: Pr
         return before
     progress("fitting again without what the flights hardly show")
     after = before.restricted(estimator, plain)
-    if has_answer(after.estimate) and after.cost - before.cost < MAX_RISE:
+    if has_answer(after.estimate.result) and after.cost - before.cost < MAX_RISE:
         return after._replace(plain=tuple(plain))
     return before._replace(rollouts=after.rollouts)
 
 
 def _rows(optimum: Optimum) -> list[tuple[Parameter, float, float]]:
     """Each parameter with its value and its standard deviation in the search; empty without an answer."""
-    if not has_answer(optimum.estimate):
+    if not has_answer(optimum.estimate.result):
         return []
     std = deviations(optimum.estimate.covariance)
     return list(zip(optimum.likelihood.model.parameters, optimum.values.tolist(), std.tolist(), strict=False))

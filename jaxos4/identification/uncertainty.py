@@ -23,11 +23,11 @@ from ..airframe import INVERSES
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
-from ..results import NINETY_FIVE
+from ..results import NINETY_FIVE, has_answer
 from ..shooting import InnovationsProblem
 from .answers import Answer
 from .data import Data, Progress, silent
-from .results import FixedParameter, has_answer
+from .results import FixedParameter
 from .search import Optimum, disturbances_of, search
 
 PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
@@ -56,7 +56,7 @@ def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping
     """
     names, units, values = optimum.whole.names, optimum.whole.units, optimum.values
     notes, jackknife, longer = dict.fromkeys(optimum.plain, _PLAIN_NOTE), np.ones(values.size), np.ones(values.size)
-    if has_answer(optimum.estimate):
+    if has_answer(optimum.estimate.result):
         free = np.flatnonzero(~np.isin(names, [*optimum.plain, *optimum.negative]))
         jackknife[free] = _widening(optimum, free, data.clock.log)
         longer[: len(names)] = [profile.get(name, 1.0) for name in names]
@@ -115,7 +115,8 @@ def at_lowest(
         counted = optimum.likelihood.noise_feedthrough
         same = data.likelihood.with_noise_feedthrough(counted)  # costs compare in the same likelihood only
         other = search(estimator, same, start=lower, progress=progress)
-        rollouts, is_lower = optimum.rollouts + other.rollouts, has_answer(other.estimate) and other.cost < optimum.cost
+        rollouts = optimum.rollouts + other.rollouts
+        is_lower = has_answer(other.estimate.result) and other.cost < optimum.cost
         if not is_lower:
             optimum = optimum._replace(rollouts=rollouts)
             break

@@ -10,11 +10,11 @@ import numpy as np
 
 from .._files import check_writable, write_file
 from .._templates import templates
-from ..airframe import INERTIAS
+from ..airframe import INERTIAS, MOTIONS
 from ..errors import printable
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import centers_of_mass, physical_quantities
-from ..identification.results import Identification
+from ..identification.results import Identification, OS4Identification, VehicleIdentification
 from ..identification.verdict import headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from . import identification_figures as figures
@@ -41,19 +41,22 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     top: list[Part] = [Text(verdict(found), "verdict" if found.successful else "verdict warning")]
     top += [Text(lines, "verdicts") for lines in [warning_lines(found)] if lines]
     top += [Text(each[0].upper() + each[1:], id="next") for each in _next(found)]
+    is_vehicle = isinstance(found, VehicleIdentification)
     signals, notes = _signals(found, look), [*used.notes, *filter(None, [found.motor_clock])]
     sections = [
         Section("quantities", "Physical quantities", _quantities(found), "Quantities"),
         Section("predictions", "Measured, predicted, residual", [*signals, Text(notes)] if signals else (), "Signals"),
         Section("vehicle", "Identified vehicle", [_vehicle(found, look)], "Vehicle"),
-        Section("sample-times", "Moment of inertia against sample time", _sample_times(found, look)),
+        Section(
+            "sample-times", "Moment of inertia against sample time", _sample_times(found, look) if is_vehicle else ()
+        ),
         Section("estimates", "Parameters", [_parameters(found)], "Parameters"),
         Section("posteriors", "Estimates in their brackets", _posteriors(found, look)),
         Section("residuals", "Residuals", _residuals(found), "Residuals"),
         Section("paths", "Path", _path(found, look)),
-        Section("disturbances", "Disturbances", _disturbances(found)),
-        Section("skills", "Skill of predictions", _skill(found), "Skill"),
-        Section("responses", "Frequency response", _response(found, look), "Response"),
+        Section("disturbances", "Disturbances", _disturbances(found) if is_vehicle else ()),
+        Section("skills", "Skill of predictions", _skill(found) if is_vehicle else (), "Skill"),
+        Section("responses", "Frequency response", _response(found, look) if is_vehicle else (), "Response"),
     ]
     text = page(
         title=title or ", ".join(printable(Path(name).name) for name in found.logs),
@@ -84,7 +87,7 @@ def _signals(found: Identification, look: Style) -> list[Part]:
     if not (signals := identified_signals(found, look)):
         return []
     words = "Dashes: measured; line: predicted; horizontal: time [s], without gaps. "
-    if found.predictions is not None:
+    if isinstance(found, VehicleIdentification) and found.predictions is not None:
         words += (
             "Each point is a separate prediction: it starts from the rates measured that much earlier and uses the "
             f"recorded inputs. The band holds {100 * BAND:g} % of the errors of its rate at this horizon. "
@@ -95,7 +98,7 @@ def _signals(found: Identification, look: Style) -> list[Part]:
             "Grey: fitted, and not predicted. Gusts: the angular acceleration that the model does not explain, as "
             "estimated by the filters; the axis shows 99 % of it."
         )
-    elif found.fit:
+    elif isinstance(found, OS4Identification) and found.fit:
         words += "The flight is simulated from its first sample with the estimated parameters, so that errors add up."
     return [Signals(signals, words, choice="Show")]
 
@@ -111,7 +114,7 @@ def _vehicle(found: Identification, look: Style) -> Part:
     )
 
 
-def _sample_times(found: Identification, look: Style) -> list[Part]:
+def _sample_times(found: VehicleIdentification, look: Style) -> list[Part]:
     if not found.sample_times:
         return []
     figure = figures.inertias_by_sample_time(found.sample_times, found.provenance.sample_time, look)
@@ -127,16 +130,16 @@ def _parameters(found: Identification) -> Part:
         Row.of(name, x.unit, number(x.estimate), span(x.ci95), number(x.bound, 2), x.note)
         for name, x in found.parameters.items()
     ]
+    fixed, widened = (found.held, found.widened) if isinstance(found, VehicleIdentification) else ({}, {})
     rows += [
-        Row.of(name, x.unit, number(x.value), "", "", f"fixed: {x.note}", reference=True)
-        for name, x in found.held.items()
+        Row.of(name, x.unit, number(x.value), "", "", f"fixed: {x.note}", reference=True) for name, x in fixed.items()
     ]
     note = (
         "Bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found. A dash: not "
         "identifiable. Fixed: not estimated, but kept at this value; the note says why."
     )
-    if found.widened:
-        factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
+    if widened:
+        factors = ", ".join(f"{name} {factor:.1f}" for name, factor in widened.items())
         note += f" Parts of the flights disagree, so that these intervals were widened by the factor: {factors}."
     headings = ("parameter", *_ESTIMATE, "bound", "note")
     return Table("parameters", "Estimated parameters, then fixed parameters", headings, [("", rows)], [note])
@@ -164,7 +167,7 @@ def _posteriors(found: Identification, look: Style) -> list[Part]:
 
 def _residuals(found: Identification) -> list[Part]:
     parts: list[Part] = []
-    if found.fit:
+    if isinstance(found, OS4Identification) and found.fit:
         headings = ("channel", "unit", "fit [%]", "RMS", "level", "neighbours", "p, white", "p, inputs")
         rows = [
             Row.of(
@@ -200,7 +203,7 @@ def _path(found: Identification, look: Style) -> list[Part]:
     return [Picture(figures.path(found.traces, look), "The path of the vehicle, with one scale on both axes.")]
 
 
-def _disturbances(found: Identification) -> list[Part]:
+def _disturbances(found: VehicleIdentification) -> list[Part]:
     rows = [
         Row.of(name, x.unit, *(number(each, 2) for each in (x.strength, x.correlation_time, x.sensor)))
         for name, x in found.disturbances.items()
@@ -214,7 +217,7 @@ def _disturbances(found: Identification) -> list[Part]:
     return [Table("disturbances-table", caption, headings, [("", rows)], [note])] if rows else []
 
 
-def _skill(found: Identification) -> list[Part]:
+def _skill(found: VehicleIdentification) -> list[Part]:
     if (skill := found.skill) is None:
         return []
     groups = []
@@ -237,11 +240,11 @@ def _skill(found: Identification) -> list[Part]:
     return [Table("skill", f"Skill by rate and horizon{starts}", headings, groups, [note])]
 
 
-def _response(found: Identification, look: Style) -> list[Part]:
+def _response(found: VehicleIdentification, look: Style) -> list[Part]:
     if found.response is None:
         return []
     gains = []
-    for name, axis in found.response._asdict().items():
+    for name, axis in zip(MOTIONS, found.response, strict=True):
         mean = axis.agreement()
         low, high = mean.interval
         known = f"{mean.ratio:.2f} ({low:.2f} to {high:.2f}) times the model"

@@ -1,6 +1,7 @@
 """Identifications, the contents of logs, and what a flight of an OS4 can identify, as text for a terminal."""
 
 import io
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 
@@ -11,7 +12,7 @@ from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities, possible
-from ..identification.results import COLOURED, Constant, Identification
+from ..identification.results import COLOURED, Constant, Identification, OS4Identification, VehicleIdentification
 from ..identification.verdict import (
     CONTRADICTED,
     IDENTIFIED,
@@ -46,20 +47,21 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
     `verbose`: for a vehicle, also all parameters, the noise and the quality of predictions. An OS4 always has its
     parameters.
     """
-    sections = [_quantities, _reasons, _notes]
-    if not found.is_vehicle:
-        sections = [_reasons, _notes, _parameters, _fit, _inertias, _validation]
-    elif verbose:
-        sections += [_parameters, _held, _inertias, _of_vehicle]
+    sections = [_quantities(found), _reasons(found), _notes(found)]
+    if isinstance(found, OS4Identification):
+        sections = [_reasons(found), _notes(found), _parameters(found), _fit(found), _inertias(found)]
+        sections.append(_validation(found))
+    elif isinstance(found, VehicleIdentification) and verbose:
+        sections += [_parameters(found), _held(found), _inertias(found), _of_vehicle(found)]
+    sections += [_summary(found), _next(found)]
     if found.has_answer:
         for status, sentence in headline(statuses_of(found.verdicts)).items():
             say(console, sentence, _COLOURS[status])
-    for section in (*sections, _summary, _next) if found.has_answer else (_notes, _failure):
-        for part in section(found):
-            if isinstance(part, Listing):
-                part.print_on(console)
-            else:
-                say(console, part)
+    for part in itertools.chain(*(sections if found.has_answer else [_notes(found), _failure(found)])):
+        if isinstance(part, Listing):
+            part.print_on(console)
+        else:
+            say(console, part)
 
 
 def identification_summary(found: Identification, *, verbose: bool = False, width: int = 80) -> str:
@@ -93,7 +95,8 @@ def _reasons(found: Identification) -> Section:
 
 def warning_lines(found: Identification) -> list[str]:
     """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
-    wide = {name: factor for name, factor in found.widened.items() if factor > _WIDENED}
+    widened = found.widened if isinstance(found, VehicleIdentification) else {}
+    wide = {name: factor for name, factor in widened.items() if factor > _WIDENED}
     factors = sorted({f"{each:.1f}" for each in (min(wide.values(), default=1.0), max(wide.values(), default=1.0))})
     flights, other = ("flights", ", or the flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "")
     said = f"warning: parts of the {flights} disagree, so that intervals were widened {' to '.join(factors)} times: "
@@ -145,14 +148,14 @@ def _parameters(found: Identification) -> Section:
         yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
 
 
-def _held(found: Identification) -> Section:
+def _held(found: VehicleIdentification) -> Section:
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
         reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
     yield from (f"fixed, {reason}: {', '.join(held)}." for reason, held in reasons.items())
 
 
-def _fit(found: Identification) -> Section:
+def _fit(found: OS4Identification) -> Section:
     percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
     yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
     coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
@@ -200,7 +203,7 @@ def _inertias(found: Identification) -> Section:
         yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}{verdict}."
 
 
-def _validation(found: Identification) -> Section:
+def _validation(found: OS4Identification) -> Section:
     if found.validation is None:
         return
     flight, fit = found.validation.flight, found.validation.fit
@@ -211,7 +214,7 @@ def _validation(found: Identification) -> Section:
     yield f"validation on {flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
 
 
-def _of_vehicle(found: Identification) -> Section:
+def _of_vehicle(found: VehicleIdentification) -> Section:
     rows = []
     for each in found.sample_times:
         chosen = " (chosen)" if math.isclose(each.sample_time, found.provenance.sample_time) else ""
