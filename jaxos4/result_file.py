@@ -34,9 +34,9 @@ _FIELD: Any = msgspec.field  # its types do not know that a field can have neith
 def _file_of(kind: type[Identification]) -> type[msgspec.Struct]:
     """The fields of a file of this kind of result: those of the result, with what has another form there."""
     own = [
-        (field.name, field.type, _FIELD(default=field.default, default_factory=field.default_factory))
-        for field in msgspec.structs.fields(kind)
-        if field.name not in APART
+        (x.name, x.type, _FIELD(name=x.encode_name, default=x.default, default_factory=x.default_factory))
+        for x in msgspec.structs.fields(kind)
+        if x.name not in APART
     ]
     others = [("constants", dict[str, Constant | float | bool]), ("airframe", dict[str, Any] | None)]
     return msgspec.defstruct("File", [*own, *others], kw_only=True)

@@ -267,7 +267,7 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
     assert not lost.optimum.is_lowest
     assert stages.count("fitting again where the cost is lower") <= 2
     assert lost.optimum.cost <= answer.optimum.cost
-    assert judge_vehicle(data, lost, [sample_time_of(lost)], "filter-error").doubts[0].result == "max_sweeps"
+    assert judge_vehicle(data, lost, [sample_time_of(lost)], "filter-error").issues[0].severity == "max_sweeps"
     # A search that did not converge has no profile.
     failed = eqx.tree_at(lambda e: e.result, found, jaxos4.RESULTS.at_bound)
     failed = corrected(answer.optimum._replace(estimate=failed), data)

@@ -317,7 +317,7 @@ def test_a_wrong_accelerometer_is_doubted():
     found = jaxos4.identify(flight, CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS, sample_time=0.008))
     value = found.held["az_bias"].value if "az_bias" in found.held else found.parameters["az_bias"].estimate
     assert value == pytest.approx(1.5, abs=0.15)
-    assert [d.cause for d in found.doubts if "levelled accelerometer" in d.cause] != []
+    assert [d.cause for d in found.issues if "levelled accelerometer" in d.cause] != []
 
 
 _GYROS_CLOCK = pytest.mark.xfail(

@@ -59,7 +59,7 @@ def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault
         causes = [str(error)]
     else:
         row["result"] = found.result
-        causes = [*map(str, found.doubts), *(r for v in found.verdicts.values() for r in v.reasons)]
+        causes = [*map(str, found.issues), *(r for v in found.verdicts.values() for r in v.reasons)]
         causes += found.provenance.notes
         row |= {n: each | {"status": found.verdicts[n].status} for n, each in shares_of_truth(found, vehicle).items()}
         if found.response is not None:

@@ -149,13 +149,13 @@ def _sizes(
 def _reservations(file: VehicleIdentification, quantity: str, *, spared: bool = False) -> tuple[float, bool]:
     """How far the reservations may move a quantity, as a share, and whether its verdict refuses it.
 
-    `spared`: whether one doubt that refuses it does not count.
+    `spared`: whether one issue that refuses it does not count.
     """
-    left = [(doubt.status_left(quantity), doubt.moves.get(quantity)) for doubt in file.doubts]
+    left = [(issue.status_left(quantity), issue.moves.get(quantity)) for issue in file.issues]
     # A reservation that does not say how far it moves the quantity is taken to move it as far as a reservation may.
     moves = [MAX_SHARE if move is None else move.share for status, move in left if status == RESERVED]
     refusing = sum(status not in (IDENTIFIED, RESERVED) for status, _ in left)
     verdict = file.verdicts.get(quantity)
-    # Without a doubt: it was not estimated well, or reservations contradict it together.
+    # Without an issue: it was not estimated well, or reservations contradict it together.
     by_verdict = verdict is not None and (verdict.status == CONTRADICTED or not (spared or verdict.trusted))
     return math.hypot(*moves), by_verdict or refusing > spared

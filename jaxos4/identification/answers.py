@@ -159,7 +159,7 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
 def overwhelmed(answer: Answer) -> dict[str, str]:
     """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
 
-    Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then doubted for that reason.
+    Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then flagged for that reason.
     """
     omega, mixer = np.asarray(answer.problem.flight.omega, dtype=float), np.asarray(answer.problem.model.airframe.mixer)
     torques = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0)

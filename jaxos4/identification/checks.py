@@ -27,7 +27,7 @@ from ..shooting import ShootingProblem, with_room
 from ..shooting.gains import LogNoise
 from .answers import Answer, overwhelmed, parameter_table, shared_fields, vehicle_constants
 from .data import Data, HeldOut, Progress, silent
-from .doubts import doubts_of_log, doubts_of_vehicle
+from .issues import issues_of_log, issues_of_vehicle
 from .quantities import vehicle_quantities
 from .results import PredictionSkill, RateSkill, RigidBody, SampleTime, VehicleIdentification
 from .search import Optimum
@@ -56,7 +56,7 @@ def judge_vehicle(
     found = VehicleIdentification(
         parameters={},
         result=search,
-        doubts=tuple(doubts_of_log(data.findings)),
+        issues=tuple(issues_of_log(data.findings)),
         sample_times=tuple(sample_times) if len(sample_times) > 1 else (),
         held=answer.fixed,
         noise={CHANNEL_NAMES[i]: float(np.asarray(answer.problem.sigma)[i]) for i in answer.problem.columns},
@@ -86,10 +86,10 @@ def judge_vehicle(
     values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
     response = frequency_response(with_room(answer.problem, data.room), values)
     quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
-    doubts = doubts_of_vehicle(
+    issues = issues_of_vehicle(
         data, answer, optimum, sample_times, table, body.constants, quantities, response, skill=achieved, still=still
     )
-    judged = judge(quantities, doubts)
+    judged = judge(quantities, issues)
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(data, answer, optimum, predicted)
     return msgspec.structs.replace(
@@ -98,7 +98,7 @@ def judge_vehicle(
         parameters=table,
         rigid_body=body,
         verdicts=judged.verdicts,
-        doubts=tuple(doubts),
+        issues=tuple(issues),
         result=judged.result(search, (ROLL.inertia, PITCH.inertia)),
         skill=achieved,
         predictions=predicted,

@@ -78,12 +78,12 @@ def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
     """The remedies of the causes that keep a quantity of these results from being identified."""
     for found in results:
         verdict = found.verdicts[name]
-        doubts = [each for each in found.doubts if each.status_left(name) != IDENTIFIED]
+        issues = [each for each in found.issues if each.status_left(name) != IDENTIFIED]
         # A verdict has the reasons of its own status alone.
-        yield from (each.remedy for each in doubts if any(each.cause in said for said in verdict.reasons))
+        yield from (each.remedy for each in issues if any(each.cause in said for said in verdict.reasons))
         for said in verdict.reasons:
             cause, _, remedy = said.rpartition("; ")
-            if cause and not cause.startswith(_VAGUE) and not any(each.cause in said for each in doubts):
+            if cause and not cause.startswith(_VAGUE) and not any(each.cause in said for each in issues):
                 yield remedy
-            elif verdict.status == MISSING and not found.is_vehicle and not doubts:
+            elif verdict.status == MISSING and not found.is_vehicle and not issues:
                 yield "fly what `jaxos4 design` proposes"

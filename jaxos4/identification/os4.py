@@ -42,7 +42,7 @@ from .data import (
     silent,
     versions,
 )
-from .doubts import doubts_of_log, doubts_of_os4
+from .issues import issues_of_log, issues_of_os4
 from .problem import FlightSettings, Intervals, bracket_of, os4_problem
 from .quantities import os4_quantities
 from .results import COLOURED, ChannelFit, Constant, OS4Identification, RigidBody, Validation
@@ -188,7 +188,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
 
 
 def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> OS4Identification:
-    """The result of the flight of an OS4 that an estimator searched: with rigid body, doubts and verdicts."""
+    """The result of the flight of an OS4 that an estimator searched: with rigid body, issues and verdicts."""
     name, _ = name_and_class(estimator)
     names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
     missing, limits, fit, traces, correlations = {}, dict.fromkeys(names), {}, None, None
@@ -209,22 +209,22 @@ def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> OS4Id
         model=class_name(answer.problem.model, MODELS),
         parameters=table,
         result=search,
-        doubts=tuple(doubts_of_log(data.findings)),
+        issues=tuple(issues_of_log(data.findings)),
         **shared_fields(data, answer, name),
     )
     if not answer.answered:
         return found
     body = _rigid_body(answer)
     # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
-    doubts = doubts_of_os4(data, search, table, body, fit if estimator.shoots else {})
-    judged = judge(os4_quantities(table, body), doubts)
+    issues = issues_of_os4(data, search, table, body, fit if estimator.shoots else {})
+    judged = judge(os4_quantities(table, body), issues)
     # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
     wrong = [name for name in table if judged.verdicts[name].status == CONTRADICTED]
     return msgspec.structs.replace(
         found,
         rigid_body=body,
         verdicts=judged.verdicts,
-        doubts=tuple(doubts),
+        issues=tuple(issues),
         result=judged.result(search, wrong if search == "successful" else table),
         fit=fit,
         validation=None if data.held_out is None else _validate_on(answer, data.held_out),

@@ -15,7 +15,7 @@ from ..estimate import Estimate
 from ..results import NO_ANSWER
 from ..shooting import ShootingProblem
 from .data import Provenance
-from .verdict import Doubt, Verdict
+from .verdict import Issue, Verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -187,7 +187,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
     - `verdicts`: for each quantity, whether it can be trusted, and why not. Empty without an answer.
-    - `doubts`: the failed checks of the estimate, and how far each would move each quantity.
+    - `issues`: the failed checks of the estimate, and how far each would move a quantity. In files: `doubts`.
     - `provenance`: inputs, settings, versions, and notes about the data.
     - `covariance`: of `parameters`; `None` without an answer.
     - `airframe`: the constants that were not estimated.
@@ -206,7 +206,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     parameters: dict[str, ParameterEstimate]
     rigid_body: RigidBody = RigidBody()
     verdicts: dict[str, Verdict] = {}
-    doubts: tuple[Doubt, ...] = ()
+    issues: tuple[Issue, ...] = msgspec.field(default=(), name="doubts")
     provenance: Provenance
     covariance: list[list[float]] | None
     airframe: Airframe
@@ -239,7 +239,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def warnings(self) -> tuple[str, ...]:
         """Why the estimate cannot be trusted, or only with care, and what to do; one line each."""
         said = "use with care: " if self.successful else "not to be trusted because "
-        return tuple(f"{said}{doubt}" for doubt in self.doubts)
+        return tuple(f"{said}{issue}" for issue in self.issues)
 
     @property
     def motor_clock(self) -> str:
@@ -260,7 +260,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
         `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`.
         """
-        fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in APART}
+        every = msgspec.structs.fields(self)
+        fields = {field.encode_name: getattr(self, field.name) for field in every if field.name not in APART}
         fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
         return msgspec.to_builtins(fields, enc_hook=as_list)
 

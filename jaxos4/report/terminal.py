@@ -101,7 +101,7 @@ def warning_lines(found: Identification) -> list[str]:
     flights, other = ("flights", ", or the flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "")
     said = f"warning: parts of the {flights} disagree, so that intervals were widened {' to '.join(factors)} times: "
     lacking = f"{said}{', '.join(wide)}. The model lacks an effect{other}."
-    return [*reason_lines(found.verdicts, found.doubts), *[lacking] * bool(wide)]
+    return [*reason_lines(found.verdicts, found.issues), *[lacking] * bool(wide)]
 
 
 def _notes(found: Identification) -> Section:
