@@ -24,7 +24,7 @@ from jaxos4.identification.results import Constant, ParameterEstimate, Predictio
 from jaxos4.identification.search import search
 from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, judge, reason_lines
+from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, judge, reason_lines, result_of
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -40,7 +40,7 @@ def flown(airframe=CRAZYFLIE, *, duration=20.0, seed=0, name="flight.csv", **loo
 
 
 def verdict_of(name, quantity, issues):
-    return judge({name: quantity}, issues).verdicts[name]
+    return judge({name: quantity}, issues)[name]
 
 
 @pytest.mark.parametrize(("share", "words"), [(0.004, "0.4 %"), (0.8149, "81 %"), (1.1, "110 %"), (10.0, "1000 %")])
@@ -96,7 +96,7 @@ def test_reservations_add_up_beside_an_impossible_parameter(moves, results, stat
         found = verdict_of("Ix", Quantity(), order)
         assert found.status == status
         assert verdict_of("Iy", Quantity(), order).status == IDENTIFIED
-    assert judge({"Ix": Quantity()}, issues).result("successful", ["Ix"]) == result
+    assert result_of(judge({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == result
     assert status == RESERVED or len(found.reasons) == 2
 
 
@@ -141,14 +141,14 @@ def test_an_axis_that_answers_otherwise_than_the_model_has_a_reservation(ratio, 
 def test_a_reservation_that_moves_a_quantity_by_more_than_itself_contradicts_it(share, status):
     issues = [Issue(RESERVATION, "cause", "b", {"Ix": Move(share, 9.0)})]
     assert verdict_of("Ix", Quantity(), issues).status == status
-    assert judge({"Ix": Quantity()}, issues).result("successful", ["Ix"]) == (
+    assert result_of(judge({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == (
         "successful" if status == RESERVED else "implausible"
     )
 
 
 def test_a_quantity_is_not_identified_without_those_that_it_requires():
     unknown = Quantity(missing="it hardly rolls")
-    found = judge({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, []).verdicts
+    found = judge({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, [])
     assert found["damping"].status == MISSING
     assert found["damping"].reasons == ("it cannot be trusted without Ix",)
 
@@ -171,12 +171,12 @@ def test_predictions_reach_as_far_as_their_skill_is_clear():
 def test_the_result_is_that_of_what_was_asked():
     issues = [Issue("no_skill", "a", "b", {"predictions": None}), Issue("implausible", "c", "d", {"Ix": None})]
     judged = judge(dict.fromkeys(("Ix", "Iy", "predictions"), Quantity()), issues)
-    assert judged.result("successful", ("Ix", "Iy")) == "implausible"
-    assert judged.result("successful", ("Iy",)) == "successful"
-    assert judged.result("successful", judged.verdicts) == "no_skill"
+    assert result_of(judged, issues, "successful", ("Ix", "Iy")) == "implausible"
+    assert result_of(judged, issues, "successful", ("Iy",)) == "successful"
+    assert result_of(judged, issues, "successful", judged) == "no_skill"
     vague = judge({"Ix": Quantity(spread=1.0)}, [])
-    assert vague.result("successful", ("Ix",)) == "unidentifiable"
-    assert vague.result("max_sweeps", ("Ix",)) == "max_sweeps"
+    assert result_of(vague, [], "successful", ("Ix",)) == "unidentifiable"
+    assert result_of(vague, [], "max_sweeps", ("Ix",)) == "max_sweeps"
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ from .issues import issues_of_log, issues_of_vehicle
 from .quantities import vehicle_quantities
 from .results import PredictionSkill, RateSkill, RigidBody, SampleTime, VehicleIdentification
 from .search import Optimum
-from .verdict import judge
+from .verdict import judge, result_of
 
 # Predictions that a result keeps: those of four minutes, 200 kB of a page.
 _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
@@ -89,7 +89,7 @@ def judge_vehicle(
     issues = issues_of_vehicle(
         data, answer, optimum, sample_times, table, body.constants, quantities, response, skill=achieved, still=still
     )
-    judged = judge(quantities, issues)
+    verdicts = judge(quantities, issues)
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(data, answer, optimum, predicted)
     return msgspec.structs.replace(
@@ -97,9 +97,9 @@ def judge_vehicle(
         provenance=msgspec.structs.replace(data.provenance, notes=notes),
         parameters=table,
         rigid_body=body,
-        verdicts=judged.verdicts,
+        verdicts=verdicts,
         issues=tuple(issues),
-        result=judged.result(search, (ROLL.inertia, PITCH.inertia)),
+        result=result_of(verdicts, issues, search, (ROLL.inertia, PITCH.inertia)),
         skill=achieved,
         predictions=predicted,
         trajectories=None if paths is None else paths.thinned(_MOST_TRAJECTORIES),

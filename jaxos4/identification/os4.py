@@ -46,7 +46,7 @@ from .issues import issues_of_log, issues_of_os4
 from .problem import FlightSettings, Intervals, bracket_of, os4_problem
 from .quantities import os4_quantities
 from .results import COLOURED, ChannelFit, Constant, OS4Identification, RigidBody, Validation
-from .verdict import CONTRADICTED, judge
+from .verdict import CONTRADICTED, judge, result_of
 
 MAX_PASSES = 3  # in which noise levels are found from residuals, before the last estimate
 SETTLED = 0.2  # largest change of a noise level; weights this close to the right ones cost under 1 % of the efficiency
@@ -217,15 +217,15 @@ def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> OS4Id
     body = _rigid_body(answer)
     # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
     issues = issues_of_os4(data, search, table, body, fit if estimator.shoots else {})
-    judged = judge(os4_quantities(table, body), issues)
+    verdicts = judge(os4_quantities(table, body), issues)
     # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
-    wrong = [name for name in table if judged.verdicts[name].status == CONTRADICTED]
+    wrong = [name for name in table if verdicts[name].status == CONTRADICTED]
     return msgspec.structs.replace(
         found,
         rigid_body=body,
-        verdicts=judged.verdicts,
+        verdicts=verdicts,
         issues=tuple(issues),
-        result=judged.result(search, wrong if search == "successful" else table),
+        result=result_of(verdicts, issues, search, wrong if search == "successful" else table),
         fit=fit,
         validation=None if data.held_out is None else _validate_on(answer, data.held_out),
         traces=traces,

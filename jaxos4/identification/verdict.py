@@ -136,37 +136,13 @@ class Quantity(NamedTuple):
     requires: tuple[str, ...] = ()
 
 
-class Judgement(NamedTuple):
-    """The verdict for each quantity, and the issues that refuse it: their places, and the result codes they lead to."""
-
-    verdicts: dict[str, Verdict]
-    refusals: dict[str, list[tuple[int, str]]]
-
-    def result(self, search: str, required: Iterable[str]) -> str:
-        """The name of the result code: `"successful"` if all required quantities can be trusted.
-
-        Otherwise that of the first issue that refuses one of them; `search`, of the search, if it has no answer.
-        """
-        refused = [name for name in required if not self.verdicts[name].trusted]
-        if not refused:
-            return "successful"
-        without_issue = (0, search if search != "successful" else "unidentifiable")
-        return min((each for name in refused for each in self.refusals[name]), default=without_issue)[1]
-
-
-def judge(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> Judgement:
+def judge(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> dict[str, Verdict]:
     """The verdict for each quantity. `issues`: all of the identification."""
-    verdicts, refusals = {}, {}
+    verdicts = {}
     for name, quantity in quantities.items():
         causes: dict[str, list[str]] = {status: [] for status in STATUSES}
-        refusals[name] = []
-        for place, status in enumerate(_statuses_left(issues, name)):
-            causes[status].append(_reason(issues[place], name))
-            # A reservation that contradicts together with another decides nothing by itself.
-            issue = issues[place]
-            is_reservation, alone = issue.severity == RESERVATION, issue.status_left(name)
-            if status not in _TRUSTED and (not is_reservation or alone not in _TRUSTED):
-                refusals[name].append((place, CONTRADICTION if is_reservation else issue.severity))
+        for issue, status in zip(issues, _statuses_left(issues, name), strict=True):
+            causes[status].append(_reason(issue, name))
         causes[RESERVED] += quantity.reservations
         if quantity.missing and not causes[MISSING]:
             causes[MISSING].append(quantity.missing)
@@ -182,7 +158,27 @@ def judge(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> Judgem
         if lacking and verdicts[name].trusted:
             why = f"it cannot be trusted without {' and '.join(lacking)}"
             verdicts[name] = Verdict(MISSING, quantity.value, (why,))
-    return Judgement(verdicts, refusals)
+    return verdicts
+
+
+def result_of(verdicts: Mapping[str, Verdict], issues: Sequence[Issue], search: str, required: Iterable[str]) -> str:
+    """The name of the result code: `"successful"` if all required quantities can be trusted.
+
+    Otherwise that of the first issue that refuses one of them. If there is none: `search`, the code of the search, or
+    `"unidentifiable"` if the search was successful.
+    """
+    refused = [name for name in required if not verdicts[name].trusted]
+    if not refused:
+        return "successful"
+    left = {name: _statuses_left(issues, name) for name in refused}
+    for place, issue in enumerate(issues):
+        for name in (each for each in refused if left[each][place] not in _TRUSTED):
+            if issue.severity != RESERVATION:
+                return issue.severity
+            # A reservation that contradicts together with another decides nothing by itself.
+            if issue.status_left(name) not in _TRUSTED:
+                return CONTRADICTION
+    return search if search != "successful" else "unidentifiable"
 
 
 def _statuses_left(issues: Sequence[Issue], name: str) -> list[str]:
