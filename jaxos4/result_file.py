@@ -61,10 +61,12 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
             raise InputError(f"not a result: {shortened(of_schema(error), 200)}; {_REMEDY}.") from None
         if fields["airframe"] is None:
             raise InputError(f"{fields['result']}: {_EMPTY}")
-        fields["airframe"], constants = airframe_from_table(fields["airframe"]), fields.pop("constants")
-        tests = {name: constants.pop(name) for name in ("consistency_p", "rigid_body") if name in constants}
-        found = kind(**fields, rigid_body=RigidBody(constants, *map(tests.get, ("consistency_p", "rigid_body"))))
-        if problem := next(_problems(found), None):
+        constants, tests = {}, {}
+        for name, each in fields.pop("constants").items():
+            (constants if isinstance(each, Constant) else tests)[name] = each
+        body = RigidBody(constants, tests.pop("consistency_p", None), tests.pop("rigid_body", None))
+        found = kind(**fields | {"airframe": airframe_from_table(fields["airframe"]), "rigid_body": body})
+        if problem := next(_problems(found, [*tests]), None):
             raise InputError(f"{problem}; {_AGAIN}")
     return found
 
@@ -82,14 +84,13 @@ def vehicle_result(found: Identification | str | os.PathLike[str]) -> VehicleIde
     return own
 
 
-def _problems(found: OS4Identification | VehicleIdentification) -> Iterator[str]:
-    """The faults that no result has, in words."""
+def _problems(found: OS4Identification | VehicleIdentification, unknown: list[str]) -> Iterator[str]:
+    """The faults that no result has, in words. `unknown`: numbers among the constants."""
     if found.result not in NAMES:
         yield f"`result` {shortened(found.result, 40)}: is not a result code"
-    constants, fixed = found.rigid_body.constants, found.held if isinstance(found, VehicleIdentification) else ()
-    strange = [name for name, row in constants.items() if not isinstance(row, Constant)]
-    names = (found.estimator, *found.parameters, *fixed, *found.verdicts, *constants)
-    if strange := strange or [each for each in names if not _NAME.fullmatch(each)]:
+    fixed = found.held if isinstance(found, VehicleIdentification) else ()
+    names = (found.estimator, *found.parameters, *fixed, *found.verdicts, *found.rigid_body.constants)
+    if strange := unknown + [each for each in names if not _NAME.fullmatch(each)]:
         yield f"{shortened(strange[0], 40)!r} is no name of an estimator, a parameter or a quantity"
     if found.covariance is not None:
         count = len(found.parameters)

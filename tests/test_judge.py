@@ -10,7 +10,7 @@ from scipy.special import chdtri
 
 import jaxos4
 from jaxos4.airframe import OS4
-from jaxos4.identification.answers import Answer, overwhelmed
+from jaxos4.identification.answers import Answer, dominated
 from jaxos4.identification.issues import issues_of_predictions, vibration
 from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.results import (
@@ -173,12 +173,12 @@ def test_a_disturbance_larger_than_the_control_is_named():
     counts = map(jnp.asarray, (0.0, 1, 1))
     estimate = jaxos4.Estimate(model.alpha, jnp.eye(8), jnp.zeros(3), *counts, RESULTS.successful)
     answer = Answer(problem, estimate, np.ones(8), 1, disturbances=gusts)
-    weak = overwhelmed(answer)
+    weak = dominated(answer)
     assert list(weak) == ["pitch"]
     assert "about pitch, the disturbance" in weak["pitch"]
-    assert not overwhelmed(answer._replace(fixed={"alpha6": FixedParameter(0.0, "1", "")}))
+    assert not dominated(answer._replace(fixed={"alpha6": FixedParameter(0.0, "1", "")}))
     # Vehicles hardly yaw: if nothing is known of it, the other axes do not need it.
-    assert list(overwhelmed(answer._replace(fixed={"alpha8": FixedParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
+    assert list(dominated(answer._replace(fixed={"alpha8": FixedParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.

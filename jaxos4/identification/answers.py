@@ -156,7 +156,7 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
     return "; ".join(notes)
 
 
-def overwhelmed(answer: Answer) -> dict[str, str]:
+def dominated(answer: Answer) -> dict[str, str]:
     """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
 
     Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then flagged for that reason.

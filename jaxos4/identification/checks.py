@@ -25,7 +25,7 @@ from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
 from ..shooting import ShootingProblem, with_room
 from ..shooting.gains import LogNoise
-from .answers import Answer, overwhelmed, parameter_table, shared_fields, vehicle_constants
+from .answers import Answer, dominated, parameter_table, shared_fields, vehicle_constants
 from .data import Data, HeldOut, Progress, silent
 from .issues import issues_of_log, issues_of_vehicle
 from .quantities import vehicle_quantities
@@ -76,7 +76,7 @@ def judge_vehicle(
     if 0 < len(still) < len(AXES):
         hardly = f"the held-out part hardly turns about {' and '.join(still)}"
         notes = [*notes, f"{hardly}; choose another with `begin`, `end` or `validate`"]
-    if YAW.motion in overwhelmed(answer):
+    if YAW.motion in dominated(answer):
         # Vehicles hardly yaw. The other axes do not need it.
         body = RigidBody({name: row for name, row in body.constants.items() if name != YAW.inertia})
         said = "not identified: the disturbance is larger"
@@ -84,7 +84,7 @@ def judge_vehicle(
         table |= {name: msgspec.structs.replace(table[name], note=said) for name in of_yaw}
         still = (*still, *({YAW.motion} - {*still}))
     values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
-    response = frequency_response(with_room(answer.problem, data.room), values)
+    response = frequency_response(with_room(answer.problem, data.capacity), values)
     quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
     issues = issues_of_vehicle(
         data, answer, optimum, sample_times, table, body.constants, quantities, response, skill=achieved, still=still
@@ -145,7 +145,7 @@ def predict_held_out(
     every = predicted_by(values, noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
     predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
     own, fixed = skill(predicted), [name in answer.fixed for name in names]
-    regressed = np.asarray(_regressed(with_room(answer.problem, data.room), as_float(values), np.asarray(fixed)))
+    regressed = np.asarray(_regressed(with_room(answer.problem, data.capacity), as_float(values), np.asarray(fixed)))
     compared = skill(predicted_by(regressed, None))
     tables = (own.skill, own.std, own.rmse, own.persistence, compared.skill)
     rates = {
@@ -166,7 +166,7 @@ def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
 def _traced(data: Data, problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise) -> Traced:
     """The disturbances and innovations of all samples of a flight."""
     samples = problem.flight.time.shape[0]
-    found = traced(with_room(problem, max(samples, data.room)), as_float(parameters), noise)
+    found = traced(with_room(problem, max(samples, data.capacity)), as_float(parameters), noise)
     return Traced(*(each[:samples] for each in found))
 
 

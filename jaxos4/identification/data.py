@@ -112,7 +112,7 @@ class Data(Generic[L]):
         return self.follows_commands and bool(getattr(self.likelihood, "answers_within", False))
 
     @property
-    def room(self) -> int:
+    def capacity(self) -> int:
         """The number of samples of a padded flight: checks at all sample times share their programs."""
         return self.likelihood.flight.time.shape[0]
 

@@ -15,9 +15,9 @@ from ..estimate import REACH
 from ..models.abstract import AbstractModel
 from ..recording.checks import Finding
 from ..results import meaning, result_names
-from .answers import Answer, overwhelmed
+from .answers import Answer, dominated
 from .data import Data
-from .issues_of_values import ALL_INERTIAS, consequences, issues_of_alphas, issues_of_iz, issues_of_values
+from .issues_of_values import ALL_INERTIAS, issues_of_alphas, issues_of_iz, issues_of_values
 from .results import (
     COLOURED,
     ChannelFit,
@@ -30,6 +30,7 @@ from .results import (
 )
 from .sample_time import is_white, moved
 from .search import Optimum
+from .uncertainty import consequences
 from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_BODY, Issue, Move, Moves
 
 # s; fitted measurements that last less give moments of inertia a reservation; those that last less than half of it do
@@ -95,11 +96,11 @@ def issues_of_vehicle(
     names of all. `skill`, `still`: see `issues_of_predictions`.
     """
     search, follow = str(result_names(answer.estimate.result)), partial(consequences, answer, optimum, constants)
-    weak, judged = overwhelmed(answer), table
+    weak, judged = dominated(answer), table
     if YAW.motion in weak:
         judged = {name: row for name, row in table.items() if name not in (YAW.coupling, YAW.inverse)}
     # What is known of a fixed parameter is its bracket.
-    widths = dict(zip(optimum.whole.names, np.asarray(optimum.whole.half_width).tolist(), strict=True))
+    widths = dict(zip(optimum.unknowns.names, np.asarray(optimum.unknowns.half_width).tolist(), strict=True))
     fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | answer.negative
     return [
         *(() if optimum.is_lowest else [Issue("max_sweeps", *_NOT_LOWEST, dict.fromkeys(quantities))]),
@@ -143,7 +144,7 @@ def _issues_of_limits(answer: Answer) -> Iterator[Issue]:
 
 
 def _issues_of_weak_axes(weak: Mapping[str, str]) -> Iterator[Issue]:
-    """Axes on which disturbances are larger than the torque of the rotors; see `overwhelmed`."""
+    """Axes on which disturbances are larger than the torque of the rotors; see `dominated`."""
     inertias = {axis.motion: axis.inertia for axis in AXES}
     for motion, why in weak.items():
         yield Issue("unidentifiable", why, f"fly more {motion}, or in calmer air", {inertias[motion]: None})

@@ -7,16 +7,12 @@ import numpy as np
 
 from ..airframe import AXES, INERTIAS, PITCH, ROLL, YAW, Airframe
 from ..analysis.inertia import fit_inertia
-from ..estimators import FilterError
 from ..models.abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..models.terms import DAMPED
 from ..recording.checks.evidence import HELD
-from ..results import result_names
 from .answers import Answer, drag_error, thrust_excess
 from .results import Constant, ParameterEstimate, RigidBody
-from .search import Optimum, deviations
-from .uncertainty import PROFILE_TOLERANCE
 from .verdict import CONTRADICTION, IMPROBABLE, MAX_PRIOR, RESERVATION, RIGID_BODY, SIGNIFICANT, Issue, Move, Moves
 
 Estimated = Mapping[str, tuple[float, float]]
@@ -47,10 +43,10 @@ def issues_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) ->
             yield Issue(CONTRADICTION, cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket))
     rotor, largest = body.constants.get("J_R"), body.constants.get(YAW.inertia)
     if rotor is not None and largest is not None:
-        remedy, room = "check `rotor_spins`, and which rotor is which", SIGNIFICANT * rotor.std
-        if rotor.estimate + room < 0:
+        remedy, margin = "check `rotor_spins`, and which rotor is which", SIGNIFICANT * rotor.std
+        if rotor.estimate + margin < 0:
             yield Issue(CONTRADICTION, f"J_R = {rotor.estimate:.3g} kg m^2 is negative", remedy, moves)
-        elif rotor.estimate - room > largest.estimate:
+        elif rotor.estimate - margin > largest.estimate:
             cause = f"J_R = {rotor.estimate:.3g} kg m^2 is larger than the {YAW.inertia} of the vehicle"
             yield Issue(CONTRADICTION, cause, remedy, moves)
     if body.consistency_p is not None and body.consistency_p < IMPROBABLE:
@@ -135,37 +131,6 @@ def contradicted(
             rare = ": motors were logged too rarely" * (why[0] == DAMPED and motor_step > HELD)
             cause = f"{parameter.name} = {value:.2g} {why[0]}{rare}"
             yield parameter, Issue(CONTRADICTION, cause, why[1], {**others, **own})
-
-
-def consequences(
-    answer: Answer, optimum: Optimum, constants: Mapping[str, Constant], name: str, value: float
-) -> dict[str, Move | None]:
-    """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
-
-    Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
-    moves if the search did not find this parameter. `None`: there is no such fit.
-    """
-    model, own, values = answer.problem.model, optimum.likelihood.problem.unknowns, optimum.values
-    if not np.asarray(own.free)[own.names.index(name)]:
-        return {}
-    other = optimum.restricted(FilterError(tolerance=PROFILE_TOLERANCE), {name: value})
-    others = {each: names for each, names in model.quantities.items() if name not in names}
-    if str(result_names(other.estimate.result)) not in ("successful", "at_bound"):
-        return dict.fromkeys((*constants, *others))
-    moved, std = other.values, deviations(answer.estimate.covariance)
-    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
-    factor = np.prod(moved[gains] / values[gains])
-    moves: dict[str, Move | None] = {}
-    for axis in AXES:
-        if (row := constants.get(axis.inertia)) is not None:
-            share = abs(factor * values[axis.place] / moved[axis.place] - 1)
-            moves[axis.inertia] = Move(float(share), float(share * row.estimate / row.std))
-    for quantity, names in others.items():
-        places = [i for i in map(own.names.index, names) if std[i] > 0]
-        if places:
-            change, width = np.abs(moved - values)[places], np.asarray(own.half_width)[places]
-            moves[quantity] = Move(float((change / width).max()), float((change / std[places]).max()))
-    return moves
 
 
 def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) -> Iterator[Issue]:

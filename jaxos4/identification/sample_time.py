@@ -25,7 +25,7 @@ from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..results import result_names
 from ..shooting import InnovationsProblem
-from .answers import Answer, overwhelmed, vehicle_constants
+from .answers import Answer, dominated, vehicle_constants
 from .data import Data, Progress, name_and_class, silent
 from .results import Constant, SampleTime
 from .search import Optimum, search
@@ -160,7 +160,7 @@ def search_sample_times(
         progress(f"fitting samples of {step:.3g} ms ({number} of {len(several)} sample times)")
         start, own = None, data.likelihood
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
-            start = start_of(own, optimum.first)
+            start = start_of(own, optimum.unrestricted)
         optimum = search(estimator, data.likelihood, start=start)
         optima.insert(0, optimum)
     return optima
@@ -192,10 +192,10 @@ def is_white(row: SampleTime) -> bool:
 def _agree(row: SampleTime, other: SampleTime) -> bool:
     """Whether the next longer sample time with an answer finds the same, and knows it no better."""
     shared = row.constants.keys() & other.constants.keys()
-    return bool(shared) and not moved(row, other) and not _vague(row, other)
+    return bool(shared) and not moved(row, other) and not _less_certain(row, other)
 
 
-def _vague(row: SampleTime, other: SampleTime) -> bool:
+def _less_certain(row: SampleTime, other: SampleTime) -> bool:
     """Whether another sample time knows Ix or Iy clearly better."""
     both = {ROLL.inertia, PITCH.inertia} & row.constants.keys() & other.constants.keys()
     return any(row.constants[name].std > WIDER * other.constants[name].std for name in both)
@@ -216,7 +216,7 @@ def sample_time_of(answer: Answer) -> SampleTime:
     scales = [each.name for each in answer.problem.model.parameters if each.scales_torque]
     answered = answer.answered and not any(name in answer.fixed for name in scales)
     constants = vehicle_constants(answer).constants if answered else {}
-    if answered and YAW.motion in overwhelmed(answer):
+    if answered and YAW.motion in dominated(answer):
         constants = {name: row for name, row in constants.items() if name != YAW.inertia}
     found = [answer.disturbances[axis.rate] for axis in AXES if axis.rate in answer.disturbances] * answer.answered
     largest, samples = max((row.correlation for row in found), key=abs, default=1.0), 0

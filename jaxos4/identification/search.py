@@ -19,9 +19,9 @@ from .data import Progress, silent
 from .results import Disturbance
 
 NEGATIVE = 2.0  # standard deviations below 0 from which a parameter that must not be negative is fixed at 0
-NEAR_PLAIN = 12.0  # standard deviations; further from its plain value, a parameter is never tried there
-# Parameters near their plain values are fixed there unless that raises the cost, prior included, by more: near a plain
-# value, a cost with kinks is not quadratic, and standard deviations are too small.
+NEAR_NOMINAL = 12.0  # standard deviations; further from its nominal value, a parameter is never tried there
+# Parameters near their nominal values are fixed there unless that raises the cost, prior included, by more: near a
+# nominal value, a cost with kinks is not quadratic, and standard deviations are too small.
 MAX_RISE = 5.0
 
 
@@ -29,9 +29,9 @@ class Optimum(NamedTuple):
     """The optimum that a search found with the likelihood of innovations.
 
     - `likelihood`: with what is fixed. `estimate`: of all its unknowns, with the covariance of the search.
-    - `first`: the estimate before any parameter was fixed. `whole`: the parameters at that time.
+    - `unrestricted`, `unknowns`: the estimate and the parameters before any parameter was fixed.
     - `rollouts`: of all searches together.
-    - `plain`: the parameters that are fixed at their plain values.
+    - `nominal`: the parameters that are fixed at their nominal values.
     - `negative`: value and standard deviation of those that came out negative, and are fixed at 0.
     - `freed`: the covariance that these would add if they were free.
     - `restarts`: how often a search began again where the cost is lower. `is_lowest`: false if the cost is known to be
@@ -40,10 +40,10 @@ class Optimum(NamedTuple):
 
     likelihood: InnovationsProblem
     estimate: Estimate
-    first: Estimate
-    whole: Unknowns
+    unrestricted: Estimate
+    unknowns: Unknowns
     rollouts: int
-    plain: tuple[str, ...] = ()
+    nominal: tuple[str, ...] = ()
     negative: dict[str, tuple[float, float]] = {}
     freed: Float[ArrayLike, "..."] = 0.0
     restarts: int = 0
@@ -67,14 +67,14 @@ class Optimum(NamedTuple):
     @property
     def std(self) -> Float[np.ndarray, " parameters"]:
         """Standard deviations of the parameters, by `covariance`."""
-        return deviations(self.covariance)[: self.whole.count]
+        return deviations(self.covariance)[: self.unknowns.count]
 
     @property
     def cost(self) -> float:
         """The cost with that of all brackets, which are Gaussian priors, also of parameters that are fixed."""
         own = self.likelihood.problem.unknowns
         fixed = ~np.asarray(own.free)
-        off = (np.asarray(own.center) - np.asarray(self.whole.center)) / np.asarray(self.whole.half_width)
+        off = (np.asarray(own.center) - np.asarray(self.unknowns.center)) / np.asarray(self.unknowns.half_width)
         return float(self.estimate.cost) + float(np.square(off[fixed]).sum()) / 2
 
     @property
@@ -109,7 +109,7 @@ def search(
     start: Float[np.ndarray, " unknowns"] | None = None,
     progress: Progress = silent,
 ) -> Optimum:
-    """The optimum without the parameters that came out negative, or near their plain values.
+    """The optimum without the parameters that came out negative, or near their nominal values.
 
     **Arguments:** `start`: of the search; by default that of the likelihood, also if there is no answer from `start`.
     """
@@ -123,7 +123,7 @@ def search(
     optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
-    return _at_plain_values(estimator, optimum, progress)
+    return _at_nominal_values(estimator, optimum, progress)
 
 
 def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
@@ -134,26 +134,26 @@ def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: P
     if not negative:
         return before
     progress("fitting again without what came out negative")
-    places = [before.whole.names.index(name) for name in negative]
+    places = [before.unknowns.names.index(name) for name in negative]
     covariance = np.asarray(before.estimate.covariance)
     freed = covariance[:, places] @ np.linalg.pinv(covariance[np.ix_(places, places)]) @ covariance[places]
     after = before.restricted(estimator, dict.fromkeys(negative, 0.0))
     return after._replace(negative=negative, freed=freed)
 
 
-def _at_plain_values(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
-    """The parameters near their plain values fixed there, unless that clearly raises the cost."""
-    plain = {
+def _at_nominal_values(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
+    """The parameters near their nominal values fixed there, unless that clearly raises the cost."""
+    nominal = {
         row.name: row.plain
         for row, value, std in _rows(before)
-        if row.plain is not None and std > 0 and abs(value - row.plain) < NEAR_PLAIN * std
+        if row.plain is not None and std > 0 and abs(value - row.plain) < NEAR_NOMINAL * std
     }
-    if not plain:
+    if not nominal:
         return before
     progress("fitting again without what the flights hardly show")
-    after = before.restricted(estimator, plain)
+    after = before.restricted(estimator, nominal)
     if has_answer(after.estimate.result) and after.cost - before.cost < MAX_RISE:
-        return after._replace(plain=tuple(plain))
+        return after._replace(nominal=tuple(nominal))
     return before._replace(rollouts=after.rollouts)
 
 

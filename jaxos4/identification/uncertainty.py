@@ -19,19 +19,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import as_float
-from ..airframe import INVERSES
+from ..airframe import AXES, INVERSES
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
-from ..results import NINETY_FIVE, has_answer
+from ..results import NINETY_FIVE, has_answer, result_names
 from ..shooting import InnovationsProblem
 from .answers import Answer
 from .data import Data, Progress, silent
-from .results import FixedParameter
-from .search import Optimum, disturbances_of, search
+from .results import Constant, FixedParameter
+from .search import Optimum, deviations, disturbances_of, search
+from .verdict import Move
 
 PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
-_PLAIN_NOTE = "at the usual value, which these flights do not contradict"
+_NOMINAL_NOTE = "at the usual value, which these flights do not contradict"
 
 
 MAX_PARTS = 20  # of flights that are compared
@@ -54,14 +55,14 @@ def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping
 
     `profile`: the factors of the profile, by parameter.
     """
-    names, units, values = optimum.whole.names, optimum.whole.units, optimum.values
-    notes, jackknife, longer = dict.fromkeys(optimum.plain, _PLAIN_NOTE), np.ones(values.size), np.ones(values.size)
+    names, units, values = optimum.unknowns.names, optimum.unknowns.units, optimum.values
+    notes, jackknife, longer = dict.fromkeys(optimum.nominal, _NOMINAL_NOTE), np.ones(values.size), np.ones(values.size)
     if has_answer(optimum.estimate.result):
-        free = np.flatnonzero(~np.isin(names, [*optimum.plain, *optimum.negative]))
+        free = np.flatnonzero(~np.isin(names, [*optimum.nominal, *optimum.negative]))
         jackknife[free] = _widening(optimum, free, data.clock.log)
         longer[: len(names)] = [profile.get(name, 1.0) for name in names]
         std = (jackknife * longer)[: len(names)] * optimum.std
-        known = np.asarray(is_identifiable(std, np.asarray(optimum.whole.half_width), GAUSSIAN_PRIOR))
+        known = np.asarray(is_identifiable(std, np.asarray(optimum.unknowns.half_width), GAUSSIAN_PRIOR))
         notes = {name: PRIOR_NOTE for name, is_known in zip(names, known, strict=True) if not is_known} | notes
 
     def of_free(factor: Float[np.ndarray, " unknowns"]) -> dict[str, float]:
@@ -98,7 +99,7 @@ def at_lowest(
         if not optimum.converged:
             return answer
         factors, lower = {}, None
-        poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.whole.count])
+        poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.unknowns.count])
         for place in sorted({*INVERSES} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
             end, fit = upper_end(optimum, place)
@@ -106,7 +107,7 @@ def at_lowest(
             if fit.converged and optimum.cost - fit.cost > LOWER:
                 lower = fit.values
                 break
-            factors[optimum.whole.names[place]] = max(end / NINETY_FIVE, 1.0)
+            factors[optimum.unknowns.names[place]] = max(end / NINETY_FIVE, 1.0)
         if lower is None:
             return corrected(optimum, data, factors)
         if not left:
@@ -139,7 +140,7 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
     unknowns, at, root, end, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
     for _ in range(MAX_FITS):
         unknowns, before, at = unknowns + (end - at) * along, at, end
-        fixed = {optimum.whole.names[place]: float(unknowns[place])}
+        fixed = {optimum.unknowns.names[place]: float(unknowns[place])}
         other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
         rise, unknowns, last = other.cost - optimum.cost, other.values, root
         if not other.converged or rise < -LOWER:
@@ -150,6 +151,37 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
         if abs(root - NINETY_FIVE) < CLOSE:
             break
     return end, other
+
+
+def consequences(
+    answer: Answer, optimum: Optimum, constants: Mapping[str, Constant], name: str, value: float
+) -> dict[str, Move | None]:
+    """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
+
+    Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
+    moves if the search did not find this parameter. `None`: there is no such fit.
+    """
+    model, own, values = answer.problem.model, optimum.likelihood.problem.unknowns, optimum.values
+    if not np.asarray(own.free)[own.names.index(name)]:
+        return {}
+    other = optimum.restricted(FilterError(tolerance=PROFILE_TOLERANCE), {name: value})
+    others = {each: names for each, names in model.quantities.items() if name not in names}
+    if str(result_names(other.estimate.result)) not in ("successful", "at_bound"):
+        return dict.fromkeys((*constants, *others))
+    moved, std = other.values, deviations(answer.estimate.covariance)
+    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
+    factor = np.prod(moved[gains] / values[gains])
+    moves: dict[str, Move | None] = {}
+    for axis in AXES:
+        if (row := constants.get(axis.inertia)) is not None:
+            share = abs(factor * values[axis.place] / moved[axis.place] - 1)
+            moves[axis.inertia] = Move(float(share), float(share * row.estimate / row.std))
+    for quantity, names in others.items():
+        places = [i for i in map(own.names.index, names) if std[i] > 0]
+        if places:
+            change, width = np.abs(moved - values)[places], np.asarray(own.half_width)[places]
+            moves[quantity] = Move(float((change / width).max()), float((change / std[places]).max()))
+    return moves
 
 
 def _widening(
@@ -164,7 +196,7 @@ def _widening(
     number = recording[np.minimum(middle, recording.size - 1)][used]
     gradient = np.asarray(segments.gradient)[used][:, free]
     information = np.asarray(segments.information)[used][:, free[:, None], free]
-    prior = np.diag(1 / np.square(np.asarray(optimum.whole.half_width)[free]))
+    prior = np.diag(1 / np.square(np.asarray(optimum.unknowns.half_width)[free]))
     ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
     return np.max([np.ones(free.size), *ways], axis=0)
 
