@@ -11,6 +11,7 @@ from scipy.special import chdtri
 import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.identification.answers import Answer, dominated
+from jaxos4.identification.intervals import disagreement, parts_of
 from jaxos4.identification.issues import issues_of_predictions, vibration
 from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.results import (
@@ -21,7 +22,6 @@ from jaxos4.identification.results import (
     PredictionSkill,
     RateSkill,
 )
-from jaxos4.identification.uncertainty import disagreement, parts_of
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import read_recording
 from jaxos4.results import RESULTS
@@ -231,7 +231,7 @@ def test_the_jackknife_of_many_unknowns_is_quick_and_the_same(monkeypatch):
     tiny = 1e-9 * np.eye(unknowns + 1)
     assert np.isfinite(disagreement(*doubled, tiny, part)).all()
     assert len(asked) == 60
-    monkeypatch.setattr("jaxos4.identification.uncertainty._CLEAR", np.inf)
+    monkeypatch.setattr("jaxos4.identification.intervals._CLEAR", np.inf)
     slowly = disagreement(gradient, information, np.zeros((unknowns, unknowns)), part)
     np.testing.assert_allclose(slowly, factors, rtol=1e-9)
 

@@ -11,13 +11,13 @@ from helpers import CRAZYFLIE
 from lanes import names
 
 import jaxos4
-from jaxos4.identification import uncertainty
+from jaxos4.identification import intervals
 from jaxos4.identification.checks import judge_vehicle
 from jaxos4.identification.data import Clock, Data
+from jaxos4.identification.intervals import at_lowest, corrected
 from jaxos4.identification.results import Provenance
 from jaxos4.identification.sample_time import sample_time_of
 from jaxos4.identification.search import search
-from jaxos4.identification.uncertainty import at_lowest, corrected
 from jaxos4.networks import for_flight
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
@@ -237,7 +237,7 @@ def fits_at_ends(monkeypatch, found, unknowns, share):
         cost = found.cost - prior + NINETY_FIVE**2 / 2 * share
         return eqx.tree_at(lambda e: (e.parameters, e.cost), found, (problem.start, cost))
 
-    monkeypatch.setattr(uncertainty, "FilterError", lambda tolerance: fit_at)
+    monkeypatch.setattr(intervals, "FilterError", lambda tolerance: fit_at)
 
 
 @pytest.mark.usefixtures("optimised")

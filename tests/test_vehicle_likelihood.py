@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import answers, uncertainty, vehicle
+from jaxos4.identification import answers, intervals, vehicle
 from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.intervals import corrected
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
 from jaxos4.identification.sample_time import chosen_place, moved, sample_time_of, search_sample_times
-from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
@@ -123,7 +123,7 @@ def all_of_one_kind(monkeypatch):
 @pytest.mark.slow
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
-    monkeypatch.setattr(uncertainty, "WELL_KNOWN", 0.0)
+    monkeypatch.setattr(intervals, "WELL_KNOWN", 0.0)
     monkeypatch.setattr(answers, "NOTED", 1.002)
     all_of_one_kind(monkeypatch)
     with compiled_programs() as programs:

@@ -17,12 +17,12 @@ from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification import verdict
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.checks import judge_vehicle
+from jaxos4.identification.intervals import consequences, corrected
 from jaxos4.identification.issues import few_parts, issues_of_log, stronger_or_weaker
 from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.identification.search import search
-from jaxos4.identification.uncertainty import consequences, corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, judge, reason_lines, result_of
 from jaxos4.models.os4 import CorrectedOS4

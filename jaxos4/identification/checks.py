@@ -66,7 +66,6 @@ def judge_vehicle(
     )
     if not answer.answered or optimum is None:
         return found
-    table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
     predicted = paths = achieved = None
     if data.held_out is not None:
         progress("predicting what was not fitted")
@@ -76,6 +75,7 @@ def judge_vehicle(
     if 0 < len(still) < len(AXES):
         hardly = f"the held-out part hardly turns about {' and '.join(still)}"
         notes = [*notes, f"{hardly}; choose another with `begin`, `end` or `validate`"]
+    table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
     if YAW.motion in dominated(answer):
         # Vehicles hardly yaw. The other axes do not need it.
         body = RigidBody({name: row for name, row in body.constants.items() if name != YAW.inertia})
@@ -85,21 +85,13 @@ def judge_vehicle(
         still = (*still, *({YAW.motion} - {*still}))
     values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
     response = frequency_response(with_room(answer.problem, data.capacity), values)
-    quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
-    issues = issues_of_vehicle(
-        data, answer, optimum, sample_times, table, body.constants, quantities, response, skill=achieved, still=still
-    )
-    verdicts = judge(quantities, issues)
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(data, answer, optimum, predicted)
-    return msgspec.structs.replace(
+    found = msgspec.structs.replace(
         found,
         provenance=msgspec.structs.replace(data.provenance, notes=notes),
         parameters=table,
         rigid_body=body,
-        verdicts=verdicts,
-        issues=tuple(issues),
-        result=result_of(verdicts, issues, search, (ROLL.inertia, PITCH.inertia)),
         skill=achieved,
         predictions=predicted,
         trajectories=None if paths is None else paths.thinned(_MOST_TRAJECTORIES),
@@ -107,6 +99,13 @@ def judge_vehicle(
         correlations=correlations,
         response=response,
     )
+    quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
+    issues = issues_of_vehicle(
+        data, answer, optimum, found, response, sample_times=sample_times, quantities=quantities, still=still
+    )
+    verdicts = judge(quantities, issues)
+    result = result_of(verdicts, issues, search, (ROLL.inertia, PITCH.inertia))
+    return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
 
 
 def _still_axes(answer: Answer, predicted: Predictions) -> tuple[str, ...]:

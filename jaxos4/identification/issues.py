@@ -14,23 +14,23 @@ from ..analysis.prediction import decisive_horizon
 from ..estimate import REACH
 from ..models.abstract import AbstractModel
 from ..recording.checks import Finding
-from ..results import meaning, result_names
+from ..results import meaning
 from .answers import Answer, dominated
 from .data import Data
+from .intervals import consequences
 from .issues_of_values import ALL_INERTIAS, issues_of_alphas, issues_of_iz, issues_of_values
 from .results import (
     COLOURED,
     ChannelFit,
     Constant,
     Disturbance,
-    ParameterEstimate,
+    OS4Identification,
     PredictionSkill,
-    RigidBody,
     SampleTime,
+    VehicleIdentification,
 )
 from .sample_time import is_white, moved
 from .search import Optimum
-from .uncertainty import consequences
 from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_BODY, Issue, Move, Moves
 
 # s; fitted measurements that last less give moments of inertia a reservation; those that last less than half of it do
@@ -45,20 +45,19 @@ _NOT_LOWEST = (
 )
 
 
-def issues_of_os4(
-    data: Data, search: str, table: Mapping[str, ParameterEstimate], body: RigidBody, fit: Mapping[str, ChannelFit]
-) -> list[Issue]:
+def issues_of_os4(data: Data, found: OS4Identification, fit: Mapping[str, ChannelFit]) -> list[Issue]:
     """The issues about the alphas of an OS4.
 
-    **Arguments:** `search`: the name of the result code of the search. `fit`: of the channels whose residuals are white
-    if the model is right; see `coloured`.
+    **Arguments:** `found`: with the result code of the search. `fit`: of the channels whose residuals are white if the
+    model is right; see `coloured`.
     """
+    search, table = found.result, found.parameters
     every = (*table, RIGID_BODY)
     # A flight that hardly depends on one alpha says nothing against the others.
     unseen = [name for name, row in table.items() if row.estimate is None and search == "unidentifiable"]
     return [
         *issues_of_log(data.findings, every),
-        *issues_of_alphas(table, body),
+        *issues_of_alphas(table, found.rigid_body),
         *coloured(fit, every),
         *_issues_of_search(search, unseen or every),
     ]
@@ -81,24 +80,22 @@ def issues_of_vehicle(
     data: Data,
     answer: Answer,
     optimum: Optimum,
-    sample_times: Sequence[SampleTime],
-    table: Mapping[str, ParameterEstimate],
-    constants: Mapping[str, Constant],
-    quantities: Iterable[str],
+    found: VehicleIdentification,
     response: FrequencyResponse,
     *,
-    skill: PredictionSkill | None,
+    sample_times: Sequence[SampleTime],
+    quantities: Iterable[str],
     still: Sequence[str],
 ) -> list[Issue]:
     """The issues about the estimate of a vehicle.
 
-    **Arguments:** `table`: of the parameters. `constants`: the moments of inertia that are judged. `quantities`: the
-    names of all. `skill`, `still`: see `issues_of_predictions`.
+    **Arguments:** `found`: parameters, the moments of inertia that are judged, the skill of predictions, and the result
+    code of the search. `quantities`: the names of all. `still`: see `issues_of_predictions`.
     """
-    search, follow = str(result_names(answer.estimate.result)), partial(consequences, answer, optimum, constants)
-    weak, judged = dominated(answer), table
+    search, constants, weak = found.result, found.rigid_body.constants, dominated(answer)
+    follow, judged = partial(consequences, answer, optimum, constants), found.parameters
     if YAW.motion in weak:
-        judged = {name: row for name, row in table.items() if name not in (YAW.coupling, YAW.inverse)}
+        judged = {name: row for name, row in judged.items() if name not in (YAW.coupling, YAW.inverse)}
     # What is known of a fixed parameter is its bracket.
     widths = dict(zip(optimum.unknowns.names, np.asarray(optimum.unknowns.half_width).tolist(), strict=True))
     fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | answer.negative
@@ -107,11 +104,11 @@ def issues_of_vehicle(
         *issues_of_log(data.findings),
         *few_parts(data.seconds),
         *_issues_of_weak_axes(weak),
-        *issues_of_iz(answer, table, constants),
+        *issues_of_iz(answer, found.parameters, constants),
         *issues_of_values(
             answer.problem.model, judged, constants, fixed, data.log_step, follow, motor_step=data.motor_step
         ),
-        *issues_of_predictions(skill, still),
+        *issues_of_predictions(found.skill, still),
         *_issues_of_sample_time(data, answer, sample_times, constants),
         *stronger_or_weaker(response, constants),
         *((search == "at_bound" and [*_issues_of_limits(answer)]) or _issues_of_search(search, quantities)),

@@ -45,7 +45,7 @@ from .data import (
 from .issues import issues_of_log, issues_of_os4
 from .problem import FlightSettings, Intervals, bracket_of, os4_problem
 from .quantities import os4_quantities
-from .results import COLOURED, ChannelFit, Constant, OS4Identification, RigidBody, Validation
+from .results import COLOURED, ChannelFit, Constant, OS4Identification, ParameterEstimate, RigidBody, Validation
 from .verdict import CONTRADICTED, judge, result_of
 
 MAX_PASSES = 3  # in which noise levels are found from residuals, before the last estimate
@@ -190,47 +190,44 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
 def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> OS4Identification:
     """The result of the flight of an OS4 that an estimator searched: with rigid body, issues and verdicts."""
     name, _ = name_and_class(estimator)
-    names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
-    missing, limits, fit, traces, correlations = {}, dict.fromkeys(names), {}, None, None
-    if (flown := answer.evaluation) is not None and answer.diagnostics is not None:
-        fit = _channel_fits(answer.problem, answer.diagnostics)
-        information = identifiability(flown, answer.problem.unknowns.bracket)
-        notes, known = information.notes(names), information.identifiable & information.excited
-        missing = {name: notes[name] for i, name in enumerate(names) if not known[i] and name in notes}
-        limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
-        if flown.feasible:
-            errors = np.where(np.isnan(flown.measured), np.nan, flown.errors)[:, : flown.problem.size]
-            traces, correlations = os4_traces(flown), residual_correlations(errors, flown.torques)
-    table = {
-        name: msgspec.structs.replace(row, noise_limit=limits[name])
-        for name, row in parameter_table(answer, estimator.prior, missing).items()
-    }
+    search, flown = str(result_names(answer.estimate.result)), answer.evaluation
     found = OS4Identification(
         model=class_name(answer.problem.model, MODELS),
-        parameters=table,
+        parameters=_alphas(answer, estimator.prior),
         result=search,
         issues=tuple(issues_of_log(data.findings)),
         **shared_fields(data, answer, name),
     )
-    if not answer.answered:
+    if flown is None or answer.diagnostics is None:
         return found
-    body = _rigid_body(answer)
-    # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
-    issues = issues_of_os4(data, search, table, body, fit if estimator.shoots else {})
-    verdicts = judge(os4_quantities(table, body), issues)
-    # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
-    wrong = [name for name in table if verdicts[name].status == CONTRADICTED]
-    return msgspec.structs.replace(
+    errors = np.where(np.isnan(flown.measured), np.nan, flown.errors)[:, : flown.problem.size]
+    found = msgspec.structs.replace(
         found,
-        rigid_body=body,
-        verdicts=verdicts,
-        issues=tuple(issues),
-        result=result_of(verdicts, issues, search, wrong if search == "successful" else table),
-        fit=fit,
+        rigid_body=_rigid_body(answer),
+        fit=_channel_fits(answer.problem, answer.diagnostics),
         validation=None if data.held_out is None else _validate_on(answer, data.held_out),
-        traces=traces,
-        correlations=correlations,
+        traces=os4_traces(flown) if flown.feasible else None,
+        correlations=residual_correlations(errors, flown.torques) if flown.feasible else None,
     )
+    # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
+    issues = issues_of_os4(data, found, found.fit if estimator.shoots else {})
+    verdicts = judge(os4_quantities(found.parameters, found.rigid_body), issues)
+    # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
+    wrong = [name for name in found.parameters if verdicts[name].status == CONTRADICTED]
+    result = result_of(verdicts, issues, search, wrong if search == "successful" else found.parameters)
+    return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
+
+
+def _alphas(answer: Answer, prior: float) -> dict[str, ParameterEstimate]:
+    """The estimate of each alpha, with the noise above which it cannot be distinguished from 0."""
+    names, missing, limits = answer.problem.unknowns.names, {}, {}
+    if answer.evaluation is not None:
+        information = identifiability(answer.evaluation, answer.problem.unknowns.bracket)
+        notes, known = information.notes(names), information.identifiable & information.excited
+        missing = {name: notes[name] for i, name in enumerate(names) if not known[i] and name in notes}
+        limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
+    table = parameter_table(answer, prior, missing)
+    return {name: msgspec.structs.replace(row, noise_limit=limits.get(name)) for name, row in table.items()}
 
 
 def _rigid_body(answer: Answer) -> RigidBody:

@@ -27,9 +27,9 @@ from ..results import result_names
 from ..shooting import InnovationsProblem
 from .answers import Answer, dominated, vehicle_constants
 from .data import Data, Progress, name_and_class, silent
+from .intervals import at_lowest, corrected
 from .results import Constant, SampleTime
 from .search import Optimum, search
-from .uncertainty import at_lowest, corrected
 
 DEFAULT = "filter-error"
 """The estimator of a vehicle, which flies in closed loop."""
