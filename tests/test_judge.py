@@ -1,5 +1,6 @@
 """Issues about an estimate of a vehicle, and the jackknife that widens its intervals."""
 
+import dataclasses
 from pathlib import Path
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from scipy.special import chdtri
 
 import jaxos4
 from jaxos4.airframe import OS4
-from jaxos4.identification.answers import Answer, dominated
+from jaxos4.identification.answers import VehicleAnswer, dominated
 from jaxos4.identification.intervals import disagreement, parts_of
 from jaxos4.identification.issues import issues_of_predictions, vibration
 from jaxos4.identification.issues_of_values import issues_of_values
@@ -172,13 +173,17 @@ def test_a_disturbance_larger_than_the_control_is_named():
     problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12))
     counts = map(jnp.asarray, (0.0, 1, 1))
     estimate = jaxos4.Estimate(model.alpha, jnp.eye(8), jnp.zeros(3), *counts, RESULTS.successful)
-    answer = Answer(problem, estimate, np.ones(8), 1, disturbances=gusts)
+    nothing = {"optimum": None, "widened": {}}
+    answer = VehicleAnswer(problem, estimate, np.ones(8), 1, disturbances=gusts, **nothing)
     weak = dominated(answer)
     assert list(weak) == ["pitch"]
     assert "about pitch, the disturbance" in weak["pitch"]
-    assert not dominated(answer._replace(fixed={"alpha6": FixedParameter(0.0, "1", "")}))
+    no_pitch, no_yaw = (
+        dataclasses.replace(answer, fixed={name: FixedParameter(0.0, "1", "")}) for name in ("alpha6", "alpha8")
+    )
+    assert not dominated(no_pitch)
     # Vehicles hardly yaw: if nothing is known of it, the other axes do not need it.
-    assert list(dominated(answer._replace(fixed={"alpha8": FixedParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
+    assert list(dominated(no_yaw)) == ["pitch", "yaw"]
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.

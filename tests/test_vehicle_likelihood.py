@@ -182,20 +182,21 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     data = data_of(flown(), DT)
     (optimum,) = search_sample_times([data], SOLVER)
-    answer = corrected(optimum, data)
+    answer = corrected(optimum)
     assert set(sample_time_of(answer).constants) == {"Ix", "Iy", "Iz"}
     place = answer.problem.model.parameter_names.index("thrust_gain")
     unknown = np.asarray(answer.estimate.covariance).copy()
     unknown[place, place] = 0.45**2
     fixed = {"thrust_gain": FixedParameter(float(answer.estimate.parameters[place]), "1", "not identifiable")}
     estimate = eqx.tree_at(lambda e: e.covariance, answer.estimate, jnp.asarray(unknown))
-    weak = answer._replace(estimate=estimate, fixed=fixed)
+    weak = dataclasses.replace(answer, estimate=estimate, fixed=fixed)
     for name, row in vehicle_constants(weak).constants.items():
         assert row.estimate == pytest.approx(vehicle_constants(answer).constants[name].estimate)
         assert row.std > 0.4 * row.estimate
     assert not sample_time_of(weak).constants
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
-    unclear = answer._replace(fixed=dict.fromkeys(answer.problem.unknowns.names, fixed["thrust_gain"]))
+    every = dict.fromkeys(answer.problem.unknowns.names, fixed["thrust_gain"])
+    unclear = dataclasses.replace(answer, fixed=every)
     assert not sample_time_of(unclear).constants
 
 

@@ -185,21 +185,20 @@ def fitted():
     flight = flown(OS4, duration=20.0, seed=5, gust=5.0, name="os4.csv")
     settings = jaxos4.VehicleSettings(sample_time=0.032)
     (data,) = prepare_vehicle([flight], OS4, settings)
-    optimum = search(jaxos4.FilterError(tolerance=1e-3), data.likelihood)
-    return data, corrected(optimum, data)
+    return corrected(search(jaxos4.FilterError(tolerance=1e-3), data))
 
 
 @pytest.mark.slow
 def test_a_parameter_at_another_value_moves_the_others(fitted):
     """The cost rises by as much as the parameter says. The thrust is the scale of the inertias."""
-    answer = fitted[1]
+    answer = fitted
     names, values = answer.problem.unknowns.names, np.asarray(answer.estimate.parameters)
     constants = {"Iy": Constant(1 / values[5], 1e-4, "kg m^2")}
 
     def moves(name, deviations):
         place = names.index(name)
         value = values[place] + deviations * answer.bound[place]
-        return consequences(answer, answer.optimum, constants, name, value)
+        return consequences(answer, constants, name, value)
 
     gain = names.index("thrust_gain")
     thrust = moves("thrust_gain", 3.0)
@@ -269,8 +268,7 @@ def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
 
 
 def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
-    data, answer = fitted
-    vehicle = judge_vehicle(data, answer, (), "filter-error")
+    vehicle = judge_vehicle(fitted, (), "filter-error")
     assert vehicle.successful
     for name, truth in zip(("Ix", "Iy"), np.asarray(OS4.inertia).tolist(), strict=False):
         row = vehicle.rigid_body.constants[name]
@@ -279,7 +277,7 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
         assert "if arms and mass are right" in vehicle.verdicts[name].value
         assert abs(row.estimate - truth) < 3 * row.std
     assert vehicle.verdicts["Iz"].status == MISSING
-    known = vehicle_constants(answer._replace(fixed={})).constants["Iz"]
+    known = vehicle_constants(dataclasses.replace(fitted, fixed={})).constants["Iz"]
     assert known.note == "if mass and the ratio of drag to thrust, 0.024 m, are right"
     assert "fly more yaw" in vehicle.verdicts["Iz"].reasons[0]
     assert "s ahead" in vehicle.verdicts["predictions"].value
@@ -293,7 +291,7 @@ def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
     table = dict.fromkeys(("alpha3", "alpha6", "alpha8", "thrust_gain", "rotor_delay"), row)
     constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy", "Iz")}
-    found = vehicle_quantities(fitted[1], table, constants, None, [])
+    found = vehicle_quantities(fitted, table, constants, None, [])
     wider = [each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations if "wider" in each]
     assert wider == [
         "Ix is 2.5 times the guess; check `mass` and `rotor_positions`, or give a wider `bracket`",

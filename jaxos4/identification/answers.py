@@ -1,7 +1,8 @@
 """`Answer`: an estimate with intervals; its parameters, and the moments of inertia of a vehicle, as tables."""
 
+import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -37,37 +38,26 @@ UNKNOWN = 1e3  # half-widths; standard deviation of an alpha that was not estima
 NOTED = 1.05  # the least factor of an interval that is noted, with one decimal
 
 
-class Answer(NamedTuple):
-    """An estimate of the parameters, with the noise that belongs to them and with what corrected its intervals.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Answer:
+    """An estimate of the parameters, with the noise that belongs to them; an `OS4Answer` or a `VehicleAnswer`.
 
     - `problem`: the flight and its model, with the noise levels of the sensors that were found.
     - `estimate`: its covariance is that of the intervals.
     - `bound`: standard deviations of the parameters if the model were right: the Cramer-Rao bound.
     - `rollouts`: of all searches together.
-
-    Only of a flight of an OS4:
-
-    - `evaluation`, `diagnostics`: the flight simulated at the estimate, and its residuals; `None` without an answer.
-
-    Only of a vehicle:
-
-    - `optimum`: where the search ended.
     - `fixed`: the parameters that are not estimated.
-    - `disturbances`: by channel.
-    - `widened`, `profiled`: by which factor the jackknife and the profile made an interval longer, by parameter.
+    - `negative`: value and standard deviation of the parameters that came out negative, and so are 0.
+    - `profiled`: by which factor the profile made an interval longer, by parameter.
     """
 
     problem: ShootingProblem
     estimate: Estimate
     bound: Float[np.ndarray, " parameters"]
     rollouts: int
-    evaluation: Evaluation | None = None
-    diagnostics: Diagnostics | None = None
-    optimum: Optimum | None = None
-    fixed: dict[str, FixedParameter] = {}
-    disturbances: dict[str, Disturbance] = {}
-    widened: dict[str, float] = {}
-    profiled: dict[str, float] = {}
+    fixed: Mapping[str, FixedParameter] = dataclasses.field(default_factory=dict, kw_only=True)
+    negative: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict, kw_only=True)
+    profiled: Mapping[str, float] = dataclasses.field(default_factory=dict, kw_only=True)
 
     @property
     def answered(self) -> bool:
@@ -75,19 +65,34 @@ class Answer(NamedTuple):
         return has_answer(self.estimate.result)
 
     @property
-    def negative(self) -> dict[str, tuple[float, float]]:
-        """Value and standard deviation of the parameters that came out negative, and so are 0."""
-        return {} if self.optimum is None else self.optimum.negative
-
-    @property
-    def restarts(self) -> int:
-        """The number of times that the search of a vehicle began again where the cost is lower."""
-        return 0 if self.optimum is None else self.optimum.restarts
-
-    @property
     def free(self) -> list[int]:
         """The places of the parameters that are estimated."""
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.fixed]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OS4Answer(Answer):
+    """The answer of a flight of an OS4.
+
+    - `evaluation`, `diagnostics`: the flight simulated at the estimate, and its residuals; `None` without an answer.
+    """
+
+    evaluation: Evaluation | None = None
+    diagnostics: Diagnostics | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VehicleAnswer(Answer):
+    """The answer of a vehicle.
+
+    - `optimum`: where the search ended.
+    - `disturbances`: by channel.
+    - `widened`: by which factor the jackknife made an interval longer, by parameter.
+    """
+
+    optimum: Optimum
+    disturbances: Mapping[str, Disturbance]
+    widened: Mapping[str, float]
 
 
 def shared_fields(data: Data, answer: Answer, estimator: str) -> dict[str, Any]:
@@ -156,7 +161,7 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
     return "; ".join(notes)
 
 
-def dominated(answer: Answer) -> dict[str, str]:
+def dominated(answer: VehicleAnswer) -> dict[str, str]:
     """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
 
     Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then flagged for that reason.

@@ -25,12 +25,11 @@ from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
 from ..shooting import ShootingProblem, with_room
 from ..shooting.gains import LogNoise
-from .answers import Answer, dominated, parameter_table, shared_fields, vehicle_constants
+from .answers import VehicleAnswer, dominated, parameter_table, shared_fields, vehicle_constants
 from .data import Data, HeldOut, Progress, silent
 from .issues import issues_of_log, issues_of_vehicle
 from .quantities import vehicle_quantities
 from .results import PredictionSkill, RateSkill, RigidBody, SampleTime, VehicleIdentification
-from .search import Optimum
 from .verdict import judge, result_of
 
 # Predictions that a result keeps: those of four minutes, 200 kB of a page.
@@ -40,36 +39,31 @@ REGRESSION = EquationError(memory=0.9)
 
 
 def judge_vehicle(
-    data: Data,
-    answer: Answer,
-    sample_times: Sequence[SampleTime],
-    estimator: str,
-    *,
-    progress: Progress = silent,
+    answer: VehicleAnswer, sample_times: Sequence[SampleTime], estimator: str, *, progress: Progress = silent
 ) -> VehicleIdentification:
     """The result of a vehicle, checked against the airframe, other sample times, and measurements that were not fitted.
 
     `sample_times`: that of the answer is among them. `estimator`: its name.
     """
     progress("checking the answer")
-    search, optimum = str(result_names(answer.estimate.result)), answer.optimum
+    search, data = str(result_names(answer.estimate.result)), answer.optimum.data
     found = VehicleIdentification(
         parameters={},
         result=search,
         issues=tuple(issues_of_log(data.findings)),
         sample_times=tuple(sample_times) if len(sample_times) > 1 else (),
-        held=answer.fixed,
+        held=dict(answer.fixed),
         noise={CHANNEL_NAMES[i]: float(np.asarray(answer.problem.sigma)[i]) for i in answer.problem.columns},
-        disturbances=answer.disturbances,
-        widened=answer.widened,
+        disturbances=dict(answer.disturbances),
+        widened=dict(answer.widened),
         **shared_fields(data, answer, estimator),
     )
-    if not answer.answered or optimum is None:
+    if not answer.answered:
         return found
     predicted = paths = achieved = None
     if data.held_out is not None:
         progress("predicting what was not fitted")
-        predicted, paths, achieved = predict_held_out(data, answer, optimum.noise, data.held_out)
+        predicted, paths, achieved = predict_held_out(answer, data.held_out)
     still = () if predicted is None else _still_axes(answer, predicted)
     notes = data.provenance.notes
     if 0 < len(still) < len(AXES):
@@ -86,7 +80,7 @@ def judge_vehicle(
     values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
     response = frequency_response(with_room(answer.problem, data.capacity), values)
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
-    traces, correlations = vehicle_traces(data, answer, optimum, predicted)
+    traces, correlations = vehicle_traces(answer, predicted)
     found = msgspec.structs.replace(
         found,
         provenance=msgspec.structs.replace(data.provenance, notes=notes),
@@ -100,15 +94,13 @@ def judge_vehicle(
         response=response,
     )
     quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
-    issues = issues_of_vehicle(
-        data, answer, optimum, found, response, sample_times=sample_times, quantities=quantities, still=still
-    )
+    issues = issues_of_vehicle(answer, found, response, sample_times=sample_times, quantities=quantities, still=still)
     verdicts = judge(quantities, issues)
     result = result_of(verdicts, issues, search, (ROLL.inertia, PITCH.inertia))
     return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
 
 
-def _still_axes(answer: Answer, predicted: Predictions) -> tuple[str, ...]:
+def _still_axes(answer: VehicleAnswer, predicted: Predictions) -> tuple[str, ...]:
     """The axes about which the held-out part hardly turns, or about which it was not measured."""
     still = []
     for axis, measured in zip(AXES, np.moveaxis(predicted.measured, 2, 0), strict=True):
@@ -119,16 +111,14 @@ def _still_axes(answer: Answer, predicted: Predictions) -> tuple[str, ...]:
     return tuple(still)
 
 
-def predict_held_out(
-    data: Data, answer: Answer, noise: LogNoise, held_out: HeldOut
-) -> tuple[Predictions, Predictions, PredictionSkill]:
+def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predictions, Predictions, PredictionSkill]:
     """Predict the rates of measurements that were not fitted, by the answer and by a regression with the same terms.
 
-    The answer, with the `noise` of its filters, predicts the disturbance too, from the measurements before each start.
+    The answer, with the noise of its filters, predicts the disturbance too, from the measurements before each start.
 
     **Returns:** its predictions at `HORIZONS`; those between start and end, as trajectories; and the skill.
     """
-    problem, names = held_out.problem, answer.problem.unknowns.names
+    data, problem, names = answer.optimum.data, held_out.problem, answer.problem.unknowns.names
     values = np.asarray(answer.estimate.parameters)[: len(names)]
 
     def predicted_by(values: np.ndarray, noise: LogNoise | None, horizons: tuple[float, ...] = HORIZONS) -> Predictions:
@@ -141,7 +131,7 @@ def predict_held_out(
             known = _traced(data, _together(data, held_out), parameters, noise).disturbance
         return predictions(problem, as_float(parameters), horizons=horizons, disturbance=known, noise=noise)
 
-    every = predicted_by(values, noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
+    every = predicted_by(values, answer.optimum.noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
     predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
     own, fixed = skill(predicted), [name in answer.fixed for name in names]
     regressed = np.asarray(_regressed(with_room(answer.problem, data.capacity), as_float(values), np.asarray(fixed)))
@@ -169,13 +159,12 @@ def _traced(data: Data, problem: ShootingProblem, parameters: np.ndarray, noise:
     return Traced(*(each[:samples] for each in found))
 
 
-def vehicle_traces(
-    data: Data, answer: Answer, optimum: Optimum, predicted: Predictions | None
-) -> tuple[Traces, Correlations]:
+def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tuple[Traces, Correlations]:
     """The signals of the fitted flights, and the correlations of the innovations.
 
     `predicted`: the predictions that the result keeps.
     """
+    optimum, data = answer.optimum, answer.optimum.data
     other = data.held_out
     problem = answer.problem if other is None or other.recording is not None else _together(data, other)
     values = np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count]

@@ -64,7 +64,7 @@ def identify(
     - `seed`: for training a network.
     - `progress`: called with the name of each stage.
 
-    **Returns:** an `Identification`. Check its `result`.
+    **Returns:** an `OS4Identification` or a `VehicleIdentification`. Check its `result`.
 
     **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
     """
@@ -83,8 +83,8 @@ def identify(
         name, wanted = vehicle_estimator(estimator, network), _settings(VehicleSettings, settings)
         several = prepare_vehicle(recordings, subject, wanted, bracket=bracket, validate=other)
         choose = wanted.sample_time is None
-        data, answer, sample_times = fit_vehicle(several, estimator, choose=choose, seed=seed, progress=progress)
-        found = judge_vehicle(data, answer, sample_times, name, progress=progress)
+        answer, sample_times = fit_vehicle(several, estimator, choose=choose, seed=seed, progress=progress)
+        found = judge_vehicle(answer, sample_times, name, progress=progress)
     else:
         options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
         wanted = _settings(FlightSettings, settings)

@@ -12,6 +12,7 @@ two factors, each of which is at least 1:
 A likelihood can have several maxima. If the cost is lower at an end than at the optimum, the search starts there again.
 """
 
+import dataclasses
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -24,9 +25,8 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
 from ..results import NINETY_FIVE, has_answer, result_names
-from ..shooting import InnovationsProblem
-from .answers import Answer
-from .data import Data, Progress, silent
+from .answers import VehicleAnswer
+from .data import Progress, silent
 from .results import Constant, FixedParameter
 from .search import Optimum, deviations, disturbances_of, search
 from .verdict import Move
@@ -48,7 +48,7 @@ MAX_MINIMA = 3  # whose ends are looked at
 _CLEAR = 1e-5  # the least share of a scaled unknown that the others do not explain, as a root
 
 
-def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping[str, float] = {}) -> Answer:
+def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAnswer:
     """The answer of a search: its intervals corrected, and without the parameters that are not identifiable.
 
     A parameter about which the flights say less than the bracket is not estimated.
@@ -56,10 +56,11 @@ def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping
     `profile`: the factors of the profile, by parameter.
     """
     names, units, values = optimum.unknowns.names, optimum.unknowns.units, optimum.values
+    problem, logs = optimum.data.problem, optimum.data.clock.log
     notes, jackknife, longer = dict.fromkeys(optimum.nominal, _NOMINAL_NOTE), np.ones(values.size), np.ones(values.size)
     if has_answer(optimum.estimate.result):
         free = np.flatnonzero(~np.isin(names, [*optimum.nominal, *optimum.negative]))
-        jackknife[free] = _widening(optimum, free, data.clock.log)
+        jackknife[free] = _widening(optimum, free, logs)
         longer[: len(names)] = [profile.get(name, 1.0) for name in names]
         std = (jackknife * longer)[: len(names)] * optimum.std
         known = np.asarray(is_identifiable(std, np.asarray(optimum.unknowns.half_width), GAUSSIAN_PRIOR))
@@ -69,15 +70,16 @@ def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping
         return {name: float(x) for name, x in zip(names, factor, strict=False) if x > 1 and name not in notes}
 
     covariance = as_float(optimum.covariance * np.outer(jackknife * longer, jackknife * longer))
-    sigma = np.array(data.problem.sigma)
-    sigma[data.problem.columns] = np.exp(optimum.noise.sensor)
+    sigma = np.array(problem.sigma)
+    sigma[problem.columns] = np.exp(optimum.noise.sensor)
     sigma = as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0))
-    return Answer(
-        problem=eqx.tree_at(lambda p: p.sigma, data.problem, sigma),
+    return VehicleAnswer(
+        problem=eqx.tree_at(lambda p: p.sigma, problem, sigma),
         estimate=eqx.tree_at(lambda e: e.covariance, optimum.estimate, covariance),
         bound=optimum.std,
         rollouts=optimum.rollouts,
         optimum=optimum,
+        negative=optimum.negative,
         fixed={x: FixedParameter(float(values[i]), units[i], notes[x]) for i, x in enumerate(names) if x in notes},
         disturbances=disturbances_of(optimum),
         widened=of_free(jackknife),
@@ -85,16 +87,12 @@ def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping
     )
 
 
-def at_lowest(
-    answer: Answer, data: Data[InnovationsProblem], estimator: AbstractEstimator, *, progress: Progress = silent
-) -> Answer:
+def at_lowest(answer: VehicleAnswer, estimator: AbstractEstimator, *, progress: Progress = silent) -> VehicleAnswer:
     """Profiles the likelihood, starts again at any lower minimum, and widens the intervals accordingly.
 
     A search that did not converge has no profile. `answer`: by `corrected`, of a search by the `estimator`.
     """
-    optimum = answer.optimum
-    if optimum is None:
-        return answer
+    optimum, data = answer.optimum, answer.optimum.data
     for left in reversed(range(MAX_MINIMA)):
         if not optimum.converged:
             return answer
@@ -109,21 +107,21 @@ def at_lowest(
                 break
             factors[optimum.unknowns.names[place]] = max(end / NINETY_FIVE, 1.0)
         if lower is None:
-            return corrected(optimum, data, factors)
+            return corrected(optimum, factors)
         if not left:
             break
         progress("fitting again where the cost is lower")
         counted = optimum.likelihood.noise_feedthrough
         same = data.likelihood.with_noise_feedthrough(counted)  # costs compare in the same likelihood only
-        other = search(estimator, same, start=lower, progress=progress)
+        other = search(estimator, dataclasses.replace(data, likelihood=same), start=lower, progress=progress)
         rollouts = optimum.rollouts + other.rollouts
         is_lower = has_answer(other.estimate.result) and other.cost < optimum.cost
         if not is_lower:
             optimum = optimum._replace(rollouts=rollouts)
             break
         optimum = other._replace(restarts=optimum.restarts + 1, rollouts=rollouts)
-        answer = corrected(optimum, data)
-    return corrected(optimum._replace(is_lowest=False), data)
+        answer = corrected(optimum)
+    return corrected(optimum._replace(is_lowest=False))
 
 
 def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
@@ -154,14 +152,15 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
 
 
 def consequences(
-    answer: Answer, optimum: Optimum, constants: Mapping[str, Constant], name: str, value: float
+    answer: VehicleAnswer, constants: Mapping[str, Constant], name: str, value: float
 ) -> dict[str, Move | None]:
     """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
 
     Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
     moves if the search did not find this parameter. `None`: there is no such fit.
     """
-    model, own, values = answer.problem.model, optimum.likelihood.problem.unknowns, optimum.values
+    model, optimum = answer.problem.model, answer.optimum
+    own, values = optimum.likelihood.problem.unknowns, optimum.values
     if not np.asarray(own.free)[own.names.index(name)]:
         return {}
     other = optimum.restricted(FilterError(tolerance=PROFILE_TOLERANCE), {name: value})

@@ -15,7 +15,7 @@ from ..estimate import REACH
 from ..models.abstract import AbstractModel
 from ..recording.checks import Finding
 from ..results import meaning
-from .answers import Answer, dominated
+from .answers import Answer, VehicleAnswer, dominated
 from .data import Data
 from .intervals import consequences
 from .issues_of_values import ALL_INERTIAS, issues_of_alphas, issues_of_iz, issues_of_values
@@ -30,7 +30,6 @@ from .results import (
     VehicleIdentification,
 )
 from .sample_time import is_white, moved
-from .search import Optimum
 from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_BODY, Issue, Move, Moves
 
 # s; fitted measurements that last less give moments of inertia a reservation; those that last less than half of it do
@@ -77,9 +76,7 @@ def coloured(fit: Mapping[str, ChannelFit], quantities: Iterable[str]) -> Iterat
 
 
 def issues_of_vehicle(
-    data: Data,
-    answer: Answer,
-    optimum: Optimum,
+    answer: VehicleAnswer,
     found: VehicleIdentification,
     response: FrequencyResponse,
     *,
@@ -93,23 +90,28 @@ def issues_of_vehicle(
     code of the search. `quantities`: the names of all. `still`: see `issues_of_predictions`.
     """
     search, constants, weak = found.result, found.rigid_body.constants, dominated(answer)
-    follow, judged = partial(consequences, answer, optimum, constants), found.parameters
+    optimum, data, judged = answer.optimum, answer.optimum.data, found.parameters
     if YAW.motion in weak:
         judged = {name: row for name, row in judged.items() if name not in (YAW.coupling, YAW.inverse)}
     # What is known of a fixed parameter is its bracket.
     widths = dict(zip(optimum.unknowns.names, np.asarray(optimum.unknowns.half_width).tolist(), strict=True))
-    fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | answer.negative
+    fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | dict(answer.negative)
+    follow = partial(consequences, answer, constants)
     return [
         *(() if optimum.is_lowest else [Issue("max_sweeps", *_NOT_LOWEST, dict.fromkeys(quantities))]),
         *issues_of_log(data.findings),
         *few_parts(data.seconds),
-        *_issues_of_weak_axes(weak),
+        *(
+            Issue("unidentifiable", weak[x.motion], f"fly more {x.motion}, or in calmer air", {x.inertia: None})
+            for x in AXES
+            if x.motion in weak
+        ),
         *issues_of_iz(answer, found.parameters, constants),
         *issues_of_values(
             answer.problem.model, judged, constants, fixed, data.log_step, follow, motor_step=data.motor_step
         ),
         *issues_of_predictions(found.skill, still),
-        *_issues_of_sample_time(data, answer, sample_times, constants),
+        *_issues_of_sample_time(answer, sample_times, constants),
         *stronger_or_weaker(response, constants),
         *((search == "at_bound" and [*_issues_of_limits(answer)]) or _issues_of_search(search, quantities)),
     ]
@@ -138,13 +140,6 @@ def _issues_of_limits(answer: Answer) -> Iterator[Issue]:
         concerned = dict.fromkeys(model_quantities(model, own.names[i]))
         cause = f"{own.names[i]} = {values[i]:.3g} {own.units[i]} is at the limit of the search around its bracket"
         yield Issue("at_bound", cause, "correct the airframe, or give a wider `bracket`", concerned)
-
-
-def _issues_of_weak_axes(weak: Mapping[str, str]) -> Iterator[Issue]:
-    """Axes on which disturbances are larger than the torque of the rotors; see `dominated`."""
-    inertias = {axis.motion: axis.inertia for axis in AXES}
-    for motion, why in weak.items():
-        yield Issue("unidentifiable", why, f"fly more {motion}, or in calmer air", {inertias[motion]: None})
 
 
 def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
@@ -196,13 +191,14 @@ def _compared(ratio: float) -> str:
 
 
 def _issues_of_sample_time(
-    data: Data, answer: Answer, sample_times: Sequence[SampleTime], constants: Mapping[str, Constant]
+    answer: VehicleAnswer, sample_times: Sequence[SampleTime], constants: Mapping[str, Constant]
 ) -> Iterator[Issue]:
     """Innovations that are not white; an inertia that changes with the sample time."""
     step, steps = float(answer.problem.flight.dt), [each.sample_time for each in sample_times]
+    vibrates = answer.optimum.data.vibrates
     place = steps.index(step) if step in steps else 0
     if len(steps) < 2:
-        yield from vibration(answer.disturbances, step, vibrates=data.vibrates)
+        yield from vibration(answer.disturbances, step, vibrates=vibrates)
         if sample_times:
             yield from _correlated(sample_times[place], {})
         return
@@ -212,7 +208,7 @@ def _issues_of_sample_time(
         name: Move(abs(two.estimate / one.estimate - 1), abs(two.estimate - one.estimate) / max(one.std, two.std))
         for name, one, two in both
     }
-    yield from vibration(answer.disturbances, step, moves, data.vibrates)
+    yield from vibration(answer.disturbances, step, moves, vibrates)
     yield from _correlated(own, moves)
     for name in (each for each in moved(own, other) if each in constants):
         values = [f"{each.constants[name].estimate:.3g} at {1e3 * each.sample_time:.3g} ms" for each in (own, other)]

@@ -29,7 +29,7 @@ from ..networks.for_flight import GivenNetwork, network_for, network_provenance
 from ..recording.checks import KINEMATIC, self_checks
 from ..results import has_answer, result_names
 from ..shooting import ShootingProblem, padded
-from .answers import UNIT, Answer, parameter_table, shared_fields
+from .answers import UNIT, Answer, OS4Answer, parameter_table, shared_fields
 from .data import (
     Clock,
     Data,
@@ -148,7 +148,7 @@ def _has_own_channels(kind: type[AbstractEstimator]) -> bool:
     return kind.looks_at != "all" and not kind.needs_network
 
 
-def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> Answer:
+def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> OS4Answer:
     """Estimate the parameters and the noise levels of one flight.
 
     The noise levels follow from the residuals, and the fit is repeated with them. The covariance of an estimator that
@@ -176,7 +176,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
             break
     estimate, rollouts = estimates[-1], sum(int(each.rollouts) for each in estimates)
     if not has_answer(estimate.result):
-        return Answer(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
+        return OS4Answer(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
     evaluation = evaluate(problem, estimate.parameters, estimate.initial_state)
     diagnostics = residual_diagnostics(evaluation)
     bound, covariance = evaluation.covariance, estimate.covariance
@@ -184,10 +184,11 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
         covariance = robust_covariance(evaluation) if (diagnostics.colour > COLOURED).any() else bound
     changed = as_float(covariance), as_float(evaluation.cost)
     estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, changed)
-    return Answer(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, evaluation, diagnostics)
+    bounds = np.sqrt(np.diagonal(bound))
+    return OS4Answer(problem, estimate, bounds, rollouts, evaluation=evaluation, diagnostics=diagnostics)
 
 
-def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> OS4Identification:
+def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator) -> OS4Identification:
     """The result of the flight of an OS4 that an estimator searched: with rigid body, issues and verdicts."""
     name, _ = name_and_class(estimator)
     search, flown = str(result_names(answer.estimate.result)), answer.evaluation
@@ -218,7 +219,7 @@ def judge_os4(data: Data, answer: Answer, estimator: AbstractEstimator) -> OS4Id
     return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
 
 
-def _alphas(answer: Answer, prior: float) -> dict[str, ParameterEstimate]:
+def _alphas(answer: OS4Answer, prior: float) -> dict[str, ParameterEstimate]:
     """The estimate of each alpha, with the noise above which it cannot be distinguished from 0."""
     names, missing, limits = answer.problem.unknowns.names, {}, {}
     if answer.evaluation is not None:

@@ -25,7 +25,7 @@ from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..results import result_names
 from ..shooting import InnovationsProblem
-from .answers import Answer, dominated, vehicle_constants
+from .answers import VehicleAnswer, dominated, vehicle_constants
 from .data import Data, Progress, name_and_class, silent
 from .intervals import at_lowest, corrected
 from .results import Constant, SampleTime
@@ -41,8 +41,6 @@ AGREE = 2.0  # standard deviations between two answers that agree
 DISCRETE = 0.03  # share of a value that errors of discretisation add to it
 WIDER = 1.5  # intervals longer by this factor than those of samples twice as long agree with anything
 NEAR_LIMIT = 0.95  # share of the way to its limit from which on an unknown is no start for another search
-
-Fit = tuple[Data[InnovationsProblem], Answer, SampleTime]
 
 
 def vehicle_estimator(estimator: str | AbstractEstimator, network: GivenNetwork) -> str:
@@ -66,7 +64,7 @@ def fit_vehicle(
     choose: bool,
     seed: int,
     progress: Progress,
-) -> tuple[Data[InnovationsProblem], Answer, tuple[SampleTime, ...]]:
+) -> tuple[VehicleAnswer, tuple[SampleTime, ...]]:
     """The parameters and the disturbances at the chosen sample time.
 
     `FilterError` searches at all sample times, and another estimator then at the chosen one.
@@ -74,23 +72,22 @@ def fit_vehicle(
     **Arguments:** `several`: the data, the shortest sample time first. `choose`: whether a sample time is to be chosen;
     otherwise it is the first. `seed`: for training a network.
 
-    **Returns:** the data that were chosen, their answer, and the answers at all sample times that belong together.
+    **Returns:** the answer, and a row for each sample time that belongs to it.
     """
     solver, is_default = FilterError(tolerance=TOLERANCE), estimator == DEFAULT
     compared = several if is_default or len(several) > 1 else ()
-    fits = fit_sample_times(compared, solver, choose=choose, progress=progress)
-    rows = [row for *_, row in fits]
-    place = chosen_place(rows) if choose and fits else 0
-    data = fits[place][0] if fits else several[0]
+    answers, rows = fit_sample_times(compared, solver, choose=choose, progress=progress)
+    place = chosen_place(rows) if choose and rows else 0
     if is_default:
-        answer = fits[place][1]
+        answer = answers[place]
     else:
+        data = answers[place].optimum.data if answers else several[0]
         data, solver = _with_estimator(data, estimator, seed=seed, progress=progress)
-        answer = corrected(search(solver, data.likelihood, progress=progress), data)
-    answer = at_lowest(answer, data, solver, progress=progress)
+        answer = corrected(search(solver, data, progress=progress))
+    answer = at_lowest(answer, solver, progress=progress)
     rows[place : place + 1] = [sample_time_of(answer)]
     # After a restart, the other sample times have the minimum that was left.
-    return data, answer, (rows[place],) if answer.restarts else tuple(rows)
+    return answer, (rows[place],) if answer.optimum.restarts else tuple(rows)
 
 
 def _with_estimator(
@@ -116,8 +113,8 @@ def _with_estimator(
 
 def fit_sample_times(
     several: Sequence[Data[InnovationsProblem]], solver: AbstractEstimator, *, choose: bool, progress: Progress
-) -> list[Fit]:
-    """The fits at the sample times that can be compared, the shortest first.
+) -> tuple[list[VehicleAnswer], list[SampleTime]]:
+    """The answers at the sample times that can be compared, the shortest first, and a row for each.
 
     Samples of commands that hold the controller's answers are another kind: feedthroughs hide nearly all that they
     show. They are fitted only if no others have white innovations, and the kind with the least correlated is returned.
@@ -125,23 +122,23 @@ def fit_sample_times(
     `choose`: whether the sample time is to be chosen; otherwise the kind of the first counts.
     """
     kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
-    best: list[Fit] = []
+    answers, rows = [], []
     for some in filter(None, kinds):
         if not choose and some[0] is not several[0]:
             continue
         optima = search_sample_times(some, solver, progress=progress)
         progress("computing intervals")
-        answers = [corrected(optimum, data) for optimum, data in zip(optima, some, strict=True)]
-        fits = [(data, answer, sample_time_of(answer)) for data, answer in zip(some, answers, strict=True)]
-        if not best or _least_correlation(fits) < _least_correlation(best):
-            best = fits
-        if any(row.constants and is_white(row) for *_, row in fits):
+        found = [corrected(optimum) for optimum in optima]
+        own = [sample_time_of(answer) for answer in found]
+        if not rows or _least_correlation(own) < _least_correlation(rows):
+            answers, rows = found, own
+        if any(row.constants and is_white(row) for row in own):
             break
-    return best
+    return answers, rows
 
 
-def _least_correlation(fits: Sequence[Fit]) -> float:
-    return min((abs(row.correlation) for *_, row in fits if row.constants), default=math.inf)
+def _least_correlation(rows: Sequence[SampleTime]) -> float:
+    return min((abs(row.correlation) for row in rows if row.constants), default=math.inf)
 
 
 def search_sample_times(
@@ -161,7 +158,7 @@ def search_sample_times(
         start, own = None, data.likelihood
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
             start = start_of(own, optimum.unrestricted)
-        optimum = search(estimator, data.likelihood, start=start)
+        optimum = search(estimator, data, start=start)
         optima.insert(0, optimum)
     return optima
 
@@ -211,7 +208,7 @@ def moved(row: SampleTime, other: SampleTime) -> list[str]:
     return [name for name in both if differs(row.constants[name], other.constants[name])]
 
 
-def sample_time_of(answer: Answer) -> SampleTime:
+def sample_time_of(answer: VehicleAnswer) -> SampleTime:
     """The answer of one sample time. Without a thrust there is no scale of torques, and so no answer."""
     scales = [each.name for each in answer.problem.model.parameters if each.scales_torque]
     answered = answer.answered and not any(name in answer.fixed for name in scales)

@@ -15,7 +15,7 @@ from ..models.abstract import Parameter
 from ..results import has_answer, result_names
 from ..shooting import InnovationsProblem, Parts, Unknowns
 from ..shooting.gains import LogNoise
-from .data import Progress, silent
+from .data import Data, Progress, silent
 from .results import Disturbance
 
 NEGATIVE = 2.0  # standard deviations below 0 from which a parameter that must not be negative is fixed at 0
@@ -28,7 +28,8 @@ MAX_RISE = 5.0
 class Optimum(NamedTuple):
     """The optimum that a search found with the likelihood of innovations.
 
-    - `likelihood`: with what is fixed. `estimate`: of all its unknowns, with the covariance of the search.
+    - `data`: that were searched. `likelihood`: theirs, with what is fixed.
+    - `estimate`: of all its unknowns, with the covariance of the search.
     - `unrestricted`, `unknowns`: the estimate and the parameters before any parameter was fixed.
     - `rollouts`: of all searches together.
     - `nominal`: the parameters that are fixed at their nominal values.
@@ -38,6 +39,7 @@ class Optimum(NamedTuple):
       lower elsewhere.
     """
 
+    data: Data[InnovationsProblem]
     likelihood: InnovationsProblem
     estimate: Estimate
     unrestricted: Estimate
@@ -104,7 +106,7 @@ class Optimum(NamedTuple):
 
 def search(
     estimator: AbstractEstimator,
-    likelihood: InnovationsProblem,
+    data: Data[InnovationsProblem],
     *,
     start: Float[np.ndarray, " unknowns"] | None = None,
     progress: Progress = silent,
@@ -113,14 +115,14 @@ def search(
 
     **Arguments:** `start`: of the search; by default that of the likelihood, also if there is no answer from `start`.
     """
-    first, spent = None, 0
+    likelihood, first, spent = data.likelihood, None, 0
     if start is not None:
         first = jax.block_until_ready(estimator(likelihood.starting_from(start)))
         spent = int(first.rollouts)
     if first is None or not has_answer(first.result):
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
-    optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
+    optimum = Optimum(data, likelihood, first, first, likelihood.problem.unknowns, spent)
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_nominal_values(estimator, optimum, progress)
