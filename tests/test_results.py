@@ -54,7 +54,7 @@ def written(found, path):
 )
 def test_a_result_that_was_read_is_the_one_that_was_written(tmp_path, found):
     again = written(found, tmp_path / "found.json")
-    assert (again.estimate, again.problem) == (None, None)
+    assert (type(again), again.estimate, again.problem) == (type(found), None, None)
     assert again.to_dict() == found.to_dict()
     assert printed(again) == printed(found)
     assert written(again, tmp_path / "again.json").to_dict() == found.to_dict()
