@@ -54,7 +54,7 @@ def fit(estimator: str, flight: jaxos4.Flight, vehicle: jaxos4.Airframe, i: int)
     except InputError as error:
         return {"result": "refused", "why": str(error), "seconds": time.perf_counter() - begin}
     row: Row = {"result": found.result, "seconds": time.perf_counter() - begin}
-    row["doubts"] = [str(doubt) for doubt in found.doubts]
+    row["doubts"] = [str(issue) for issue in found.issues]
     row |= shares_of_truth(found, vehicle)
     gain = found.parameters.get("thrust_gain")
     if gain is not None and gain.estimate is not None and gain.std is not None:

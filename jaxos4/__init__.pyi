@@ -95,6 +95,8 @@ from .identification import (
     FlightInformation as FlightInformation,
     FlightSettings as FlightSettings,
     Identification as Identification,
+    OS4Identification as OS4Identification,
+    VehicleIdentification as VehicleIdentification,
     VehicleSettings as VehicleSettings,
     assess as assess,
     identify as identify,

@@ -1,7 +1,8 @@
 """Shapes that public signatures share, and the converters and checks of fields."""
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, SupportsFloat, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +34,37 @@ class Arrays(msgspec.Struct, frozen=True, eq=False):
             for name, kind in get_type_hints(type(self)).items():
                 if not isinstance(getattr(self, name), kind):
                     raise ValueError(f"`{name}` has another shape than the arrays beside it")
+
+
+def finite_or_none(value: SupportsFloat) -> float | None:
+    """A number, or `None` if it is not finite."""
+    return float(value) if math.isfinite(float(value)) else None
+
+
+def as_list(array: np.ndarray) -> list[Any]:
+    """An array as lists, for `enc_hook` of msgspec; `None` for what is not finite."""
+    values = array.astype(object)
+    values[~np.isfinite(array)] = None
+    return values.tolist()
+
+
+def as_array(kind: Any, values: Any) -> np.ndarray:
+    """The array of a field of `Arrays` from lists of numbers, for `dec_hook` of msgspec.
+
+    A missing number is NaN. An array without rows has the number of axes of the field, with the lengths that are known.
+    """
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError("is not an array of numbers") from None
+    if "int64" in kind.dtypes:
+        whole = np.where(np.abs(array) < 1 << 40, array, -1).astype(int)
+        if (whole != array).any():
+            raise ValueError("is not an array of whole numbers")
+        array = whole
+    _, *others = kind.dim_str.split()
+    lengths = [int(axis) if axis.isdigit() else 0 for axis in others]
+    return array.reshape(0, *lengths) if array.shape == (0,) else array
 
 
 def as_float(x: ArrayLike) -> Array:

@@ -47,6 +47,13 @@ NAMES = (
     "no_skill",
     "max_sweeps",
 )
+NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
+"""The results without an estimate."""
+
+
+def has_answer(result: RESULTS) -> bool:
+    """Whether there is an estimate at all, trustworthy or not."""
+    return str(result_names(result)) not in NO_ANSWER
 
 
 def meaning(name: str) -> str:

@@ -253,8 +253,8 @@ def test_no_torque_before_an_instant_answers_what_is_measured_at_it():
     """Means, and slower logs, hold such answers."""
     flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0), duration=16.0, seed=0)
     (every,), slow = as_recordings(flight), as_recordings(flight)[0].rows(slice(None, None, 2))
-    own, longer = prepare_vehicle([every], CINERAT, jaxos4.VehicleSettings()).data[:2]
-    slower = prepare_vehicle([slow], CINERAT, jaxos4.VehicleSettings()).data[0]
+    own, longer = prepare_vehicle([every], CINERAT, jaxos4.VehicleSettings())[:2]
+    slower = prepare_vehicle([slow], CINERAT, jaxos4.VehicleSettings())[0]
     assert not own.likelihood.answers_within
     assert longer.likelihood.answers_within
     assert slower.likelihood.answers_within
@@ -274,7 +274,7 @@ def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias
     references = jaxos4.random_references(duration=20.0, dt=0.004, key=first)
     flight = jaxos4.fly_closed_loop(loop, references, dt=0.004, key=second, substeps=4)
     settings = jaxos4.VehicleSettings(sample_time=0.008, holdout=0.0)
-    data = prepare_vehicle(as_recordings(flight), CINERAT, settings).data[0]
+    data = prepare_vehicle(as_recordings(flight), CINERAT, settings)[0]
     answer = jaxos4.FilterError(tolerance=1e-3)(data.likelihood)
     found = dict(zip(data.likelihood.unknowns.names, zip(answer.parameters, answer.std, strict=True), strict=True))
     truth = dict(zip(("alpha3", "alpha6"), 1 / np.asarray(CINERAT.inertia)[:2], strict=True))

@@ -140,7 +140,7 @@ def test_only_clear_frequencies_count_and_each_as_much_as_its_gain_is_known():
 
 def test_the_right_model_has_gain_one_and_phase_zero_and_a_late_one_a_negative_phase(flown):
     problem, values = flown
-    for axis in jaxos4.frequency_response(problem, values)[:2]:
+    for axis in [*jaxos4.frequency_response(problem, values)][:2]:
         agreement = axis.agreement()
         assert abs(math.log(agreement.ratio)) < 4 * agreement.error + 2e-3
         assert agreement.error < 0.02

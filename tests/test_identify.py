@@ -241,7 +241,7 @@ def test_a_search_that_fails_keeps_what_the_log_shows():
     recording, airframe = flown(CRAZYFLIE, 0, seconds=6.0), turned(CRAZYFLIE, "rotor_spins")
     found = jaxos4.identify(recording, airframe, bracket=diverging, settings=settings)
     assert found.result == "nonfinite_trajectory"
-    assert any("yaw answers the rotors with the opposite sign" in doubt.cause for doubt in found.doubts)
+    assert any("yaw answers the rotors with the opposite sign" in issue.cause for issue in found.issues)
 
 
 MODEL, OS4 = jaxos4.PublishedOS4(), jaxos4.OS4

@@ -1,5 +1,6 @@
-"""Doubts about an estimate of a vehicle, and the jackknife that widens its intervals."""
+"""Issues about an estimate of a vehicle, and the jackknife that widens its intervals."""
 
+import dataclasses
 from pathlib import Path
 
 import equinox as eqx
@@ -10,9 +11,10 @@ from scipy.special import chdtri
 
 import jaxos4
 from jaxos4.airframe import OS4
-from jaxos4.identification.answers import Answer, overwhelmed
-from jaxos4.identification.doubts import doubts_of_predictions, vibration
-from jaxos4.identification.doubts_of_values import doubts_of_values
+from jaxos4.identification.answers import VehicleAnswer, dominated
+from jaxos4.identification.intervals import disagreement, parts_of
+from jaxos4.identification.issues import issues_of_predictions, vibration
+from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.results import (
     Constant,
     Disturbance,
@@ -21,7 +23,6 @@ from jaxos4.identification.results import (
     PredictionSkill,
     RateSkill,
 )
-from jaxos4.identification.uncertainty import disagreement, parts_of
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import read_recording
 from jaxos4.results import RESULTS
@@ -58,27 +59,27 @@ def skill(**rates):
     return PredictionSkill([0.1, 0.248, 0.5], 100, **{name: rate(rates.get(name, 0.8)) for name in "pqr"})
 
 
-def doubts(changed=None, inertias=None, skill=None, still=(), **others):
-    """The doubts about a believable estimate, some of whose parameters or inertias (value, std) are changed."""
+def issues(changed=None, inertias=None, skill=None, still=(), **others):
+    """The issues about a believable estimate, some of whose parameters or inertias (value, std) are changed."""
     parameters, constants = believable()
     parameters |= {name: parameter(*values) for name, values in (changed or {}).items()}
     constants |= {name: Constant(*values, "kg m^2") for name, values in (inertias or {}).items()}
-    found = doubts_of_values(VEHICLE, parameters, constants, **others)
-    return (*found, *doubts_of_predictions(skill, still))
+    found = issues_of_values(VEHICLE, parameters, constants, **others)
+    return (*found, *issues_of_predictions(skill, still))
 
 
 def test_nothing_speaks_against_a_good_estimate_and_one_without_roll_and_pitch_is_none():
-    assert doubts(skill=skill()) == doubts() == ()
+    assert issues(skill=skill()) == issues() == ()
     # An uncertain parameter is no contradiction.
     for name in ("rotor_lag", "rotor_delay", "thrust_gain", "alpha1"):
-        assert doubts({name: (-0.5, 1.0)}) == ()
+        assert issues({name: (-0.5, 1.0)}) == ()
     # Rotors of a Crazyflie damp by 0.7 to 1.3 1/s, those of RotorPy's Hummingbird by 1.7. A poor log knows it poorly.
-    assert doubts({"roll_damping": (1.8, 0.1), "pitch_damping": (5.0, 1.0)}) == ()
+    assert issues({"roll_damping": (1.8, 0.1), "pitch_damping": (5.0, 1.0)}) == ()
     parameters, constants = believable()
     del parameters["alpha3"]
     parameters["alpha6"] = parameter(10.0, 5.0)
-    found = doubts_of_values(VEHICLE, parameters, {"Iz": constants["Iz"]})
-    assert [str(doubt).split()[0] for doubt in found] == ["roll", "pitch"]
+    found = issues_of_values(VEHICLE, parameters, {"Iz": constants["Iz"]})
+    assert [str(issue).split()[0] for issue in found] == ["roll", "pitch"]
 
 
 @pytest.mark.parametrize(
@@ -103,9 +104,9 @@ def test_nothing_speaks_against_a_good_estimate_and_one_without_roll_and_pitch_i
     ],
 )
 def test_a_parameter_that_contradicts_physics_is_named_with_its_cause(changed, words):
-    (doubt,) = doubts(changed)
-    assert doubt.result == IMPLAUSIBLE
-    assert [word for word in words if word not in str(doubt)] == []
+    (issue,) = issues(changed)
+    assert issue.severity == IMPLAUSIBLE
+    assert [word for word in words if word not in str(issue)] == []
 
 
 @pytest.mark.parametrize(
@@ -118,46 +119,46 @@ def test_a_parameter_that_contradicts_physics_is_named_with_its_cause(changed, w
     ],
 )
 def test_inertias_that_no_body_has_are_named(inertias, words):
-    found = doubts(inertias={name: (x, 0.02 * x) for name, x in inertias.items()})
-    assert {doubt.result for doubt in found} == {IMPLAUSIBLE}
+    found = issues(inertias={name: (x, 0.02 * x) for name, x in inertias.items()})
+    assert {issue.severity for issue in found} == {IMPLAUSIBLE}
     assert [word for word in words if word not in str(found[0])] == []
     # Inertias that are wrong because the thrust is are not named beside it.
-    wrong = doubts({"thrust_gain": (9.8, 0.2)}, {name: (x, 0.02 * x) for name, x in inertias.items()})
+    wrong = issues({"thrust_gain": (9.8, 0.2)}, {name: (x, 0.02 * x) for name, x in inertias.items()})
     assert len(wrong) == 1
 
 
 def test_a_gyro_that_vibrates_is_named():
     quiet, loud = (Disturbance(5.0, "rad/s^2", 0.25, 0.02, correlation) for correlation in (0.1, -0.6))
     assert not list(vibration({"p": quiet, "q": quiet, "r": quiet, "az": loud}, 0.004))
-    (doubt,) = vibration({"p": quiet, "q": loud, "r": quiet}, 0.004)
-    assert all(word in str(doubt) for word in ("noise of q", "-0.6", "`sample_time` 0.008", "log faster"))
+    (issue,) = vibration({"p": quiet, "q": loud, "r": quiet}, 0.004)
+    assert all(word in str(issue) for word in ("noise of q", "-0.6", "`sample_time` 0.008", "log faster"))
     # Longer samples would hide the motion too.
-    (doubt,) = vibration({"q": loud}, 0.008)
-    assert "sample_time" not in str(doubt)
+    (issue,) = vibration({"q": loud}, 0.008)
+    assert "sample_time" not in str(issue)
 
 
 @pytest.mark.parametrize(("rates", "axes"), [({"p": 0.0}, "roll"), ({"q": -1.0, "r": -0.1}, "pitch and yaw")])
 def test_predictions_of_a_fit_without_skill_are_not_believed(rates, axes):
     """Skill 0.1 s ahead is a reservation. Without any, predictions are refused; if clearly so, inertias too."""
-    (doubt,) = doubts(skill=skill(**rates))
-    assert (doubt.result, doubt.severity) == ("successful", "identified with a reservation")
-    assert doubt.moves == {"predictions": None}
-    assert axes in str(doubt)
-    assert doubts(skill=skill(**dict.fromkeys(rates))) == ()  # not measured
+    (issue,) = issues(skill=skill(**rates))
+    assert (issue.severity, issue.status) == ("successful", "identified with a reservation")
+    assert issue.moves == {"predictions": None}
+    assert axes in str(issue)
+    assert issues(skill=skill(**dict.fromkeys(rates))) == ()  # not measured
     # The held-out parts are too short for 0.25 s.
     short = RateSkill([-0.5, None, None], *[[None] * 3] * 4)
-    (doubt,) = doubts(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=short, q=short, r=short))
-    assert "roll and pitch and yaw no better than constant rates (skill p -0.5 at 0.1 s, " in str(doubt)
-    assert (doubt.result, set(doubt.moves)) == ("no_skill", {"predictions", "Ix", "Iy", "Iz"})
+    (issue,) = issues(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=short, q=short, r=short))
+    assert "roll and pitch and yaw no better than constant rates (skill p -0.5 at 0.1 s, " in str(issue)
+    assert (issue.severity, set(issue.moves)) == ("no_skill", {"predictions", "Ix", "Iy", "Iz"})
     # Each rate has its own horizon.
-    (doubt,) = doubts(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=skill().p, q=short, r=skill().r))
-    assert "predicts pitch no better than constant rates (skill q -0.5 at 0.1 s)" in str(doubt)
+    (issue,) = issues(skill=PredictionSkill([0.1, 0.248, 0.5], 14, p=skill().p, q=short, r=skill().r))
+    assert "predicts pitch no better than constant rates (skill q -0.5 at 0.1 s)" in str(issue)
     # An axis that the held-out part hardly shows has no skill to lose, and the cause comes before the missing skill.
     poor = skill(p=0.5, q=0.5, r=-2.0)
-    assert doubts(skill=poor, still=["yaw"]) == ()
-    (doubt,) = doubts(skill=poor, still=["roll", "pitch", "yaw"])
-    assert (doubt.result, "`validate`" in doubt.remedy) == ("no_skill", True)
-    first, second = doubts({"rotor_lag": (0.002, 0.001)}, skill=skill(p=-1.0), log_step=0.01)
+    assert issues(skill=poor, still=["yaw"]) == ()
+    (issue,) = issues(skill=poor, still=["roll", "pitch", "yaw"])
+    assert (issue.severity, "`validate`" in issue.remedy) == ("no_skill", True)
+    first, second = issues({"rotor_lag": (0.002, 0.001)}, skill=skill(p=-1.0), log_step=0.01)
     assert "rotor_lag = 0.002 s is shorter than a sample of the log, 0.01 s" in first.cause
     assert "predictions" in second.moves
 
@@ -172,13 +173,17 @@ def test_a_disturbance_larger_than_the_control_is_named():
     problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12))
     counts = map(jnp.asarray, (0.0, 1, 1))
     estimate = jaxos4.Estimate(model.alpha, jnp.eye(8), jnp.zeros(3), *counts, RESULTS.successful)
-    answer = Answer(problem, estimate, np.ones(8), 1, disturbances=gusts)
-    weak = overwhelmed(answer)
+    nothing = {"optimum": None, "widened": {}}
+    answer = VehicleAnswer(problem, estimate, np.ones(8), 1, disturbances=gusts, **nothing)
+    weak = dominated(answer)
     assert list(weak) == ["pitch"]
     assert "about pitch, the disturbance" in weak["pitch"]
-    assert not overwhelmed(answer._replace(fixed={"alpha6": FixedParameter(0.0, "1", "")}))
+    no_pitch, no_yaw = (
+        dataclasses.replace(answer, fixed={name: FixedParameter(0.0, "1", "")}) for name in ("alpha6", "alpha8")
+    )
+    assert not dominated(no_pitch)
     # Vehicles hardly yaw: if nothing is known of it, the other axes do not need it.
-    assert list(overwhelmed(answer._replace(fixed={"alpha8": FixedParameter(0.0, "1", "")}))) == ["pitch", "yaw"]
+    assert list(dominated(no_yaw)) == ["pitch", "yaw"]
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.
@@ -231,7 +236,7 @@ def test_the_jackknife_of_many_unknowns_is_quick_and_the_same(monkeypatch):
     tiny = 1e-9 * np.eye(unknowns + 1)
     assert np.isfinite(disagreement(*doubled, tiny, part)).all()
     assert len(asked) == 60
-    monkeypatch.setattr("jaxos4.identification.uncertainty._CLEAR", np.inf)
+    monkeypatch.setattr("jaxos4.identification.intervals._CLEAR", np.inf)
     slowly = disagreement(gradient, information, np.zeros((unknowns, unknowns)), part)
     np.testing.assert_allclose(slowly, factors, rtol=1e-9)
 

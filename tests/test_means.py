@@ -185,7 +185,7 @@ def answers(logged="speeds", **settings):
     terms = ("offset", "damping", "delay", "reaction", "accelerometer") + ("lag",) * (logged == "commands")
     fits = jaxos4.VehicleSettings(terms=terms, holdout=0.0)
     found = []
-    for data in prepare_vehicle(as_recordings(flight), CINERAT, fits).data:
+    for data in prepare_vehicle(as_recordings(flight), CINERAT, fits):
         if round(1e3 * float(data.problem.flight.dt)) in (8, 32):
             answer = jaxos4.FilterError(tolerance=1e-3)(data.likelihood)
             values = zip(answer.parameters.tolist(), answer.std.tolist(), strict=True)

@@ -7,17 +7,17 @@ from synthetic_identification import identified_flight, identified_vehicle
 
 from jaxos4.identification.next_flight import next_flight, spreads_of
 from jaxos4.identification.results import Constant, RigidBody
-from jaxos4.identification.verdict import RESERVED, Quantity, Verdict, judge, refusal, reservation
+from jaxos4.identification.verdict import RESERVATION, RESERVED, Issue, Quantity, Verdict, judge
 from jaxos4.report import write_flight_page
 
 HALF = {"Ix": 0.16, "Iy": 0.05, "Iz": 0.64}
 
 
-def vehicle(half=HALF, doubts=(), seconds=32.0):
+def vehicle(half=HALF, issues=(), seconds=32.0):
     """A vehicle whose moments of inertia are known to these shares, with verdicts to match."""
     constants = {name: Constant(1e-5, 1e-5 * each / 1.959963984540054, "kg m^2") for name, each in half.items()}
-    verdicts = judge({name: Quantity("", each) for name, each in half.items()}, doubts).verdicts
-    about = {"verdicts": verdicts, "doubts": tuple(doubts), "provenance": {"fitted_seconds": seconds}}
+    verdicts = judge({name: Quantity("", each) for name, each in half.items()}, issues)
+    about = {"verdicts": verdicts, "issues": tuple(issues), "provenance": {"fitted_seconds": seconds}}
     return identified_vehicle(rigid_body=RigidBody(constants), **about)
 
 
@@ -46,8 +46,8 @@ def test_time_is_that_of_all_flights_that_count():
 
 
 def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once():
-    calm = refusal("unidentifiable", "gusts are larger", "fly more yaw, or in calmer air", {"Iz": None})
-    slow = reservation("the log is slow", "log faster", {"Ix": None})
+    calm = Issue("unidentifiable", "gusts are larger", "fly more yaw, or in calmer air", {"Iz": None})
+    slow = Issue(RESERVATION, "the log is slow", "log faster", {"Ix": None})
     found = vehicle({"Ix": 0.05, "Iz": 0.05}, [calm, slow])
     unseen = Verdict("not identified", "", ("it is unseen; fly more yaw",))
     verdicts = found.verdicts | {"predictions": unseen, "drag": msgspec.structs.replace(unseen, status=RESERVED)}

@@ -11,13 +11,13 @@ from helpers import CRAZYFLIE
 from lanes import names
 
 import jaxos4
-from jaxos4.identification import uncertainty
-from jaxos4.identification.checks import check_vehicle
+from jaxos4.identification import intervals
+from jaxos4.identification.checks import judge_vehicle
 from jaxos4.identification.data import Clock, Data
+from jaxos4.identification.intervals import at_lowest, corrected
 from jaxos4.identification.results import Provenance
 from jaxos4.identification.sample_time import sample_time_of
 from jaxos4.identification.search import search
-from jaxos4.identification.uncertainty import at_lowest, corrected
 from jaxos4.networks import for_flight
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
@@ -86,7 +86,7 @@ def data_of(problem):
 
 def fitted(problem, **options):
     """The answer of `FilterError`, with intervals corrected by the jackknife."""
-    return corrected(search(jaxos4.FilterError(), problem, **options), data_of(problem))
+    return corrected(search(jaxos4.FilterError(), data_of(problem), **options))
 
 
 @functools.cache
@@ -197,7 +197,7 @@ def test_at_the_upper_end_of_a_wide_interval_the_least_cost_is_higher_by_two():
     data, answer = poorly_known()
     own, stages = data.likelihood.problem.unknowns, []
     place = own.names.index("alpha8")
-    wider = at_lowest(answer.optimum, data, jaxos4.FilterError(), progress=stages.append)
+    wider = at_lowest(answer, jaxos4.FilterError(), progress=stages.append)
     assert stages == ["computing intervals"]  # the other inertias are known well
     assert wider.rollouts > answer.rollouts
     assert wider.fixed == answer.fixed
@@ -221,7 +221,7 @@ def test_the_factor_of_the_jackknife_multiplies_that_of_the_profile():
     place = answer.problem.unknowns.names.index("alpha8")
     uneven = eqx.tree_at(lambda e: e.parts.gradient, answer.optimum.estimate, replace_fn=lambda x: 4 * x)
     optimum = answer.optimum._replace(estimate=uneven)
-    one, both = (corrected(optimum, data, factors) for factors in ({}, {"alpha8": 1.3}))
+    one, both = (corrected(optimum, factors) for factors in ({}, {"alpha8": 1.3}))
     assert one.widened != {}
     np.testing.assert_allclose(both.estimate.std[place], 1.3 * one.estimate.std[place])
     others = np.arange(one.estimate.std.size) != place
@@ -237,14 +237,14 @@ def fits_at_ends(monkeypatch, found, unknowns, share):
         cost = found.cost - prior + NINETY_FIVE**2 / 2 * share
         return eqx.tree_at(lambda e: (e.parameters, e.cost), found, (problem.start, cost))
 
-    monkeypatch.setattr(uncertainty, "FilterError", lambda tolerance: fit_at)
+    monkeypatch.setattr(intervals, "FilterError", lambda tolerance: fit_at)
 
 
 @pytest.mark.usefixtures("optimised")
 def test_an_inertia_whose_interval_has_no_end_is_not_identifiable(monkeypatch):
     data, answer = poorly_known()
     fits_at_ends(monkeypatch, answer.optimum.estimate, data.likelihood.problem.unknowns, 1 / 4)
-    lost = at_lowest(answer.optimum, data, jaxos4.FilterError())
+    lost = at_lowest(answer, jaxos4.FilterError())
     assert "alpha8" in lost.fixed
     assert "alpha8" not in {**lost.widened, **lost.profiled}
 
@@ -254,25 +254,24 @@ def test_a_search_starts_again_where_the_profile_finds_a_lower_cost(monkeypatch)
     data, answer = poorly_known()
     found, solver = answer.optimum.estimate, jaxos4.FilterError()
     aside, stages = eqx.tree_at(lambda e: e.cost, found, found.cost + 3.0), []  # it ended beside the minimum
-    better = at_lowest(answer.optimum._replace(estimate=aside), data, solver, progress=stages.append)
-    assert stages.count("fitting again where the cost is lower") == better.restarts == 1
+    aside = corrected(answer.optimum._replace(estimate=aside))
+    better = at_lowest(aside, solver, progress=stages.append)
+    assert stages.count("fitting again where the cost is lower") == better.optimum.restarts == 1
     assert better.rollouts > answer.rollouts
     assert abs(float(better.estimate.cost - found.cost)) < 2 * jaxos4.FilterError().tolerance
     assert (better.optimum.is_lowest, "alpha8" in better.profiled) == (True, True)
     # The search ends where it began, although the cost is lower at an end: no minimum is found.
     stages.clear()
     fits_at_ends(monkeypatch, found, data.likelihood.problem.unknowns, -1.0)
-    lost = at_lowest(answer.optimum, data, solver, progress=stages.append)
+    lost = at_lowest(answer, solver, progress=stages.append)
     assert not lost.optimum.is_lowest
     assert stages.count("fitting again where the cost is lower") <= 2
     assert lost.optimum.cost <= answer.optimum.cost
-    assert (
-        check_vehicle(data, lost, [sample_time_of(lost)], "filter-error", stages.append).doubts[0].result
-        == "max_sweeps"
-    )
+    assert judge_vehicle(lost, [sample_time_of(lost)], "filter-error").issues[0].severity == "max_sweeps"
     # A search that did not converge has no profile.
     failed = eqx.tree_at(lambda e: e.result, found, jaxos4.RESULTS.at_bound)
-    assert at_lowest(answer.optimum._replace(estimate=failed), data, solver).profiled == {}
+    failed = corrected(answer.optimum._replace(estimate=failed))
+    assert at_lowest(failed, solver).profiled == {}
 
 
 @pytest.mark.usefixtures("optimised")

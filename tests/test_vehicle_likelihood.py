@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import answers, uncertainty, vehicle
+from jaxos4.identification import answers, intervals, vehicle
 from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.intervals import corrected
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
 from jaxos4.identification.sample_time import chosen_place, moved, sample_time_of, search_sample_times
-from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
@@ -56,7 +56,7 @@ SOLVER = jaxos4.FilterError(tolerance=1e-3)
 def data_of(flight, sample_time):
     """As `jaxos4.identify` prepares it, so that all fits are one program."""
     settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=sample_time, holdout=0.0)
-    return prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings).data[0]
+    return prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings)[0]
 
 
 @eqx.filter_jit
@@ -123,7 +123,7 @@ def all_of_one_kind(monkeypatch):
 @pytest.mark.slow
 def test_four_sample_times_and_the_profile_need_one_program(monkeypatch):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
-    monkeypatch.setattr(uncertainty, "WELL_KNOWN", 0.0)
+    monkeypatch.setattr(intervals, "WELL_KNOWN", 0.0)
     monkeypatch.setattr(answers, "NOTED", 1.002)
     all_of_one_kind(monkeypatch)
     with compiled_programs() as programs:
@@ -182,20 +182,21 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     data = data_of(flown(), DT)
     (optimum,) = search_sample_times([data], SOLVER)
-    answer = corrected(optimum, data)
+    answer = corrected(optimum)
     assert set(sample_time_of(answer).constants) == {"Ix", "Iy", "Iz"}
     place = answer.problem.model.parameter_names.index("thrust_gain")
     unknown = np.asarray(answer.estimate.covariance).copy()
     unknown[place, place] = 0.45**2
     fixed = {"thrust_gain": FixedParameter(float(answer.estimate.parameters[place]), "1", "not identifiable")}
     estimate = eqx.tree_at(lambda e: e.covariance, answer.estimate, jnp.asarray(unknown))
-    weak = answer._replace(estimate=estimate, fixed=fixed)
+    weak = dataclasses.replace(answer, estimate=estimate, fixed=fixed)
     for name, row in vehicle_constants(weak).constants.items():
         assert row.estimate == pytest.approx(vehicle_constants(answer).constants[name].estimate)
         assert row.std > 0.4 * row.estimate
     assert not sample_time_of(weak).constants
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
-    unclear = answer._replace(fixed=dict.fromkeys(answer.problem.unknowns.names, fixed["thrust_gain"]))
+    every = dict.fromkeys(answer.problem.unknowns.names, fixed["thrust_gain"])
+    unclear = dataclasses.replace(answer, fixed=every)
     assert not sample_time_of(unclear).constants
 
 
@@ -317,7 +318,7 @@ def test_a_wrong_accelerometer_is_doubted():
     found = jaxos4.identify(flight, CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS, sample_time=0.008))
     value = found.held["az_bias"].value if "az_bias" in found.held else found.parameters["az_bias"].estimate
     assert value == pytest.approx(1.5, abs=0.15)
-    assert [d.cause for d in found.doubts if "levelled accelerometer" in d.cause] != []
+    assert [d.cause for d in found.issues if "levelled accelerometer" in d.cause] != []
 
 
 _GYROS_CLOCK = pytest.mark.xfail(

@@ -1,4 +1,4 @@
-"""A verdict for each quantity: a doubt counts by how far it would move the quantity."""
+"""A verdict for each quantity: an issue counts by how far it would move the quantity."""
 
 import dataclasses
 
@@ -15,15 +15,16 @@ from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification import verdict
-from jaxos4.identification.answers import Solution, vehicle_constants
-from jaxos4.identification.doubts import doubts_of_log, few_parts, stronger_or_weaker
-from jaxos4.identification.doubts_of_values import consequences, doubts_of_values
+from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.checks import judge_vehicle
+from jaxos4.identification.intervals import consequences, corrected
+from jaxos4.identification.issues import few_parts, issues_of_log, stronger_or_weaker
+from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.identification.search import search
-from jaxos4.identification.uncertainty import corrected
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.identification.verdict import Doubt, Move, Quantity, judge, reason_lines, reservation
+from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, judge, reason_lines, result_of
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -38,14 +39,14 @@ def flown(airframe=CRAZYFLIE, *, duration=20.0, seed=0, name="flight.csv", **loo
     return Recording.of(fly_standard(jaxos4.ClosedLoop(airframe, **settings), duration=duration, seed=seed), name)
 
 
-def verdict_of(name, quantity, doubts):
-    return judge({name: quantity}, doubts).verdicts[name]
+def verdict_of(name, quantity, issues):
+    return judge({name: quantity}, issues)[name]
 
 
 @pytest.mark.parametrize(("share", "words"), [(0.004, "0.4 %"), (0.8149, "81 %"), (1.1, "110 %"), (10.0, "1000 %")])
 def test_a_move_is_told_in_percent_without_a_power_of_ten(share, words):
-    doubt = Doubt("implausible", "it errs", "log faster", {"Ix": Move(share, 2.0)})
-    (reason,) = verdict_of("Ix", Quantity("1 kg m^2"), [doubt]).reasons
+    issue = Issue("implausible", "it errs", "log faster", {"Ix": Move(share, 2.0)})
+    (reason,) = verdict_of("Ix", Quantity("1 kg m^2"), [issue]).reasons
     assert reason.startswith(f"it errs (this would move it by {words})")
 
 
@@ -61,17 +62,17 @@ def test_a_move_is_told_in_percent_without_a_power_of_ten(share, words):
         (None, "successful", RESERVED),
     ],
 )
-def test_a_doubt_counts_by_how_far_it_moves_a_quantity(move, result, status):
-    doubt = Doubt(result, "the damping is impossible", "log faster", {"Ix": move})
-    found = verdict_of("Ix", Quantity("1 kg m^2"), [doubt])
+def test_an_issue_counts_by_how_far_it_moves_a_quantity(move, result, status):
+    issue = Issue(result, "the damping is impossible", "log faster", {"Ix": move})
+    found = verdict_of("Ix", Quantity("1 kg m^2"), [issue])
     assert found.status == status
     assert found.trusted == (status in (IDENTIFIED, RESERVED))
-    assert [doubt.cause in reason for reason in found.reasons] == [True] * (status != IDENTIFIED)
-    assert verdict_of("Iy", Quantity(), [doubt]).status == IDENTIFIED
+    assert [issue.cause in reason for reason in found.reasons] == [True] * (status != IDENTIFIED)
+    assert verdict_of("Iy", Quantity(), [issue]).status == IDENTIFIED
     # A note is listed too, and says that it is no more.
-    said = reason_lines({"Ix": found}, [doubt])
+    said = reason_lines({"Ix": found}, [issue])
     assert any("affects no quantity" in line for line in said) == (status == IDENTIFIED)
-    assert any("affects no quantity" in line for line in said) or any(doubt.cause in line for line in said)
+    assert any("affects no quantity" in line for line in said) or any(issue.cause in line for line in said)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +81,7 @@ def test_a_doubt_counts_by_how_far_it_moves_a_quantity(move, result, status):
         ([(0.09, 0.8), (0.2, 0.9)], ["implausible", "successful"], CONTRADICTED, "implausible"),
         ([(0.2, 0.9), (0.04, 1.3)], ["no_skill", "implausible"], CONTRADICTED, "no_skill"),
         ([(0.09, 0.4), (0.2, 0.5)], ["implausible", "successful"], RESERVED, "successful"),
-        # Nothing impossible, a note, and a doubt of unknown size do not count.
+        # Nothing impossible, a note, and an issue of unknown size do not count.
         ([(0.09, 0.8), (0.2, 5.0)], ["successful", "successful"], RESERVED, "successful"),
         ([(0.09, 0.8), (0.04, 0.9)], ["implausible", "successful"], RESERVED, "successful"),
         ([(0.09, 0.8), None], ["implausible", "successful"], RESERVED, "successful"),
@@ -88,14 +89,14 @@ def test_a_doubt_counts_by_how_far_it_moves_a_quantity(move, result, status):
 )
 def test_reservations_add_up_beside_an_impossible_parameter(moves, results, status, result):
     sized = [None if move is None else Move(*move) for move in moves]
-    doubts = [
-        Doubt(name, f"cause {i}", "b", {"Ix": move}) for i, (name, move) in enumerate(zip(results, sized, strict=True))
+    issues = [
+        Issue(name, f"cause {i}", "b", {"Ix": move}) for i, (name, move) in enumerate(zip(results, sized, strict=True))
     ]
-    for order in (doubts, doubts[::-1]):
+    for order in (issues, issues[::-1]):
         found = verdict_of("Ix", Quantity(), order)
         assert found.status == status
         assert verdict_of("Iy", Quantity(), order).status == IDENTIFIED
-    assert judge({"Ix": Quantity()}, doubts).result("successful", ["Ix"]) == result
+    assert result_of(judge({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == result
     assert status == RESERVED or len(found.reasons) == 2
 
 
@@ -126,28 +127,28 @@ def test_an_axis_that_answers_otherwise_than_the_model_has_a_reservation(ratio, 
     )
     response = jaxos4.FrequencyResponse(msgspec.structs.replace(other, gain=np.ones(30)), other, other)
     constants = {name: Constant(2.0, 0.1, "kg m^2") for name in ("Ix", "Iy")}
-    doubts = [*stronger_or_weaker(response, constants)]
-    statuses = {name: verdict_of(name, Quantity(), doubts).status for name in ("Ix", "Iy", "Iz")}
+    issues = [*stronger_or_weaker(response, constants)]
+    statuses = {name: verdict_of(name, Quantity(), issues).status for name in ("Ix", "Iy", "Iz")}
     assert statuses == {"Ix": IDENTIFIED, "Iy": IDENTIFIED if move is None else RESERVED, "Iz": IDENTIFIED}
     if move is not None:
-        assert doubts[0].moves["Iy"].share == pytest.approx(move, abs=1e-3)
-        assert doubts[0].moves["Iy"].deviations == pytest.approx(20 * move, rel=0.01)
+        assert issues[0].moves["Iy"].share == pytest.approx(move, abs=1e-3)
+        assert issues[0].moves["Iy"].deviations == pytest.approx(20 * move, rel=0.01)
         more = f"{100 * abs(ratio - 1):.0f} % {'more' if ratio > 1 else 'less'} strongly than the model"
-        assert f"from 4 to 20 Hz, the vehicle pitches {more}" in str(doubts[0])
+        assert f"from 4 to 20 Hz, the vehicle pitches {more}" in str(issues[0])
 
 
 @pytest.mark.parametrize(("share", "status"), [(0.9, RESERVED), (1.1, CONTRADICTED)])
 def test_a_reservation_that_moves_a_quantity_by_more_than_itself_contradicts_it(share, status):
-    doubts = [reservation("cause", "b", {"Ix": Move(share, 9.0)})]
-    assert verdict_of("Ix", Quantity(), doubts).status == status
-    assert judge({"Ix": Quantity()}, doubts).result("successful", ["Ix"]) == (
+    issues = [Issue(RESERVATION, "cause", "b", {"Ix": Move(share, 9.0)})]
+    assert verdict_of("Ix", Quantity(), issues).status == status
+    assert result_of(judge({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == (
         "successful" if status == RESERVED else "implausible"
     )
 
 
 def test_a_quantity_is_not_identified_without_those_that_it_requires():
     unknown = Quantity(missing="it hardly rolls")
-    found = judge({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, []).verdicts
+    found = judge({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, [])
     assert found["damping"].status == MISSING
     assert found["damping"].reasons == ("it cannot be trusted without Ix",)
 
@@ -168,14 +169,14 @@ def test_predictions_reach_as_far_as_their_skill_is_clear():
 
 
 def test_the_result_is_that_of_what_was_asked():
-    doubts = [Doubt("no_skill", "a", "b", {"predictions": None}), Doubt("implausible", "c", "d", {"Ix": None})]
-    judged = judge(dict.fromkeys(("Ix", "Iy", "predictions"), Quantity()), doubts)
-    assert judged.result("successful", ("Ix", "Iy")) == "implausible"
-    assert judged.result("successful", ("Iy",)) == "successful"
-    assert judged.result("successful", judged.verdicts) == "no_skill"
+    issues = [Issue("no_skill", "a", "b", {"predictions": None}), Issue("implausible", "c", "d", {"Ix": None})]
+    judged = judge(dict.fromkeys(("Ix", "Iy", "predictions"), Quantity()), issues)
+    assert result_of(judged, issues, "successful", ("Ix", "Iy")) == "implausible"
+    assert result_of(judged, issues, "successful", ("Iy",)) == "successful"
+    assert result_of(judged, issues, "successful", judged) == "no_skill"
     vague = judge({"Ix": Quantity(spread=1.0)}, [])
-    assert vague.result("successful", ("Ix",)) == "unidentifiable"
-    assert vague.result("max_sweeps", ("Ix",)) == "max_sweeps"
+    assert result_of(vague, [], "successful", ("Ix",)) == "unidentifiable"
+    assert result_of(vague, [], "max_sweeps", ("Ix",)) == "max_sweeps"
 
 
 @pytest.fixture(scope="module")
@@ -183,23 +184,21 @@ def fitted():
     """A flight of the OS4 in gusts as `simulate --closed-loop` flies it by default, with longer samples."""
     flight = flown(OS4, duration=20.0, seed=5, gust=5.0, name="os4.csv")
     settings = jaxos4.VehicleSettings(sample_time=0.032)
-    case = prepare_vehicle([flight], OS4, settings)
-    data = case.data[0]
-    optimum = search(jaxos4.FilterError(tolerance=1e-3), data.likelihood)
-    return case, Solution(data, corrected(optimum, data))
+    (data,) = prepare_vehicle([flight], OS4, settings)
+    return corrected(search(jaxos4.FilterError(tolerance=1e-3), data))
 
 
 @pytest.mark.slow
 def test_a_parameter_at_another_value_moves_the_others(fitted):
     """The cost rises by as much as the parameter says. The thrust is the scale of the inertias."""
-    answer = fitted[1].answer
+    answer = fitted
     names, values = answer.problem.unknowns.names, np.asarray(answer.estimate.parameters)
     constants = {"Iy": Constant(1 / values[5], 1e-4, "kg m^2")}
 
     def moves(name, deviations):
         place = names.index(name)
         value = values[place] + deviations * answer.bound[place]
-        return consequences(answer, answer.optimum, constants, name, value)
+        return consequences(answer, constants, name, value)
 
     gain = names.index("thrust_gain")
     thrust = moves("thrust_gain", 3.0)
@@ -219,7 +218,7 @@ def test_yaw_that_contradicts_the_other_axes_leaves_them_alone():
         alpha = dict(zip(model.parameter_names, np.asarray(CorrectedOS4(OS4).alpha).tolist(), strict=False))
         rows = {name: ParameterEstimate(x, 0.02 * abs(x) + 1e-3, None, None, "", "") for name, x in alpha.items()}
         rows |= {name: ParameterEstimate(x, 0.02, None, None, "", "") for name, x in changed.items()}
-        return [set(doubt.moves) for doubt in doubts_of_values(model, rows, {})]
+        return [set(issue.moves) for issue in issues_of_values(model, rows, {})]
 
     assert moved() == []
     # alpha1 and alpha4 of a body whose Iz is larger than alpha8 says.
@@ -269,8 +268,7 @@ def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
 
 
 def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
-    case, solution = fitted
-    vehicle = case.check(solution, lambda stage: None)
+    vehicle = judge_vehicle(fitted, (), "filter-error")
     assert vehicle.successful
     for name, truth in zip(("Ix", "Iy"), np.asarray(OS4.inertia).tolist(), strict=False):
         row = vehicle.rigid_body.constants[name]
@@ -279,21 +277,21 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
         assert "if arms and mass are right" in vehicle.verdicts[name].value
         assert abs(row.estimate - truth) < 3 * row.std
     assert vehicle.verdicts["Iz"].status == MISSING
-    known = vehicle_constants(solution.answer._replace(fixed={})).constants["Iz"]
+    known = vehicle_constants(dataclasses.replace(fitted, fixed={})).constants["Iz"]
     assert known.note == "if mass and the ratio of drag to thrust, 0.024 m, are right"
     assert "fly more yaw" in vehicle.verdicts["Iz"].reasons[0]
     assert "s ahead" in vehicle.verdicts["predictions"].value
     written = vehicle.to_dict()
     assert {*written["verdicts"]} > {"Ix", "Iy", "Iz", "thrust", "motors", "center of mass", "damping", "predictions"}
     assert written["verdicts"]["Iz"]["status"] == MISSING
-    assert all(set(doubt) == {"result", "cause", "remedy", "moves"} for doubt in written["doubts"])
+    assert all(set(issue) == {"result", "cause", "remedy", "moves"} for issue in written["doubts"])
 
 
 def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
     table = dict.fromkeys(("alpha3", "alpha6", "alpha8", "thrust_gain", "rotor_delay"), row)
     constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy", "Iz")}
-    found = vehicle_quantities(fitted[1].answer, table, constants, None, [])
+    found = vehicle_quantities(fitted, table, constants, None, [])
     wider = [each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations if "wider" in each]
     assert wider == [
         "Ix is 2.5 times the guess; check `mass` and `rotor_positions`, or give a wider `bracket`",
@@ -332,19 +330,19 @@ def heavier():
 def test_what_the_log_shows_counts_against_the_inertias_before_a_fit(fault):
     spoil, status, cause = SPOILED[fault]
     findings = prepare(spoil(flown(duration=12.0)), CRAZYFLIE, sample_time=0.016, holdout=0.0)[0].findings
-    doubts = list(doubts_of_log(findings))
+    issues = list(issues_of_log(findings))
     for name in ("Ix", "Iy"):
-        found = verdict_of(name, Quantity("1e-5 kg m^2"), doubts)
+        found = verdict_of(name, Quantity("1e-5 kg m^2"), issues)
         assert found.status == status
         assert any(cause in reason for reason in found.reasons)
-    assert verdict_of("damping", Quantity(), doubts).status == IDENTIFIED
+    assert verdict_of("damping", Quantity(), issues).status == IDENTIFIED
 
 
 def test_a_contradiction_of_another_quantity_counts_against_that_quantity_alone():
     """Motors that were logged rarely contradict the damping; the attitude alone is no quantity of the vehicle."""
     rare = prepare([thinned(flown(duration=12.0), 5)], CRAZYFLIE, sample_time=0.016, holdout=0.0)[0].findings
     assert [finding.name for finding in rare] == ["rare_motors"]
-    assert verdict_of("damping", Quantity(), list(doubts_of_log(rare))).status == CONTRADICTED
-    assert verdict_of("Ix", Quantity("1e-5 kg m^2"), list(doubts_of_log(rare))).status == IDENTIFIED
+    assert verdict_of("damping", Quantity(), list(issues_of_log(rare))).status == CONTRADICTED
+    assert verdict_of("Ix", Quantity("1e-5 kg m^2"), list(issues_of_log(rare))).status == IDENTIFIED
     turned = prepare([scaled(ANGLES)(flown(duration=12.0), 0.5)], CRAZYFLIE, sample_time=0.016, holdout=0.0)[0]
     assert (turned.findings, len(turned.notes)) == ((), 1)

@@ -12,7 +12,7 @@ import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.excitation import doublet, multisine
 from jaxos4.flight import RATES
-from jaxos4.identification.doubts_of_values import doubts_of_alphas
+from jaxos4.identification.issues_of_values import issues_of_alphas
 from jaxos4.identification.physical import physical_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, RigidBody
 from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, RESERVED
@@ -102,11 +102,11 @@ def alpha_table(**alphas):
 )
 def test_an_alpha_is_contradicted_only_outside_its_bracket(alphas, rotor, said):
     constants = {"Iz": Constant(0.013, 1e-5, "kg m^2"), "J_R": Constant(rotor, 1.0, "kg m^2")}
-    doubts = list(doubts_of_alphas(alpha_table(**alphas), RigidBody(constants, 0.5, True)))
-    assert len(doubts) == len(said)
-    for doubt, (cause, moves) in zip(doubts, said.items(), strict=True):
-        assert cause in doubt.cause
-        assert set(doubt.moves) == moves
+    issues = list(issues_of_alphas(alpha_table(**alphas), RigidBody(constants, 0.5, True)))
+    assert len(issues) == len(said)
+    for issue, (cause, moves) in zip(issues, said.items(), strict=True):
+        assert cause in issue.cause
+        assert set(issue.moves) == moves
 
 
 def test_a_rotor_inertia_below_noise_is_no_physical_value():
@@ -126,7 +126,7 @@ def test_coloured_residuals_are_a_reservation():
     assert "the residuals of p, q" in found.verdicts["alpha3"].reasons[0]
     # Kalman filters and regressions do not find the best fit, so their residuals say nothing.
     other = jaxos4.identify(flight, jaxos4.PublishedOS4(), estimator="rls")
-    assert not any("not white" in str(doubt) for doubt in other.doubts)
+    assert not any("not white" in str(issue) for issue in other.issues)
 
 
 def test_an_alpha_that_is_not_excited_does_not_refuse_the_others():

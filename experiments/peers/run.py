@@ -88,7 +88,7 @@ def measured(folder: Path | None, name: str, peer: Any, setting: Row) -> Row:
         found = jaxos4.identify(recording, airframe, settings=jaxos4.VehicleSettings(holdout=0.0))
     except InputError as error:
         return {"warnings": [str(error)], "seconds": time.perf_counter() - begin}
-    row: Row = {"warnings": [*map(str, found.doubts)], "seconds": time.perf_counter() - begin}
+    row: Row = {"warnings": [*map(str, found.issues)], "seconds": time.perf_counter() - begin}
     known = found.rigid_body.constants
     return row | {n: {"estimate": known[n].estimate, "std": known[n].std} for n in INERTIAS if n in known}
 

@@ -97,7 +97,7 @@ def judged(case: Row, fly: Fly) -> Row:
             row["quantities"][name] = {"truth": truth[name], "estimate": each.value, "std": each.std, **verdict}
     absent = (name for name in INERTIAS if name in found.verdicts and name not in row["quantities"])
     row["missing"] = {name: found.verdicts[name].status for name in absent}
-    notes = {"result": found.result, "notes": list(found.provenance.notes), "doubts": list(map(str, found.doubts))}
+    notes = {"result": found.result, "notes": list(found.provenance.notes), "doubts": list(map(str, found.issues))}
     return row | notes | {"seconds": time.perf_counter() - begin}
 
 

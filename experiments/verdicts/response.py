@@ -20,7 +20,7 @@ from experiments.closed_loop.effects import EFFECTS, GUST, flights_of
 from experiments.closed_loop.run import DELAY, LAG, VEHICLE
 from experiments.monte_carlo import Row, continued, fill, print_table
 from experiments.verdicts.run import LOST, agreements, print_responses, share
-from jaxos4 import FrequencyResponse
+from jaxos4.airframe import MOTIONS
 from jaxos4.analysis.frequency_response import Agreement
 from jaxos4.identification.verdict import MAX_SHARE
 from jaxos4.models.terms import default_terms
@@ -88,7 +88,7 @@ def print_reservations(groups: dict[str, list[Row]]) -> None:
     """For each group and axis: how often it has a reservation, if the model's torque is too weak by each factor."""
     lines = []
     for name, rows in groups.items():
-        for axis in FrequencyResponse._fields:
+        for axis in MOTIONS:
             every = [row["response"][axis] for row in rows if axis in row["response"]]
             shares = []
             for factor in TOO_WEAK:

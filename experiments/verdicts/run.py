@@ -23,6 +23,7 @@ from experiments.fits import INERTIAS, given_airframe, shares_of_truth
 from experiments.monte_carlo import Row, continued, fill, print_table
 from experiments.verdicts.faults import FAULTS, Fault
 from jaxos4 import FrequencyResponse
+from jaxos4.airframe import MOTIONS
 from jaxos4.errors import InputError
 from jaxos4.identification.verdict import IDENTIFIED
 from jaxos4.recording import Recording
@@ -58,7 +59,7 @@ def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault
         causes = [str(error)]
     else:
         row["result"] = found.result
-        causes = [*map(str, found.doubts), *(r for v in found.verdicts.values() for r in v.reasons)]
+        causes = [*map(str, found.issues), *(r for v in found.verdicts.values() for r in v.reasons)]
         causes += found.provenance.notes
         row |= {n: each | {"status": found.verdicts[n].status} for n, each in shares_of_truth(found, vehicle).items()}
         if found.response is not None:
@@ -69,7 +70,7 @@ def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault
 
 def agreements(response: FrequencyResponse) -> dict[str, list[float]]:
     """The mean gain of each axis with a clear response, and the standard deviation of its logarithm."""
-    every = {axis: one.agreement() for axis, one in response._asdict().items()}
+    every = {axis: one.agreement() for axis, one in zip(MOTIONS, response, strict=True)}
     return {axis: [one.ratio, one.error] for axis, one in every.items() if np.isfinite(one.ratio)}
 
 
@@ -120,7 +121,7 @@ def print_responses(title: str, groups: dict[str, list[Row]]) -> None:
     """For each group of flights and axis: the mean logarithm of the gain, and how many intervals hold 1."""
     lines = []
     for name, rows in groups.items():
-        for axis in FrequencyResponse._fields:
+        for axis in MOTIONS:
             every = [row["response"][axis] for row in rows if axis in row.get("response", {})]
             logs, errors = np.log([ratio for ratio, _ in every]), np.array([error for _, error in every])
             if every:

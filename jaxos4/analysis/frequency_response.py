@@ -1,6 +1,7 @@
 """A check of a fit without parameters: the frequency response from modelled to measured angular acceleration."""
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -106,12 +107,16 @@ class AxisResponse(Arrays, frozen=True, eq=False):
         return self.gain * self.error < UNCLEAR
 
 
-class FrequencyResponse(NamedTuple):
+class FrequencyResponse(msgspec.Struct, frozen=True, eq=False):
     """The frequency response of each axis, from modelled to measured angular acceleration."""
 
     roll: AxisResponse
     pitch: AxisResponse
     yaw: AxisResponse
+
+    def __iter__(self) -> Iterator[AxisResponse]:
+        """Roll, pitch and yaw."""
+        return iter((self.roll, self.pitch, self.yaw))
 
 
 def frequency_response(problem: ShootingProblem, parameters: Parameters) -> FrequencyResponse:

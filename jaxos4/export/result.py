@@ -15,7 +15,7 @@ from ..airframe import AXES, INERTIAS, YAW, Airframe
 from ..closed_loop import ClosedLoop
 from ..errors import InputError, named, printable
 from ..flight import RATES, STATE_NAMES
-from ..identification.results import Identification
+from ..identification.results import Identification, VehicleIdentification
 from ..models.flight_model import without_recording
 from ..result_file import vehicle_result
 from .spread import DRAG, ESTIMATE, spread_of
@@ -188,7 +188,7 @@ def _given_note(found: Identified, inertia_z: float) -> str:
 _SIGNIFICANT = 3.0
 
 
-def _parts(file: Identification) -> tuple[dict[str, float], list[str], list[str]]:
+def _parts(file: VehicleIdentification) -> tuple[dict[str, float], list[str], list[str]]:
     """Values by name, the names of those that were estimated, and notes."""
     rows, constants, notes = file.parameters, file.rigid_body.constants, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..airframe import AXES, INERTIAS, YAW, Airframe
 from ..identification.answers import GUESSED_DRAG, SCALE_ERROR, UNIT, ratio_error
-from ..identification.results import Identification
+from ..identification.results import VehicleIdentification
 from ..identification.verdict import CONTRADICTED, IDENTIFIED, MAX_SHARE, RESERVED
 from ..linalg import covariance_root
 from ..models.flight_model import without_recording
@@ -28,7 +28,7 @@ ESTIMATE, _MISSING = "the estimate", "a guess: it was not identified"
 
 @np.errstate(all="ignore")  # what is not finite gives no possible vehicle
 def spread_of(
-    file: Identification, values: Mapping[str, float], estimated: Sequence[str], vehicle: RigidVehicle
+    file: VehicleIdentification, values: Mapping[str, float], estimated: Sequence[str], vehicle: RigidVehicle
 ) -> tuple[dict[str, dict[str, Any]], Float[np.ndarray, "n n"]]:
     """The Gaussian of a result, before draws that no vehicle can have are repeated.
 
@@ -106,7 +106,7 @@ def _slopes(
 
 
 def _sizes(
-    file: Identification, mean: Mapping[str, float], parameters: Sequence[str]
+    file: VehicleIdentification, mean: Mapping[str, float], parameters: Sequence[str]
 ) -> dict[str, tuple[str, float, float]]:
     """The verdict on each moment of inertia and parameter, of what its moves are shares, and how wide a guess is."""
     terms = {x.name: (term.quantity, x.half_width) for term in TERMS.values() for x in term.parameters}
@@ -121,16 +121,16 @@ def _sizes(
     return sizes
 
 
-def _reservations(file: Identification, quantity: str, *, spared: bool = False) -> tuple[float, bool]:
+def _reservations(file: VehicleIdentification, quantity: str, *, spared: bool = False) -> tuple[float, bool]:
     """How far the reservations may move a quantity, as a share, and whether its verdict refuses it.
 
-    `spared`: whether one doubt that refuses it does not count.
+    `spared`: whether one issue that refuses it does not count.
     """
-    left = [(doubt.status_left(quantity), doubt.moves.get(quantity)) for doubt in file.doubts]
+    left = [(issue.status_left(quantity), issue.moves.get(quantity)) for issue in file.issues]
     # A reservation that does not say how far it moves the quantity is taken to move it as far as a reservation may.
     moves = [MAX_SHARE if move is None else move.share for status, move in left if status == RESERVED]
     refusing = sum(status not in (IDENTIFIED, RESERVED) for status, _ in left)
     verdict = file.verdicts.get(quantity)
-    # Without a doubt: it was not estimated well, or reservations contradict it together.
+    # Without an issue: it was not estimated well, or reservations contradict it together.
     by_verdict = verdict is not None and (verdict.status == CONTRADICTED or not (spared or verdict.trusted))
     return math.hypot(*moves), by_verdict or refusing > spared

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from .._custom_types import finite_or_none
 from .._files import write_atomically, write_netcdf
 from .._version import __version__
 from ..errors import InputError
-from ..identification.tables import finite_or_none
 from .motion import PARTS, departures
 
 if TYPE_CHECKING:

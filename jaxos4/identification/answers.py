@@ -1,39 +1,29 @@
-"""`Answer`: an estimate with intervals; its parameters, moments of inertia, and residuals of channels as tables."""
+"""`Answer`: an estimate with intervals; its parameters, and the moments of inertia of a vehicle, as tables."""
 
+import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .._custom_types import Parameters
-from ..airframe import AXES, INERTIAS, INVERSES, MOTIONS, YAW, Airframe
+from .._custom_types import Parameters, finite_or_none
+from ..airframe import AXES, INVERSES, YAW, Airframe
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.evaluation import Evaluation
 from ..analysis.inertia import fit_inertia
 from ..bracket import is_identifiable
 from ..estimate import Estimate
-from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.abstract import PARAMETER_NAMES
 from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
-from ..models.state import CASCADE_ORDER
 from ..models.terms import follows_commands
+from ..results import has_answer
 from ..shooting import ShootingProblem
 from .data import Data
-from .results import (
-    ChannelFit,
-    Constant,
-    Disturbance,
-    FixedParameter,
-    ParameterEstimate,
-    RigidBody,
-    SampleTime,
-    has_answer,
-)
+from .results import Constant, Disturbance, FixedParameter, ParameterEstimate, RigidBody
 from .search import Optimum
-from .tables import finite_or_none
 
 UNIT = "kg m^2"
 NEGATIVE_NOTE = "negative, which is impossible; set to 0"
@@ -48,51 +38,31 @@ UNKNOWN = 1e3  # half-widths; standard deviation of an alpha that was not estima
 NOTED = 1.05  # the least factor of an interval that is noted, with one decimal
 
 
-class Answer(NamedTuple):
-    """An estimate of the parameters, with the noise that belongs to them and with what corrected its intervals.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Answer:
+    """An estimate of the parameters, with the noise that belongs to them; an `OS4Answer` or a `VehicleAnswer`.
 
     - `problem`: the flight and its model, with the noise levels of the sensors that were found.
     - `estimate`: its covariance is that of the intervals.
     - `bound`: standard deviations of the parameters if the model were right: the Cramer-Rao bound.
     - `rollouts`: of all searches together.
-
-    Only of a flight of an OS4:
-
-    - `evaluation`: the flight simulated at the estimate; `None` without an answer.
-
-    Only of a vehicle:
-
-    - `optimum`: where the search ended.
     - `fixed`: the parameters that are not estimated.
-    - `disturbances`: by channel.
-    - `widened`, `profiled`: by which factor the jackknife and the profile made an interval longer, by parameter.
+    - `negative`: value and standard deviation of the parameters that came out negative, and so are 0.
+    - `profiled`: by which factor the profile made an interval longer, by parameter.
     """
 
     problem: ShootingProblem
     estimate: Estimate
     bound: Float[np.ndarray, " parameters"]
     rollouts: int
-    evaluation: Evaluation | None = None
-    optimum: Optimum | None = None
-    fixed: dict[str, FixedParameter] = {}
-    disturbances: dict[str, Disturbance] = {}
-    widened: dict[str, float] = {}
-    profiled: dict[str, float] = {}
+    fixed: Mapping[str, FixedParameter] = dataclasses.field(default_factory=dict, kw_only=True)
+    negative: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict, kw_only=True)
+    profiled: Mapping[str, float] = dataclasses.field(default_factory=dict, kw_only=True)
 
     @property
     def answered(self) -> bool:
         """Whether there is an estimate at all."""
-        return has_answer(self.estimate)
-
-    @property
-    def negative(self) -> dict[str, tuple[float, float]]:
-        """Value and standard deviation of the parameters that came out negative, and so are 0."""
-        return {} if self.optimum is None else self.optimum.negative
-
-    @property
-    def restarts(self) -> int:
-        """The number of times that the search of a vehicle began again where the cost is lower."""
-        return 0 if self.optimum is None else self.optimum.restarts
+        return has_answer(self.estimate.result)
 
     @property
     def free(self) -> list[int]:
@@ -100,16 +70,45 @@ class Answer(NamedTuple):
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.fixed]
 
 
-class Solution(NamedTuple):
-    """The fitted data, and the answer.
+@dataclasses.dataclass(frozen=True, eq=False)
+class OS4Answer(Answer):
+    """The answer of a flight of an OS4.
 
-    - `data`: of a vehicle, at the chosen sample time.
-    - `sample_times`: the answers at all sample times that belong together; empty for an OS4.
+    - `evaluation`, `diagnostics`: the flight simulated at the estimate, and its residuals; `None` without an answer.
     """
 
-    data: Data
-    answer: Answer
-    sample_times: tuple[SampleTime, ...] = ()
+    evaluation: Evaluation | None = None
+    diagnostics: Diagnostics | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VehicleAnswer(Answer):
+    """The answer of a vehicle.
+
+    - `optimum`: where the search ended.
+    - `disturbances`: by channel.
+    - `widened`: by which factor the jackknife made an interval longer, by parameter.
+    """
+
+    optimum: Optimum
+    disturbances: Mapping[str, Disturbance]
+    widened: Mapping[str, float]
+
+
+def shared_fields(data: Data, answer: Answer, estimator: str) -> dict[str, Any]:
+    """The fields of a result that an OS4 and a vehicle fill in the same way. `estimator`: its name."""
+    free = answer.free
+    covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
+    return {
+        "estimator": estimator,
+        "rollouts": answer.rollouts,
+        "cost": finite_or_none(answer.estimate.cost),
+        "provenance": data.provenance,
+        "covariance": covariance.tolist() if np.isfinite(covariance).all() else None,
+        "airframe": answer.problem.model.airframe,
+        "estimate": answer.estimate,
+        "problem": answer.problem,
+    }
 
 
 def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {}) -> dict[str, ParameterEstimate]:
@@ -162,10 +161,10 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
     return "; ".join(notes)
 
 
-def overwhelmed(answer: Answer) -> dict[str, str]:
+def dominated(answer: VehicleAnswer) -> dict[str, str]:
     """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
 
-    Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then doubted for that reason.
+    Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then flagged for that reason.
     """
     omega, mixer = np.asarray(answer.problem.flight.omega, dtype=float), np.asarray(answer.problem.model.airframe.mixer)
     torques = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0)
@@ -181,18 +180,6 @@ def overwhelmed(answer: Answer) -> dict[str, str]:
                 f"({control:.2g} rad/s^2)"
             )
     return weak
-
-
-def rigid_body(answer: Answer) -> RigidBody:
-    """The moments of inertia of an OS4 that explain the estimate best; none if they are not identifiable."""
-    model, estimate = answer.problem.model, answer.estimate
-    rigid = fit_inertia(model, estimate.parameters, estimate.covariance)
-    values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
-    if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
-        return RigidBody()
-    table = zip((*INERTIAS, "J_R"), values.tolist(), std.tolist(), strict=True)
-    constants = {name: Constant(value, error, UNIT) for name, value, error in table}
-    return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
 
 def thrust_excess(answer: Answer) -> float:
@@ -253,22 +240,3 @@ def vehicle_constants(answer: Answer) -> RigidBody:
         return RigidBody(constants)
     rigid = fit_inertia(CorrectedOS4(model.airframe), alpha, covariance)
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
-
-
-def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str, ChannelFit]:
-    """The diagnostics of each measured channel, by its name."""
-    return {
-        STATE_NAMES[column]: ChannelFit(
-            rms=float(diagnostics.rms[i]),
-            unit=STATE_UNITS[column],
-            percent=finite_or_none(diagnostics.percent[i]),
-            level=float(diagnostics.level[i]),
-            level_p=float(diagnostics.level_p[i]),
-            correlation=float(diagnostics.colour[i]),
-            white_p=float(diagnostics.white_p[i]),
-            input_correlation=dict(zip(MOTIONS, diagnostics.input_correlation[i].tolist(), strict=True)),
-            input_p=float(diagnostics.input_p[i]),
-        )
-        for i, column in enumerate(CASCADE_ORDER[: problem.size])
-        if diagnostics.count[i] > 2
-    }

@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from .._custom_types import finite_or_none
 from ..analysis.evaluation import evaluate
 from ..analysis.identifiability import Identifiability, identifiability
 from ..estimators import IBSS
@@ -13,8 +14,7 @@ from ..flight import STATE_NAMES, Flight
 from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
 from .os4 import fit_os4
-from .problem import Intervals, bracket_of, os4_problem
-from .tables import finite_or_none
+from .problem import FlightSettings, Intervals, bracket_of, os4_problem
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):
@@ -80,8 +80,8 @@ def assess(
     """
     (recording,) = as_recordings(flight)
     where = bracket_of(bracket, model)
-    settings = {"channels": channels, "initial_state": initial_state, "window": window}
-    problem = os4_problem(recording, model, where, **settings)
+    settings = FlightSettings(channels=channels, initial_state=initial_state, window=window)
+    problem = os4_problem(recording, model, where, settings)
     answer = fit_os4(IBSS(), problem, progress=progress)
     known = identifiability(answer.evaluation or evaluate(answer.problem, answer.estimate.parameters), where)
     notes = known.notes(model.parameter_names)

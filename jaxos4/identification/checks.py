@@ -1,125 +1,76 @@
-"""The checks of an answer: the estimate of each quantity, the doubts about it, and its verdict."""
+"""The checks of a vehicle's answer: its verdicts, and predictions of measurements that were not fitted."""
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import msgspec
 import numpy as np
+from jaxtyping import Array, Float
 
-from .._custom_types import as_float
+from .._custom_types import Numeric, as_float, finite_or_none
+from .._xla import compiled_cheaply
 from ..airframe import AXES, PITCH, ROLL, YAW
-from ..analysis.diagnostics import residual_correlations, residual_diagnostics
-from ..analysis.frequency_response import frequency_response
-from ..analysis.identifiability import identifiability
-from ..analysis.prediction import Predictions
-from ..analysis.traces import os4_traces
+from ..analysis.diagnostics import Correlations, residual_correlations
+from ..analysis.frequency_response import frequency_response, modelled_acceleration
+from ..analysis.prediction import HORIZONS, Predictions, filtered, predictions, skill, trajectory_horizons
+from ..analysis.traces import Traces, position_of
 from ..bracket import GAUSSIAN_PRIOR
-from ..estimate import AbstractEstimator
-from ..flight import CHANNEL_NAMES
+from ..estimators import EquationError
+from ..flight import CHANNEL_NAMES, RATES
+from ..models.flight_model import without_recording
 from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
-from ..shooting import with_room
-from .answers import Answer, channel_fits, overwhelmed, parameter_table, rigid_body, vehicle_constants
-from .data import Data, Progress
-from .doubts import doubts_of_log, doubts_of_os4, doubts_of_vehicle
-from .held_out import predict_held_out, validate_on, vehicle_traces
-from .quantities import os4_quantities, vehicle_quantities
-from .results import Identification, RigidBody, SampleTime
-from .tables import finite_or_none
-from .verdict import CONTRADICTED, judge
+from ..shooting import ShootingProblem, with_room
+from ..shooting.gains import LogNoise
+from .answers import VehicleAnswer, dominated, parameter_table, shared_fields, vehicle_constants
+from .data import Data, HeldOut, Progress, silent
+from .issues import issues_of_log, issues_of_vehicle
+from .quantities import vehicle_quantities
+from .results import PredictionSkill, RateSkill, RigidBody, SampleTime, VehicleIdentification
+from .verdict import judge, result_of
 
 # Predictions that a result keeps: those of four minutes, 200 kB of a page.
 _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
+REGRESSION = EquationError(memory=0.9)
+"""For comparison. This memory is the best on real flights."""
 
 
-def _identified(
-    data: Data, answer: Answer, estimator: str, model: str, notes: Sequence[str] = (), **checked: Any
-) -> Identification:
-    """The result of an answer, with the fields that were `checked`. `notes`: what could not be checked."""
-    free, sigma = answer.free, np.asarray(answer.problem.sigma)
-    covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
-    return Identification(
-        estimator=estimator,
-        model=model,
-        rollouts=answer.rollouts,
-        cost=finite_or_none(answer.estimate.cost),
-        provenance=msgspec.structs.replace(data.provenance, notes=[*data.provenance.notes, *notes]),
-        covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
-        airframe=answer.problem.model.airframe,
-        estimate=answer.estimate,
-        problem=answer.problem,
-        held=answer.fixed,
-        noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in answer.problem.columns},
-        disturbances=answer.disturbances,
-        widened=answer.widened,
-        **checked,
-    )
-
-
-def check_os4(data: Data, answer: Answer, estimator: AbstractEstimator, name: str, model: str) -> Identification:
-    """The checked result of a flight of an OS4, which the estimator of this `name` searched."""
-    own = data, answer, name, model
-    names, search = answer.problem.unknowns.names, str(result_names(answer.estimate.result))
-    missing, limits, fit, traces, correlations = {}, dict.fromkeys(names), {}, None, None
-    if (found := answer.evaluation) is not None:
-        fit = channel_fits(answer.problem, residual_diagnostics(found))
-        information = identifiability(found, answer.problem.unknowns.bracket)
-        notes, known = information.notes(names), information.identifiable & information.excited
-        missing = {name: notes[name] for i, name in enumerate(names) if not known[i] and name in notes}
-        limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
-        if found.feasible:
-            errors = np.where(np.isnan(found.measured), np.nan, found.errors)[:, : found.problem.size]
-            traces, correlations = os4_traces(found), residual_correlations(errors, found.torques)
-    table = {
-        name: msgspec.structs.replace(row, noise_limit=limits[name])
-        for name, row in parameter_table(answer, estimator.prior, missing).items()
-    }
-    if not answer.answered:
-        return _identified(*own, parameters=table, result=search, doubts=tuple(doubts_of_log(data.findings)))
-    body = rigid_body(answer)
-    # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
-    doubts = doubts_of_os4(data, search, table, body, fit if estimator.shoots else {})
-    judged = judge(os4_quantities(table, body), doubts)
-    # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
-    wrong = [name for name in table if judged.verdicts[name].status == CONTRADICTED]
-    return _identified(
-        *own,
-        parameters=table,
-        rigid_body=body,
-        verdicts=judged.verdicts,
-        doubts=tuple(doubts),
-        result=judged.result(search, wrong if search == "successful" else table),
-        fit=fit,
-        validation=None if data.held_out is None else validate_on(answer, data.held_out),
-        traces=traces,
-        correlations=correlations,
-    )
-
-
-def check_vehicle(
-    data: Data, answer: Answer, sample_times: Sequence[SampleTime], name: str, progress: Progress
-) -> Identification:
+def judge_vehicle(
+    answer: VehicleAnswer, sample_times: Sequence[SampleTime], estimator: str, *, progress: Progress = silent
+) -> VehicleIdentification:
     """The result of a vehicle, checked against the airframe, other sample times, and measurements that were not fitted.
 
-    `sample_times`: that of the answer is among them. `name`: of the estimator.
+    `sample_times`: that of the answer is among them. `estimator`: its name.
     """
-    search, optimum = str(result_names(answer.estimate.result)), answer.optimum
-    own = data, answer, name, "flight"
-    several = tuple(sample_times) if len(sample_times) > 1 else ()
-    if not answer.answered or optimum is None:
-        return _identified(
-            *own, parameters={}, result=search, doubts=tuple(doubts_of_log(data.findings)), sample_times=several
-        )
-    table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
-    predicted = paths = skill = None
+    progress("checking the answer")
+    search, data = str(result_names(answer.estimate.result)), answer.optimum.data
+    found = VehicleIdentification(
+        parameters={},
+        result=search,
+        issues=tuple(issues_of_log(data.findings)),
+        sample_times=tuple(sample_times) if len(sample_times) > 1 else (),
+        held=dict(answer.fixed),
+        noise={CHANNEL_NAMES[i]: float(np.asarray(answer.problem.sigma)[i]) for i in answer.problem.columns},
+        disturbances=dict(answer.disturbances),
+        widened=dict(answer.widened),
+        **shared_fields(data, answer, estimator),
+    )
+    if not answer.answered:
+        return found
+    predicted = paths = achieved = None
     if data.held_out is not None:
         progress("predicting what was not fitted")
-        predicted, paths, skill = predict_held_out(data, answer, optimum.noise, data.held_out)
+        predicted, paths, achieved = predict_held_out(answer, data.held_out)
     still = () if predicted is None else _still_axes(answer, predicted)
-    notes = (
-        f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`",
-    ) * (0 < len(still) < len(AXES))
-    if YAW.motion in overwhelmed(answer):
+    notes = data.provenance.notes
+    if 0 < len(still) < len(AXES):
+        hardly = f"the held-out part hardly turns about {' and '.join(still)}"
+        notes = [*notes, f"{hardly}; choose another with `begin`, `end` or `validate`"]
+    table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
+    if YAW.motion in dominated(answer):
         # Vehicles hardly yaw. The other axes do not need it.
         body = RigidBody({name: row for name, row in body.constants.items() if name != YAW.inertia})
         said = "not identified: the disturbance is larger"
@@ -127,33 +78,29 @@ def check_vehicle(
         table |= {name: msgspec.structs.replace(table[name], note=said) for name in of_yaw}
         still = (*still, *({YAW.motion} - {*still}))
     values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
-    response = frequency_response(with_room(answer.problem, data.room), values)
-    quantities = vehicle_quantities(answer, table, body.constants, skill, still)
-    doubts = doubts_of_vehicle(
-        data, answer, optimum, sample_times, table, body.constants, quantities, response, skill=skill, still=still
-    )
-    judged = judge(quantities, doubts)
+    response = frequency_response(with_room(answer.problem, data.capacity), values)
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
-    traces, correlations = vehicle_traces(data, answer, optimum, predicted)
-    return _identified(
-        *own,
-        notes,
+    traces, correlations = vehicle_traces(answer, predicted)
+    found = msgspec.structs.replace(
+        found,
+        provenance=msgspec.structs.replace(data.provenance, notes=notes),
         parameters=table,
         rigid_body=body,
-        verdicts=judged.verdicts,
-        doubts=tuple(doubts),
-        result=judged.result(search, (ROLL.inertia, PITCH.inertia)),
-        sample_times=several,
-        skill=skill,
+        skill=achieved,
         predictions=predicted,
         trajectories=None if paths is None else paths.thinned(_MOST_TRAJECTORIES),
         traces=traces,
         correlations=correlations,
         response=response,
     )
+    quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
+    issues = issues_of_vehicle(answer, found, response, sample_times=sample_times, quantities=quantities, still=still)
+    verdicts = judge(quantities, issues)
+    result = result_of(verdicts, issues, search, (ROLL.inertia, PITCH.inertia))
+    return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
 
 
-def _still_axes(answer: Answer, predicted: Predictions) -> tuple[str, ...]:
+def _still_axes(answer: VehicleAnswer, predicted: Predictions) -> tuple[str, ...]:
     """The axes about which the held-out part hardly turns, or about which it was not measured."""
     still = []
     for axis, measured in zip(AXES, np.moveaxis(predicted.measured, 2, 0), strict=True):
@@ -162,3 +109,96 @@ def _still_axes(answer: Answer, predicted: Predictions) -> tuple[str, ...]:
         if not seen.size or seen.std() < max(WEAK, OVER_NOISE * noise):
             still.append(axis.motion)
     return tuple(still)
+
+
+def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predictions, Predictions, PredictionSkill]:
+    """Predict the rates of measurements that were not fitted, by the answer and by a regression with the same terms.
+
+    The answer, with the noise of its filters, predicts the disturbance too, from the measurements before each start.
+
+    **Returns:** its predictions at `HORIZONS`; those between start and end, as trajectories; and the skill.
+    """
+    data, problem, names = answer.optimum.data, held_out.problem, answer.problem.unknowns.names
+    values = np.asarray(answer.estimate.parameters)[: len(names)]
+
+    def predicted_by(values: np.ndarray, noise: LogNoise | None, horizons: tuple[float, ...] = HORIZONS) -> Predictions:
+        parameters = values
+        if held_out.recording is not None:  # the mean of those of which each fitted recording has its own
+            shared = np.array([without_recording(name) for name in names])
+            parameters = np.array([values[shared == name].mean() for name in problem.unknowns.names])
+        known = None
+        if noise is not None:
+            known, _ = _disturbances(data, _together(data, held_out), parameters, noise)
+        return predictions(problem, as_float(parameters), horizons=horizons, disturbance=known, noise=noise)
+
+    every = predicted_by(values, answer.optimum.noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
+    predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
+    own, fixed = skill(predicted), [name in answer.fixed for name in names]
+    regressed = np.asarray(_regressed(with_room(answer.problem, data.capacity), as_float(values), np.asarray(fixed)))
+    compared = skill(predicted_by(regressed, None))
+    tables = (own.skill, own.std, own.rmse, own.persistence, compared.skill)
+    rates = {
+        rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
+    }
+    return predicted, trajectories, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
+
+
+def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
+    """The problem with all measurements: those that were fitted, and those that were held out of the same flight."""
+    if held_out.recording is not None:
+        return held_out.problem
+    own, others = np.asarray(held_out.problem.flight.states), np.asarray(data.problem.flight.states)
+    both = as_float(np.where(np.isnan(own), others, own))
+    return eqx.tree_at(lambda p: p.flight.states, held_out.problem, both)
+
+
+def _disturbances(
+    data: Data, problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise
+) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
+    """The disturbance of each body rate [rad/s^2] and its innovation [rad/s; NaN: not measured] at each sample.
+
+    Filters know the disturbance from the measurements until the sample. An innovation is a measured rate less its
+    prediction from the sample before. The model is evaluated at the measured rates.
+    """
+    samples = problem.flight.time.shape[0]
+    problem = with_room(problem, max(samples, data.capacity))
+    flight, rates = problem.flight, np.asarray(problem.flight.states)[:, RATES]
+    modelled = np.pad(modelled_acceleration(problem, as_float(parameters)), ((0, 1), (0, 0)))
+    of_rates = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
+    known, innovation = filtered(of_rates, rates, modelled, flight.stretch_numbers, flight.dt)
+    return np.asarray(known.disturbance)[:samples], np.asarray(innovation)[:samples]
+
+
+def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tuple[Traces, Correlations]:
+    """The signals of the fitted flights, and the correlations of the innovations.
+
+    `predicted`: the predictions that the result keeps.
+    """
+    optimum, data = answer.optimum, answer.optimum.data
+    other = data.held_out
+    problem = answer.problem if other is None or other.recording is not None else _together(data, other)
+    values = np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count]
+    disturbance, innovation = _disturbances(data, problem, values, optimum.noise)
+    flight = answer.problem.flight
+    states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
+    position = position_of(np.asarray(problem.flight.states, float))
+    start = np.zeros(0, int) if predicted is None else predicted.start
+    clock = data.clock if other is None or other.recording is None else other.clock
+    signals = omega, states[:, RATES], states[:, :0], disturbance, position
+    traces = Traces(data.clock.time, data.clock.log, *signals, clock.time[start], clock.log[start])
+    torques = omega**2 @ np.asarray(answer.problem.model.airframe.mixer)[:3].T
+    crossed = residual_correlations(innovation, torques)
+    if (parts := optimum.estimate.parts) is not None:
+        # Of the innovations of the likelihood itself, which is exact for means.
+        products = np.asarray(parts.products).sum(axis=0)[:3]
+        crossed = msgspec.structs.replace(crossed, own=products[:, 1:] / np.maximum(products[:, :1], 1.0))
+    return traces.thinned(), crossed
+
+
+@compiled_cheaply
+def _regressed(problem: ShootingProblem, values: Array, fixed: Numeric) -> Array:
+    """The parameters by regression; fixed ones, and those that it cannot estimate, have the values of the fit."""
+    linear = np.array([not each.in_forcing for each in problem.model.parameters])
+    own = jnp.where(linear & ~fixed, problem.unknowns.center, values)
+    unknowns = dataclasses.replace(problem.unknowns, center=own, free=linear & ~fixed)
+    return REGRESSION.solution(dataclasses.replace(problem, unknowns=unknowns))

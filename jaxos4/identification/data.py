@@ -12,6 +12,9 @@ from jaxtyping import Float, Int
 from .._custom_types import Positive
 from .._version import __version__
 from ..airframe import PRESETS, Airframe
+from ..errors import InputError
+from ..estimate import AbstractEstimator
+from ..estimators import ESTIMATORS
 from ..recording.checks import Finding
 from ..shooting import InnovationsProblem, ShootingProblem
 
@@ -109,7 +112,7 @@ class Data(Generic[L]):
         return self.follows_commands and bool(getattr(self.likelihood, "answers_within", False))
 
     @property
-    def room(self) -> int:
+    def capacity(self) -> int:
         """The number of samples of a padded flight: checks at all sample times share their programs."""
         return self.likelihood.flight.time.shape[0]
 
@@ -127,3 +130,17 @@ def versions(problem: ShootingProblem) -> dict[str, Any]:
 def airframe_name(airframe: Airframe) -> str:
     """The name of a preset, or "custom"."""
     return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")
+
+
+def class_name(instance: object, kinds: Mapping[str, type]) -> str:
+    """The name of an object's class in a table of classes, or else the class's own name."""
+    return next((name for name, kind in kinds.items() if type(instance) is kind), type(instance).__name__)
+
+
+def name_and_class(estimator: str | AbstractEstimator) -> tuple[str, type[AbstractEstimator]]:
+    """The name and the class of an estimator. Raises `InputError` for an unknown name."""
+    if not isinstance(estimator, str):
+        return class_name(estimator, ESTIMATORS), type(estimator)
+    if estimator not in ESTIMATORS:
+        raise InputError(f"`estimator`: must be one of {', '.join(ESTIMATORS)}, got {estimator!r}.")
+    return estimator, ESTIMATORS[estimator]

@@ -1,14 +1,14 @@
 """`jaxos4.identify`: from recorded flights to parameters with intervals.
 
-- recordings -> `Data`, with a likelihood: `prepare_os4` in os4.py, or `prepare_vehicle` in vehicle.py. Each makes a
-  case, which knows the other steps.
-- `Data` -> `Solution`, the data with their `Answer`: `case.solve`, by search.py, uncertainty.py and sample_time.py.
-- `Solution` -> `Identification`: `case.check`, by checks.py with quantities.py, doubts.py and verdict.py.
+Data with a likelihood are prepared, the likelihood is fitted, and the answer is judged. An OS4 does all of this in
+os4.py; a vehicle in vehicle.py, sample_time.py and checks.py.
 """
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -16,21 +16,26 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..logs import Source, as_recording, as_recordings
+from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..networks import TrainedNetwork
-from .data import silent
-from .os4 import prepare_os4
-from .problem import Intervals
+from .checks import judge_vehicle
+from .data import class_name, silent
+from .os4 import fit_os4, judge_os4, prepare_os4
+from .problem import FlightSettings, Intervals
 from .results import Identification
-from .settings import FlightSettings, VehicleSettings, own_settings
-from .vehicle import prepare_vehicle
+from .sample_time import DEFAULT, fit_vehicle, vehicle_estimator
+from .vehicle import VehicleSettings, prepare_vehicle
+
+Settings = FlightSettings | VehicleSettings
+S = TypeVar("S", FlightSettings, VehicleSettings)
 
 
 def identify(
     flights: Source | Sequence[Source],
     subject: AbstractModel | Airframe,
     *,
-    settings: FlightSettings | VehicleSettings | None = None,
+    settings: Settings | None = None,
     estimator: str | AbstractEstimator | None = None,
     bracket: Intervals = None,
     network: TrainedNetwork | str | os.PathLike[str] | None = None,
@@ -59,7 +64,7 @@ def identify(
     - `seed`: for training a network.
     - `progress`: called with the name of each stage.
 
-    **Returns:** an `Identification`. Check its `result`.
+    **Returns:** an `OS4Identification` or a `VehicleIdentification`. Check its `result`.
 
     **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
     """
@@ -72,12 +77,46 @@ def identify(
         raise InputError("`flights`: holds no flight; give one.")
     other = None if validate is None else as_recording(validate, "validation flight", given)
     begin = time.perf_counter()
-    options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
     progress("checking and averaging")
     if isinstance(subject, Airframe):
-        case = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **options)
+        estimator = DEFAULT if estimator is None else estimator
+        name, wanted = vehicle_estimator(estimator, network), _settings(VehicleSettings, settings)
+        several = prepare_vehicle(recordings, subject, wanted, bracket=bracket, validate=other)
+        choose = wanted.sample_time is None
+        answer, sample_times = fit_vehicle(several, estimator, choose=choose, seed=seed, progress=progress)
+        found = judge_vehicle(answer, sample_times, name, progress=progress)
     else:
-        os4_settings = own_settings(FlightSettings, settings)
-        case = prepare_os4(recordings, subject, os4_settings, progress=progress, **options)
-    found = case.check(case.solve(progress), progress)
+        options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
+        wanted = _settings(FlightSettings, settings)
+        data, method = prepare_os4(recordings, subject, wanted, progress=progress, **options)
+        found = judge_os4(data, fit_os4(method, data.likelihood, progress=progress), method)
     return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)
+
+
+def _settings(kind: type[S], settings: Settings | None) -> S:
+    """The settings, or the default ones. Raises `InputError` if they are of another kind."""
+    if settings is not None and not isinstance(settings, kind):
+        what, got = "an airframe" if kind is VehicleSettings else "a model", type(settings).__name__
+        raise InputError(f"`settings`: must be {kind.__name__} for {what} as `subject`, got {got}.")
+    return kind() if settings is None else settings
+
+
+def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> Settings:
+    """The settings for a subject, from options by name; those that were not given are `None`.
+
+    **Raises:** `InputError` for an option that does not fit the subject.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    kind = VehicleSettings if isinstance(subject, Airframe) else FlightSettings
+    own = {field.name for field in dataclasses.fields(kind)}
+    for name in given:
+        if name in own or (name, given[name]) == ("initial_state", "free"):
+            continue
+        if kind is FlightSettings:
+            why = f"is for a real vehicle, not for the {class_name(subject, MODELS)} model"
+        elif name == "initial_state":
+            raise InputError(f"`initial_state` {given[name]}: a vehicle's filters find their own state; leave it out.")
+        else:
+            why = "a vehicle is identified from its rates and specific force, without windows"
+        raise InputError(f"`{name}`: {why}; leave it out.")
+    return kind(**{name: value for name, value in given.items() if name in own})

@@ -11,7 +11,7 @@ from .verdict import IDENTIFIED, MISSING, RESERVED, UNCERTAIN, pooled_status
 
 _ROUND = 5.0  # s; flights are not planned more precisely
 _MOST = 300.0  # s, about one battery: beyond it a stronger motion is the better advice
-_VAGUE = "it is known to"
+_UNCERTAIN = "it is known to"
 _REPEAT = "nothing is missing; repeat the flight and compare the results with `jaxos4 compare`"
 
 
@@ -29,7 +29,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
     motions, known, flown, advised = [], [], set(), {}
     for axis in AXES:
         spread, fitted = spreads.get(axis.inertia, 0.0), counted.get(axis.inertia, [])
-        whys = [why for each in fitted for why in each.verdicts[axis.inertia].reasons if why.startswith(_VAGUE)]
+        whys = [why for each in fitted for why in each.verdicts[axis.inertia].reasons if why.startswith(_UNCERTAIN)]
         helps = not whys or any("fly" in why for why in whys)  # no flight measures a drag coefficient
         if fitted and helps and UNCERTAIN < spread < math.inf:
             every = (each.provenance.fitted_seconds for each in fitted)
@@ -78,12 +78,12 @@ def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
     """The remedies of the causes that keep a quantity of these results from being identified."""
     for found in results:
         verdict = found.verdicts[name]
-        doubts = [each for each in found.doubts if each.status_left(name) != IDENTIFIED]
+        issues = [each for each in found.issues if each.status_left(name) != IDENTIFIED]
         # A verdict has the reasons of its own status alone.
-        yield from (each.remedy for each in doubts if any(each.cause in said for said in verdict.reasons))
+        yield from (each.remedy for each in issues if any(each.cause in said for said in verdict.reasons))
         for said in verdict.reasons:
             cause, _, remedy = said.rpartition("; ")
-            if cause and not cause.startswith(_VAGUE) and not any(each.cause in said for each in doubts):
+            if cause and not cause.startswith(_UNCERTAIN) and not any(each.cause in said for each in issues):
                 yield remedy
-            elif verdict.status == MISSING and not found.is_vehicle and not doubts:
+            elif verdict.status == MISSING and not found.is_vehicle and not issues:
                 yield "fly what `jaxos4 design` proposes"

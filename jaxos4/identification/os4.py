@@ -1,4 +1,4 @@
-"""A flight of an OS4: its data, and its parameters with the noise of the sensors that belongs to them."""
+"""A flight of an OS4: its data, its parameters with the noise of the sensors that belongs to them, and their checks."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,12 +8,17 @@ import jax
 import msgspec
 import numpy as np
 
-from .._custom_types import as_float
-from ..analysis.diagnostics import residual_diagnostics
+from .._custom_types import as_float, finite_or_none
+from ..airframe import INERTIAS, MOTIONS
+from ..analysis.diagnostics import Diagnostics, residual_correlations, residual_diagnostics
 from ..analysis.evaluation import evaluate, robust_covariance
+from ..analysis.identifiability import identifiability
+from ..analysis.inertia import fit_inertia
+from ..analysis.traces import os4_traces
 from ..errors import InputError
-from ..estimate import AbstractEstimator, Estimate
+from ..estimate import AbstractEstimator, Estimate, fit_start
 from ..estimators import ESTIMATORS, Hybrid, make_estimator
+from ..flight import STATE_NAMES, STATE_UNITS
 from ..logs import Recording
 from ..models import MODELS
 from ..models.abstract import AbstractModel
@@ -22,40 +27,29 @@ from ..networks import TrainedNetwork
 from ..networks.file import load_network
 from ..networks.for_flight import GivenNetwork, network_for, network_provenance
 from ..recording.checks import KINEMATIC, self_checks
-from ..results import result_names
+from ..results import has_answer, result_names
 from ..shooting import ShootingProblem, padded
-from .answers import Answer, Solution
-from .checks import check_os4
-from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, silent, versions
-from .problem import Intervals, bracket_of, os4_problem
-from .results import COLOURED, Identification, has_answer
-from .settings import FlightSettings, class_name, name_and_class
+from .answers import UNIT, Answer, OS4Answer, parameter_table, shared_fields
+from .data import (
+    Clock,
+    Data,
+    HeldOut,
+    Progress,
+    Provenance,
+    airframe_name,
+    class_name,
+    name_and_class,
+    silent,
+    versions,
+)
+from .issues import issues_of_log, issues_of_os4
+from .problem import FlightSettings, Intervals, bracket_of, os4_problem
+from .quantities import os4_quantities
+from .results import COLOURED, ChannelFit, Constant, OS4Identification, ParameterEstimate, RigidBody, Validation
+from .verdict import CONTRADICTED, judge, result_of
 
 MAX_PASSES = 3  # in which noise levels are found from residuals, before the last estimate
 SETTLED = 0.2  # largest change of a noise level; weights this close to the right ones cost under 1 % of the efficiency
-
-
-@dataclasses.dataclass(frozen=True)
-class OS4Case:
-    """A flight of an OS4, and how it is identified.
-
-    - `data`: with the likelihood of a simulation, which has noise of the sensors only.
-    - `estimator`, `name`: what searches it. `model`: the name of the equations.
-    """
-
-    data: Data[ShootingProblem]
-    estimator: AbstractEstimator
-    name: str
-    model: str
-
-    def solve(self, progress: Progress) -> Solution:
-        """The parameters and the noise levels."""
-        return Solution(self.data, fit_os4(self.estimator, self.data.likelihood, progress=progress))
-
-    def check(self, solution: Solution, progress: Progress) -> Identification:
-        """The estimate of each quantity, and the doubts about it."""
-        del progress
-        return check_os4(solution.data, solution.answer, self.estimator, self.name, self.model)
 
 
 def prepare_os4(
@@ -69,22 +63,28 @@ def prepare_os4(
     validate: Recording | None,
     seed: int,
     progress: Progress,
-) -> OS4Case:
-    """A flight of an OS4. Arguments as of `identify`."""
+) -> tuple[Data[ShootingProblem], AbstractEstimator]:
+    """The data of one flight, and the estimator that searches its likelihood. Arguments as of `identify`."""
     recording, *others = recordings
-    subject = class_name(model, MODELS)
     if others:
         raise InputError(
-            f"{others[0].name}: the {subject} model explains one flight; several need an airframe and the model flight."
+            f"{others[0].name}: the {class_name(model, MODELS)} model explains one flight; several need an airframe "
+            "and the model flight."
         )
-    name, kind, trained = _method("ibss" if estimator is None else estimator, settings, network)
+    estimator = "ibss" if estimator is None else estimator
+    name, kind = name_and_class(estimator)
+    trained = _given_network(estimator, settings, network)
     if trained is not None and not kind.shoots and bracket is not None:
         raise InputError("`bracket`: a network searches the bracket that it was trained in; leave one of them out.")
-    where, shooting = bracket_of(bracket, model), {"initial_state": settings.initial_state, "window": settings.window}
-    problem = os4_problem(recording, model, where, channels=settings.channels, **shooting)
-    other = None if validate is None else os4_problem(validate, model, where, **shooting)
+    where = bracket_of(bracket, model)
+    problem = os4_problem(recording, model, where, settings)
+    other = None
+    if validate is not None:
+        other = os4_problem(validate, model, where, dataclasses.replace(settings, channels=None))
     if _has_own_channels(kind):
-        problem = _restricted(problem, kind.looks_at, name, recording)
+        problem = problem.restrict(kind.looks_at)
+        if np.isnan(np.asarray(problem.flight.states)[:, CASCADE_ORDER[: problem.size]]).all(axis=0).any():
+            raise InputError(f"{recording.name}: {name} needs p, q and r; use `estimator` output-error.")
     if kind.needs_network and trained is None:
         progress("training a network for this flight")
         trained = network_for(problem, where, recording.name, shoots=kind.shoots, seed=seed)
@@ -97,16 +97,19 @@ def prepare_os4(
             problem = problem.restrict(trained.channels).within(trained.bracket)
     notes, held_out = recording.notes, None
     if validate is not None and other is not None:
-        held_out = HeldOut(_comparable(other, problem, validate), validate.name)
-        notes += validate.named_notes
-    samples = int(problem.flight.time.shape[0])
+        other = other.restrict(problem.channels) if other.size > problem.size else other
+        if np.isnan(other.recorded()).all():
+            raise InputError(
+                f"{validate.name}: nothing was measured among the {problem.channels} channels; give another flight."
+            )
+        held_out, notes = HeldOut(other, validate.name), notes + validate.named_notes
     provenance = Provenance(
         flight=recording.name,
         airframe=airframe_name(model.airframe),
         channels=problem.channels,
         initial_state=settings.initial_state,
         windows=problem.windows,
-        samples=samples,
+        samples=int(problem.flight.time.shape[0]),
         sample_time=float(problem.flight.dt),
         network=msgspec.UNSET if trained is None else network_provenance(network, trained),
         notes=list(notes),
@@ -114,43 +117,14 @@ def prepare_os4(
     )
     findings = self_checks(recording, model.airframe, checks=KINEMATIC)
     data = Data(problem, problem, Clock(), provenance, held_out=held_out, findings=findings)
-    method = estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
-    return OS4Case(data, method, name, subject)
+    return data, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
 
 
-def _method(
+def _given_network(
     estimator: str | AbstractEstimator, settings: FlightSettings, network: GivenNetwork
-) -> tuple[str, type[AbstractEstimator], TrainedNetwork | None]:
-    """The name of an estimator, its class, and the network that it has or was given."""
+) -> TrainedNetwork | None:
+    """The network that an estimator has or was given. Raises `InputError` for options that do not fit the estimator."""
     name, kind = name_and_class(estimator)
-    _check_options(name, kind, settings, network)
-    if network is not None and not isinstance(estimator, str):
-        raise InputError(f"`network`: this {name} estimator has one already; leave it out.")
-    trained = estimator.network if isinstance(estimator, Hybrid) else estimator
-    if not isinstance(trained, TrainedNetwork):
-        trained = network if network is None or isinstance(network, TrainedNetwork) else load_network(network)
-    return name, kind, trained
-
-
-def _restricted(problem: ShootingProblem, channels: str, name: str, recording: Recording) -> ShootingProblem:
-    """The problem on the channels that an estimator looks at."""
-    problem = problem.restrict(channels)
-    if np.isnan(np.asarray(problem.flight.states)[:, CASCADE_ORDER[: problem.size]]).all(axis=0).any():
-        raise InputError(f"{recording.name}: {name} needs p, q and r; use `estimator` output-error.")
-    return problem
-
-
-def _comparable(other: ShootingProblem, problem: ShootingProblem, validate: Recording) -> ShootingProblem:
-    """The other flight's problem on the same channels."""
-    other = other.restrict(problem.channels) if other.size > problem.size else other
-    if np.isnan(other.recorded()).all():
-        raise InputError(
-            f"{validate.name}: nothing was measured among the {problem.channels} channels; give another flight."
-        )
-    return other
-
-
-def _check_options(name: str, kind: type[AbstractEstimator], settings: FlightSettings, network: GivenNetwork) -> None:
     if network is not None and not kind.needs_network:
         raise InputError(f"`network`: {name} uses none; use `estimator` network or hybrid, or leave it out.")
     if settings.window is not None and not (kind.shoots or kind.needs_network):
@@ -162,13 +136,19 @@ def _check_options(name: str, kind: type[AbstractEstimator], settings: FlightSet
         raise InputError(
             f"`channels` {settings.channels}: {name} looks at the {kind.looks_at}; use `estimator` output-error."
         )
+    if network is not None and not isinstance(estimator, str):
+        raise InputError(f"`network`: this {name} estimator has one already; leave it out.")
+    trained = estimator.network if isinstance(estimator, Hybrid) else estimator
+    if isinstance(trained, TrainedNetwork):
+        return trained
+    return network if network is None or isinstance(network, TrainedNetwork) else load_network(network)
 
 
 def _has_own_channels(kind: type[AbstractEstimator]) -> bool:
     return kind.looks_at != "all" and not kind.needs_network
 
 
-def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> Answer:
+def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> OS4Answer:
     """Estimate the parameters and the noise levels of one flight.
 
     The noise levels follow from the residuals, and the fit is repeated with them. The covariance of an estimator that
@@ -184,7 +164,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
     estimates = [search(problem, 0)]
     for number in range(1, MAX_PASSES + 2):
         last, before = estimates[-1], np.asarray(problem.sigma)
-        if not has_answer(last):
+        if not has_answer(last.result):
             break
         problem = problem.reweighted(evaluate(problem, last.parameters, last.initial_state).errors)
         settled = (np.abs(np.asarray(problem.sigma) / before - 1) < SETTLED).all()
@@ -195,13 +175,97 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
         if is_last:
             break
     estimate, rollouts = estimates[-1], sum(int(each.rollouts) for each in estimates)
-    if not has_answer(estimate):
-        return Answer(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
+    if not has_answer(estimate.result):
+        return OS4Answer(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
     evaluation = evaluate(problem, estimate.parameters, estimate.initial_state)
+    diagnostics = residual_diagnostics(evaluation)
     bound, covariance = evaluation.covariance, estimate.covariance
     if estimator.shoots:
-        coloured = (residual_diagnostics(evaluation).colour > COLOURED).any()
-        covariance = robust_covariance(evaluation) if coloured else bound
+        covariance = robust_covariance(evaluation) if (diagnostics.colour > COLOURED).any() else bound
     changed = as_float(covariance), as_float(evaluation.cost)
     estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, changed)
-    return Answer(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, evaluation)
+    bounds = np.sqrt(np.diagonal(bound))
+    return OS4Answer(problem, estimate, bounds, rollouts, evaluation=evaluation, diagnostics=diagnostics)
+
+
+def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator) -> OS4Identification:
+    """The result of the flight of an OS4 that an estimator searched: with rigid body, issues and verdicts."""
+    name, _ = name_and_class(estimator)
+    search, flown = str(result_names(answer.estimate.result)), answer.evaluation
+    found = OS4Identification(
+        model=class_name(answer.problem.model, MODELS),
+        parameters=_alphas(answer, estimator.prior),
+        result=search,
+        issues=tuple(issues_of_log(data.findings)),
+        **shared_fields(data, answer, name),
+    )
+    if flown is None or answer.diagnostics is None:
+        return found
+    errors = np.where(np.isnan(flown.measured), np.nan, flown.errors)[:, : flown.problem.size]
+    found = msgspec.structs.replace(
+        found,
+        rigid_body=_rigid_body(answer),
+        fit=_channel_fits(answer.problem, answer.diagnostics),
+        validation=None if data.held_out is None else _validate_on(answer, data.held_out),
+        traces=os4_traces(flown) if flown.feasible else None,
+        correlations=residual_correlations(errors, flown.torques) if flown.feasible else None,
+    )
+    # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
+    issues = issues_of_os4(data, found, found.fit if estimator.shoots else {})
+    verdicts = judge(os4_quantities(found.parameters, found.rigid_body), issues)
+    # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
+    wrong = [name for name in found.parameters if verdicts[name].status == CONTRADICTED]
+    result = result_of(verdicts, issues, search, wrong if search == "successful" else found.parameters)
+    return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
+
+
+def _alphas(answer: OS4Answer, prior: float) -> dict[str, ParameterEstimate]:
+    """The estimate of each alpha, with the noise above which it cannot be distinguished from 0."""
+    names, missing, limits = answer.problem.unknowns.names, {}, {}
+    if answer.evaluation is not None:
+        information = identifiability(answer.evaluation, answer.problem.unknowns.bracket)
+        notes, known = information.notes(names), information.identifiable & information.excited
+        missing = {name: notes[name] for i, name in enumerate(names) if not known[i] and name in notes}
+        limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
+    table = parameter_table(answer, prior, missing)
+    return {name: msgspec.structs.replace(row, noise_limit=limits.get(name)) for name, row in table.items()}
+
+
+def _rigid_body(answer: Answer) -> RigidBody:
+    """The moments of inertia that explain the alphas best; none if they are not identifiable."""
+    rigid = fit_inertia(answer.problem.model, answer.estimate.parameters, answer.estimate.covariance)
+    values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
+    if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
+        return RigidBody()
+    table = zip((*INERTIAS, "J_R"), values.tolist(), std.tolist(), strict=True)
+    constants = {name: Constant(value, error, UNIT) for name, value, error in table}
+    return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
+
+
+def _validate_on(answer: Answer, held_out: HeldOut) -> Validation:
+    """The fit of the parameters to another flight, of which only the initial state is estimated."""
+    other, name = eqx.tree_at(lambda p: p.sigma, held_out.problem, answer.problem.sigma), held_out.recording or ""
+    start, cost, feasible, _ = eqx.filter_jit(fit_start)(padded(other), answer.estimate.parameters)
+    if not bool(feasible):
+        return Validation(name, None, None)
+    diagnostics = residual_diagnostics(evaluate(other, answer.estimate.parameters, start), fitted=False)
+    return Validation(name, finite_or_none(cost), _channel_fits(other, diagnostics))
+
+
+def _channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str, ChannelFit]:
+    """The diagnostics of each measured channel, by its name."""
+    return {
+        STATE_NAMES[column]: ChannelFit(
+            rms=float(diagnostics.rms[i]),
+            unit=STATE_UNITS[column],
+            percent=finite_or_none(diagnostics.percent[i]),
+            level=float(diagnostics.level[i]),
+            level_p=float(diagnostics.level_p[i]),
+            correlation=float(diagnostics.colour[i]),
+            white_p=float(diagnostics.white_p[i]),
+            input_correlation=dict(zip(MOTIONS, diagnostics.input_correlation[i].tolist(), strict=True)),
+            input_p=float(diagnostics.input_p[i]),
+        )
+        for i, column in enumerate(CASCADE_ORDER[: problem.size])
+        if diagnostics.count[i] > 2
+    }

@@ -21,10 +21,25 @@ from ..networks.for_flight import seen_channels
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem, Unknowns
 
-# A bracket, or `[lower, upper]` by parameter name; the model's default for all others.
 Intervals = Bracket | Mapping[str, Any] | None
+"""A bracket, or `[lower, upper]` by parameter name; the model's default for all others."""
+
 # The states that each choice of channels adds to the one before, in cascade order.
 _ADDED = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightSettings:
+    """Settings of the identification of an OS4.
+
+    - `channels`: `"rates"`, `"attitude"` or `"all"`: the compared channels; by default everything that was measured.
+    - `initial_state`: `"free"`: estimated too; `"known"`: the first sample is exact.
+    - `window`: length of the windows for multiple shooting [s]; by default the flight is one window.
+    """
+
+    channels: str | None = None
+    initial_state: str = "free"
+    window: float | None = None
 
 
 def bracket_of(bracket: Intervals, model: AbstractModel) -> Bracket:
@@ -56,15 +71,9 @@ def _interval(name: str, value: Any) -> list[float]:
 
 
 def os4_problem(
-    recording: Recording,
-    model: AbstractModel,
-    bracket: Bracket,
-    *,
-    channels: str | None = None,
-    initial_state: str = "free",
-    window: float | None = None,
+    recording: Recording, model: AbstractModel, bracket: Bracket, settings: FlightSettings
 ) -> ShootingProblem:
-    """The problem of explaining one flight by a model, at the standard sensors' noise. Arguments as of `identify`.
+    """The problem of explaining one flight by a model, at the standard sensors' noise.
 
     **Raises:** `InputError`, one line, for arguments out of range and flights that measured too little.
     """
@@ -72,16 +81,16 @@ def os4_problem(
         raise InputError(
             "`sensor_rotation`: the rates of an OS4 flight are along the body's axes; leave it out of the airframe."
         )
-    if initial_state not in ("free", "known"):
-        raise InputError(f"`initial_state`: must be free or known, got {initial_state!r}.")
-    known = initial_state == "known"
+    if settings.initial_state not in ("free", "known"):
+        raise InputError(f"`initial_state`: must be free or known, got {settings.initial_state!r}.")
+    known, window = settings.initial_state == "known", settings.window
     if window is not None and not (math.isfinite(window) and window > 0):
         raise InputError(f"`window`: must be a positive number of seconds, got {window:g}.")
     if window is not None and known:
         raise InputError("`window`: each window has its own initial state; use `initial_state` free.")
     flight, name = recording.flight, recording.name
     measured = ~np.isnan(np.asarray(flight.states))
-    chosen = _chosen_channels(name, measured, channels)
+    chosen = _chosen_channels(name, measured, settings.channels)
     columns = CASCADE_ORDER[: CHANNELS[chosen]]
     start = jnp.nan_to_num(flight.states[0]) if known else None
     unknown = [STATE_NAMES[i] for i in columns if not measured[0, i]]
@@ -144,8 +153,8 @@ def train_network(
     - `settings`: of the training, except the channels.
     - `channels`: what the network looks at; by default the rates, and the attitude if a rate was not measured.
     """
-    where = bracket_of(bracket, model)
-    problem = os4_problem(recording, model, where, channels=channels, initial_state=initial_state)
+    where, own = bracket_of(bracket, model), FlightSettings(channels=channels, initial_state=initial_state)
+    problem = os4_problem(recording, model, where, own)
     settings = dataclasses.replace(settings, channels=channels or seen_channels(problem))
     with named(recording.name):
         return settings.fit(problem, where, key=jax.random.key(seed))

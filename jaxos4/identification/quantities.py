@@ -9,9 +9,9 @@ from ..models.abstract import PARAMETER_NAMES
 from ..models.terms import SAG, VOLTAGE_EXPONENT
 from ..results import NINETY_FIVE
 from .answers import Answer, drag_error
-from .doubts_of_iz import MEASURE
+from .intervals import PRIOR_NOTE
+from .issues_of_values import MEASURE
 from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
-from .uncertainty import PRIOR_NOTE
 from .verdict import MAX_PRIOR, PREDICTIONS, RIGID_BODY, Quantity
 
 

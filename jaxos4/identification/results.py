@@ -5,18 +5,17 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from jaxtyping import Array, PRNGKeyArray
 
-from .._custom_types import NotNegative, Positive
+from .._custom_types import NotNegative, Positive, as_list
 from ..airframe import Airframe, airframe_table
 from ..analysis.diagnostics import Correlations
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
 from ..analysis.traces import Traces
 from ..estimate import Estimate
-from ..results import result_names
+from ..results import NO_ANSWER
 from ..shooting import ShootingProblem
 from .data import Provenance
-from .tables import as_list, dataframe, dataset
-from .verdict import Doubt, Verdict
+from .verdict import Issue, Verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,13 +23,9 @@ if TYPE_CHECKING:
 
     from ..report import Plots
 
-NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
+VEHICLE_MODEL = "flight"  # the name of the model of a vehicle, in files and on the command line
+APART = {"rigid_body", "airframe", "estimate", "problem"}  # fields that a file holds in another form, or not at all
 LATE = 0.005  # s; with a `rotor_delay` below minus this, motors are recorded late
-
-
-def has_answer(estimate: Estimate) -> bool:
-    """Whether there is an estimate at all, trustworthy or not."""
-    return str(result_names(estimate.result)) not in NO_ANSWER
 
 
 class ParameterEstimate(msgspec.Struct, frozen=True):
@@ -181,7 +176,8 @@ class PredictionSkill(msgspec.Struct, frozen=True):
 class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The parameters of a quadrotor, with what a user needs to judge them.
 
-    Made by `jaxos4.identify`, or read from a file by `jaxos4.read_result`.
+    Made by `jaxos4.identify`, or read from a file by `jaxos4.read_result`; either is an `OS4Identification` or a
+    `VehicleIdentification`.
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
@@ -191,7 +187,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
     - `verdicts`: for each quantity, whether it can be trusted, and why not. Empty without an answer.
-    - `doubts`: the failed checks of the estimate, and how far each would move each quantity.
+    - `issues`: the failed checks of the estimate, and how far each would move a quantity. In files: `doubts`.
     - `provenance`: inputs, settings, versions, and notes about the data.
     - `covariance`: of `parameters`; `None` without an answer.
     - `airframe`: the constants that were not estimated.
@@ -199,22 +195,6 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
       that were found. Files do not hold them: `None` if the result was read from one.
     - `traces`: signals of the fitted flights, at most 1,200 samples. `correlations`: of the residuals. `None` without
       an answer.
-
-    Only of a flight of an OS4:
-
-    - `fit`: how well the model explains each measured channel, by the channel's name.
-    - `validation`: the same for another flight, if one was given.
-
-    Only of a vehicle:
-
-    - `held`: parameters that were not estimated.
-    - `noise`: standard deviation of the sensors' noise by channel.
-    - `disturbances`: the accelerations that the model lacks, by channel.
-    - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
-    - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
-    - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
-    - `predictions`: the predictions themselves, at most 1,200 starts. `trajectories`: the same every 20 ms, at most 40.
-    - `response`: the frequency response with the fitted data. `None` without an answer.
     """
 
     estimator: str
@@ -226,23 +206,12 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     parameters: dict[str, ParameterEstimate]
     rigid_body: RigidBody = RigidBody()
     verdicts: dict[str, Verdict] = {}
-    doubts: tuple[Doubt, ...] = ()
+    issues: tuple[Issue, ...] = msgspec.field(default=(), name="doubts")
     provenance: Provenance
     covariance: list[list[float]] | None
     airframe: Airframe
     estimate: Estimate | None = None
     problem: ShootingProblem | None = None
-    fit: dict[str, ChannelFit] = {}
-    validation: Validation | None = None
-    held: dict[str, FixedParameter] = {}
-    noise: dict[str, float] = {}
-    disturbances: dict[str, Disturbance] = {}
-    widened: dict[str, float] = {}
-    sample_times: tuple[SampleTime, ...] = ()
-    skill: PredictionSkill | None = None
-    predictions: Predictions | None = None
-    trajectories: Predictions | None = None
-    response: FrequencyResponse | None = None
     traces: Traces | None = None
     correlations: Correlations | None = None
 
@@ -253,8 +222,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def is_vehicle(self) -> bool:
-        """Whether it is of a real vehicle, and not of an OS4."""
-        return self.model == "flight"
+        """Whether it is a `VehicleIdentification`."""
+        return isinstance(self, VehicleIdentification)
 
     @property
     def has_answer(self) -> bool:
@@ -270,7 +239,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def warnings(self) -> tuple[str, ...]:
         """Why the estimate cannot be trusted, or only with care, and what to do; one line each."""
         said = "use with care: " if self.successful else "not to be trusted because "
-        return tuple(f"{said}{doubt}" for doubt in self.doubts)
+        return tuple(f"{said}{issue}" for issue in self.issues)
 
     @property
     def motor_clock(self) -> str:
@@ -291,11 +260,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
         `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`.
         """
-        apart = APART | (_OF_OS4 if self.is_vehicle else _OF_VEHICLES)
-        fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
+        every = msgspec.structs.fields(self)
+        fields = {field.encode_name: getattr(self, field.name) for field in every if field.name not in APART}
         fields |= {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.airframe)}
-        if self.response is not None:
-            fields["response"] = self.response._asdict()
         return msgspec.to_builtins(fields, enc_hook=as_list)
 
     def summary(self, *, verbose: bool = False, width: int = 80) -> str:
@@ -328,7 +295,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
         **Raises:** `InputError` if pandas is not installed.
         """
-        return dataframe(self.rigid_body.constants, self.parameters, self.held)
+        from .tables import dataframe
+
+        return dataframe(self)
 
     def to_dataset(self) -> "xr.Dataset":
         """Parameters, covariance, predictions and response as an xarray Dataset.
@@ -337,13 +306,42 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
         **Raises:** `InputError` if xarray is not installed.
         """
-        about = {"estimator": self.estimator, "model": self.model, "result": self.result}
-        parts, step = (self.parameters, self.covariance, self.predictions, self.response), self.provenance.sample_time
-        return dataset(*parts, sample_time=step, **about)
+        from .tables import dataset
+
+        return dataset(self)
 
 
-APART = {"rigid_body", "airframe", "estimate", "problem"}
-"""Fields that a file holds in another form, or not at all."""
-_OF_OS4 = {"fit", "validation"}  # and those of a vehicle: written of this kind only
-_OF_VEHICLES = {"held", "noise", "disturbances", "widened", "skill", "sample_times"}
-_OF_VEHICLES |= {"predictions", "trajectories", "response"}
+class OS4Identification(Identification, frozen=True, kw_only=True, eq=False):
+    """The parameters of an OS4, from one flight.
+
+    - `fit`: how well the model explains each measured channel, by the channel's name.
+    - `validation`: the same for another flight, if one was given.
+    """
+
+    fit: dict[str, ChannelFit] = {}
+    validation: Validation | None = None
+
+
+class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False):
+    """The parameters of a real vehicle, from its recorded flights.
+
+    - `held`: parameters that were not estimated.
+    - `noise`: standard deviation of the sensors' noise by channel.
+    - `disturbances`: the accelerations that the model lacks, by channel.
+    - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
+    - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
+    - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
+    - `predictions`: the predictions themselves, at most 1,200 starts. `trajectories`: the same every 20 ms, at most 40.
+    - `response`: the frequency response with the fitted data. `None` without an answer.
+    """
+
+    model: str = VEHICLE_MODEL
+    held: dict[str, FixedParameter] = {}
+    noise: dict[str, float] = {}
+    disturbances: dict[str, Disturbance] = {}
+    widened: dict[str, float] = {}
+    sample_times: tuple[SampleTime, ...] = ()
+    skill: PredictionSkill | None = None
+    predictions: Predictions | None = None
+    trajectories: Predictions | None = None
+    response: FrequencyResponse | None = None

@@ -1,4 +1,4 @@
-"""The sample time of a vehicle's fit: the shortest at which the answer does not depend on it.
+"""The fit of a vehicle at the shortest sample time at which the answer does not depend on it.
 
 Short samples contain the vibration of the sensors. Long samples hide motion. The flight is fitted at several sample
 times. A sample time that the user gives is fitted in the same way, and longer ones beside it.
@@ -8,23 +8,33 @@ inertia are those of the next longer samples with an answer, within two standard
 If there is none: the shortest with white innovations. If there is none either: the least correlated.
 """
 
+import dataclasses
 import itertools
 import math
+import time
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from ..airframe import AXES, PITCH, ROLL, YAW
+from ..errors import InputError, TrainingError
 from ..estimate import REACH, AbstractEstimator, Estimate
+from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
+from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..results import result_names
 from ..shooting import InnovationsProblem
-from .answers import Answer, overwhelmed, vehicle_constants
-from .data import Data, Progress, silent
+from .answers import VehicleAnswer, dominated, vehicle_constants
+from .data import Data, Progress, name_and_class, silent
+from .intervals import at_lowest, corrected
 from .results import Constant, SampleTime
 from .search import Optimum, search
-from .uncertainty import corrected
 
+DEFAULT = "filter-error"
+"""The estimator of a vehicle, which flies in closed loop."""
+
+TOLERANCE = 1e-3  # of `FilterError`: it stops within 0.05 standard deviations of the minimum
 WHITE = 0.06  # largest correlation of innovations that count as white, besides chance
 CHANCE = 3.0  # standard errors of a correlation, of which the largest of 24 (3 rates, 8 lags) is compared
 AGREE = 2.0  # standard deviations between two answers that agree
@@ -32,14 +42,79 @@ DISCRETE = 0.03  # share of a value that errors of discretisation add to it
 WIDER = 1.5  # intervals longer by this factor than those of samples twice as long agree with anything
 NEAR_LIMIT = 0.95  # share of the way to its limit from which on an unknown is no start for another search
 
-Fits = tuple[Sequence[Data[InnovationsProblem]], list[Optimum], list[SampleTime]]
-"""Data, optimum and answer at several sample times, the shortest first."""
+
+def vehicle_estimator(estimator: str | AbstractEstimator, network: GivenNetwork) -> str:
+    """The name of an estimator of vehicles. Raises `InputError` for one that a controller biases, and for a network."""
+    name, kind = name_and_class(estimator)
+    if not kind.in_closed_loop:
+        fitting = ", ".join(each for each, other in ESTIMATORS.items() if other.in_closed_loop)
+        raise InputError(
+            f"`estimator` {name}: is biased by a controller that answers gusts, as every vehicle has; use one of "
+            f"{fitting}."
+        )
+    if network is not None or isinstance(estimator, Hybrid):
+        raise InputError("`network`: a vehicle's network is trained for its own flights; use `estimator` hybrid.")
+    return name
+
+
+def fit_vehicle(
+    several: Sequence[Data[InnovationsProblem]],
+    estimator: str | AbstractEstimator,
+    *,
+    choose: bool,
+    seed: int,
+    progress: Progress,
+) -> tuple[VehicleAnswer, tuple[SampleTime, ...]]:
+    """The parameters and the disturbances at the chosen sample time.
+
+    `FilterError` searches at all sample times, and another estimator then at the chosen one.
+
+    **Arguments:** `several`: the data, the shortest sample time first. `choose`: whether a sample time is to be chosen;
+    otherwise it is the first. `seed`: for training a network.
+
+    **Returns:** the answer, and a row for each sample time that belongs to it.
+    """
+    solver, is_default = FilterError(tolerance=TOLERANCE), estimator == DEFAULT
+    compared = several if is_default or len(several) > 1 else ()
+    answers, rows = fit_sample_times(compared, solver, choose=choose, progress=progress)
+    place = chosen_place(rows) if choose and rows else 0
+    if is_default:
+        answer = answers[place]
+    else:
+        data = answers[place].optimum.data if answers else several[0]
+        data, solver = _with_estimator(data, estimator, seed=seed, progress=progress)
+        answer = corrected(search(solver, data, progress=progress))
+    answer = at_lowest(answer, solver, progress=progress)
+    rows[place : place + 1] = [sample_time_of(answer)]
+    # After a restart, the other sample times have the minimum that was left.
+    return answer, (rows[place],) if answer.optimum.restarts else tuple(rows)
+
+
+def _with_estimator(
+    data: Data[InnovationsProblem], estimator: str | AbstractEstimator, *, seed: int, progress: Progress
+) -> tuple[Data[InnovationsProblem], AbstractEstimator]:
+    """The estimator, with a network that is trained for the data if it needs one; the data, with a note on that."""
+    if not isinstance(estimator, str):
+        return data, estimator
+    if not ESTIMATORS[estimator].needs_network:
+        return data, make_estimator(estimator)
+    progress("training a network for these flights")
+    begin, seen = time.perf_counter(), liveliest(data.problem)
+    name, method = str((data.provenance.flights or ["flight"])[0]), IBSS()
+    try:
+        method = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)
+        what = f"its network was trained for these flights in {time.perf_counter() - begin:.0f} s"
+    except TrainingError as error:
+        what = f"no network for these flights ({error}); IBSS searched the whole bracket"
+    notes = [*data.provenance.notes, f"{estimator}: {what}"]
+    provenance = msgspec.structs.replace(data.provenance, notes=notes)
+    return dataclasses.replace(data, provenance=provenance), method
 
 
 def fit_sample_times(
     several: Sequence[Data[InnovationsProblem]], solver: AbstractEstimator, *, choose: bool, progress: Progress
-) -> Fits:
-    """The fits at the sample times that can be compared.
+) -> tuple[list[VehicleAnswer], list[SampleTime]]:
+    """The answers at the sample times that can be compared, the shortest first, and a row for each.
 
     Samples of commands that hold the controller's answers are another kind: feedthroughs hide nearly all that they
     show. They are fitted only if no others have white innovations, and the kind with the least correlated is returned.
@@ -47,18 +122,19 @@ def fit_sample_times(
     `choose`: whether the sample time is to be chosen; otherwise the kind of the first counts.
     """
     kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
-    best: Fits = [], [], []
+    answers, rows = [], []
     for some in filter(None, kinds):
         if not choose and some[0] is not several[0]:
             continue
-        found = search_sample_times(some, solver, progress=progress)
+        optima = search_sample_times(some, solver, progress=progress)
         progress("computing intervals")
-        rows = [sample_time_of(corrected(x, data)) for x, data in zip(found, some, strict=True)]
-        if not best[2] or _least_correlation(rows) < _least_correlation(best[2]):
-            best = some, found, rows
-        if any(row.constants and is_white(row) for row in rows):
+        found = [corrected(optimum) for optimum in optima]
+        own = [sample_time_of(answer) for answer in found]
+        if not rows or _least_correlation(own) < _least_correlation(rows):
+            answers, rows = found, own
+        if any(row.constants and is_white(row) for row in own):
             break
-    return best
+    return answers, rows
 
 
 def _least_correlation(rows: Sequence[SampleTime]) -> float:
@@ -81,8 +157,8 @@ def search_sample_times(
         progress(f"fitting samples of {step:.3g} ms ({number} of {len(several)} sample times)")
         start, own = None, data.likelihood
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
-            start = start_of(own, optimum.first)
-        optimum = search(estimator, data.likelihood, start=start)
+            start = start_of(own, optimum.unrestricted)
+        optimum = search(estimator, data, start=start)
         optima.insert(0, optimum)
     return optima
 
@@ -113,10 +189,10 @@ def is_white(row: SampleTime) -> bool:
 def _agree(row: SampleTime, other: SampleTime) -> bool:
     """Whether the next longer sample time with an answer finds the same, and knows it no better."""
     shared = row.constants.keys() & other.constants.keys()
-    return bool(shared) and not moved(row, other) and not _vague(row, other)
+    return bool(shared) and not moved(row, other) and not _less_certain(row, other)
 
 
-def _vague(row: SampleTime, other: SampleTime) -> bool:
+def _less_certain(row: SampleTime, other: SampleTime) -> bool:
     """Whether another sample time knows Ix or Iy clearly better."""
     both = {ROLL.inertia, PITCH.inertia} & row.constants.keys() & other.constants.keys()
     return any(row.constants[name].std > WIDER * other.constants[name].std for name in both)
@@ -132,12 +208,12 @@ def moved(row: SampleTime, other: SampleTime) -> list[str]:
     return [name for name in both if differs(row.constants[name], other.constants[name])]
 
 
-def sample_time_of(answer: Answer) -> SampleTime:
+def sample_time_of(answer: VehicleAnswer) -> SampleTime:
     """The answer of one sample time. Without a thrust there is no scale of torques, and so no answer."""
     scales = [each.name for each in answer.problem.model.parameters if each.scales_torque]
     answered = answer.answered and not any(name in answer.fixed for name in scales)
     constants = vehicle_constants(answer).constants if answered else {}
-    if answered and YAW.motion in overwhelmed(answer):
+    if answered and YAW.motion in dominated(answer):
         constants = {name: row for name, row in constants.items() if name != YAW.inertia}
     found = [answer.disturbances[axis.rate] for axis in AXES if axis.rate in answer.disturbances] * answer.answered
     largest, samples = max((row.correlation for row in found), key=abs, default=1.0), 0

@@ -12,38 +12,40 @@ from jaxtyping import ArrayLike, Float
 
 from ..estimate import AbstractEstimator, Estimate
 from ..models.abstract import Parameter
-from ..results import result_names
+from ..results import has_answer, result_names
 from ..shooting import InnovationsProblem, Parts, Unknowns
 from ..shooting.gains import LogNoise
-from .data import Progress, silent
-from .results import Disturbance, has_answer
+from .data import Data, Progress, silent
+from .results import Disturbance
 
 NEGATIVE = 2.0  # standard deviations below 0 from which a parameter that must not be negative is fixed at 0
-NEAR_PLAIN = 12.0  # standard deviations; further from its plain value, a parameter is never tried there
-# Parameters near their plain values are fixed there unless that raises the cost, prior included, by more: near a plain
-# value, a cost with kinks is not quadratic, and standard deviations are too small.
+NEAR_NOMINAL = 12.0  # standard deviations; further from its nominal value, a parameter is never tried there
+# Parameters near their nominal values are fixed there unless that raises the cost, prior included, by more: near a
+# nominal value, a cost with kinks is not quadratic, and standard deviations are too small.
 MAX_RISE = 5.0
 
 
 class Optimum(NamedTuple):
     """The optimum that a search found with the likelihood of innovations.
 
-    - `likelihood`: with what is fixed. `estimate`: of all its unknowns, with the covariance of the search.
-    - `first`: the estimate before any parameter was fixed. `whole`: the parameters at that time.
+    - `data`: that were searched. `likelihood`: theirs, with what is fixed.
+    - `estimate`: of all its unknowns, with the covariance of the search.
+    - `unrestricted`, `unknowns`: the estimate and the parameters before any parameter was fixed.
     - `rollouts`: of all searches together.
-    - `plain`: the parameters that are fixed at their plain values.
+    - `nominal`: the parameters that are fixed at their nominal values.
     - `negative`: value and standard deviation of those that came out negative, and are fixed at 0.
     - `freed`: the covariance that these would add if they were free.
     - `restarts`: how often a search began again where the cost is lower. `is_lowest`: false if the cost is known to be
       lower elsewhere.
     """
 
+    data: Data[InnovationsProblem]
     likelihood: InnovationsProblem
     estimate: Estimate
-    first: Estimate
-    whole: Unknowns
+    unrestricted: Estimate
+    unknowns: Unknowns
     rollouts: int
-    plain: tuple[str, ...] = ()
+    nominal: tuple[str, ...] = ()
     negative: dict[str, tuple[float, float]] = {}
     freed: Float[ArrayLike, "..."] = 0.0
     restarts: int = 0
@@ -67,14 +69,14 @@ class Optimum(NamedTuple):
     @property
     def std(self) -> Float[np.ndarray, " parameters"]:
         """Standard deviations of the parameters, by `covariance`."""
-        return deviations(self.covariance)[: self.whole.count]
+        return deviations(self.covariance)[: self.unknowns.count]
 
     @property
     def cost(self) -> float:
         """The cost with that of all brackets, which are Gaussian priors, also of parameters that are fixed."""
         own = self.likelihood.problem.unknowns
         fixed = ~np.asarray(own.free)
-        off = (np.asarray(own.center) - np.asarray(self.whole.center)) / np.asarray(self.whole.half_width)
+        off = (np.asarray(own.center) - np.asarray(self.unknowns.center)) / np.asarray(self.unknowns.half_width)
         return float(self.estimate.cost) + float(np.square(off[fixed]).sum()) / 2
 
     @property
@@ -104,26 +106,26 @@ class Optimum(NamedTuple):
 
 def search(
     estimator: AbstractEstimator,
-    likelihood: InnovationsProblem,
+    data: Data[InnovationsProblem],
     *,
     start: Float[np.ndarray, " unknowns"] | None = None,
     progress: Progress = silent,
 ) -> Optimum:
-    """The optimum without the parameters that came out negative, or near their plain values.
+    """The optimum without the parameters that came out negative, or near their nominal values.
 
     **Arguments:** `start`: of the search; by default that of the likelihood, also if there is no answer from `start`.
     """
-    first, spent = None, 0
+    likelihood, first, spent = data.likelihood, None, 0
     if start is not None:
         first = jax.block_until_ready(estimator(likelihood.starting_from(start)))
         spent = int(first.rollouts)
-    if first is None or not has_answer(first):
+    if first is None or not has_answer(first.result):
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
-    optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
+    optimum = Optimum(data, likelihood, first, first, likelihood.problem.unknowns, spent)
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
-    return _at_plain_values(estimator, optimum, progress)
+    return _at_nominal_values(estimator, optimum, progress)
 
 
 def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
@@ -134,32 +136,32 @@ def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: P
     if not negative:
         return before
     progress("fitting again without what came out negative")
-    places = [before.whole.names.index(name) for name in negative]
+    places = [before.unknowns.names.index(name) for name in negative]
     covariance = np.asarray(before.estimate.covariance)
     freed = covariance[:, places] @ np.linalg.pinv(covariance[np.ix_(places, places)]) @ covariance[places]
     after = before.restricted(estimator, dict.fromkeys(negative, 0.0))
     return after._replace(negative=negative, freed=freed)
 
 
-def _at_plain_values(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
-    """The parameters near their plain values fixed there, unless that clearly raises the cost."""
-    plain = {
+def _at_nominal_values(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
+    """The parameters near their nominal values fixed there, unless that clearly raises the cost."""
+    nominal = {
         row.name: row.plain
         for row, value, std in _rows(before)
-        if row.plain is not None and std > 0 and abs(value - row.plain) < NEAR_PLAIN * std
+        if row.plain is not None and std > 0 and abs(value - row.plain) < NEAR_NOMINAL * std
     }
-    if not plain:
+    if not nominal:
         return before
     progress("fitting again without what the flights hardly show")
-    after = before.restricted(estimator, plain)
-    if has_answer(after.estimate) and after.cost - before.cost < MAX_RISE:
-        return after._replace(plain=tuple(plain))
+    after = before.restricted(estimator, nominal)
+    if has_answer(after.estimate.result) and after.cost - before.cost < MAX_RISE:
+        return after._replace(nominal=tuple(nominal))
     return before._replace(rollouts=after.rollouts)
 
 
 def _rows(optimum: Optimum) -> list[tuple[Parameter, float, float]]:
     """Each parameter with its value and its standard deviation in the search; empty without an answer."""
-    if not has_answer(optimum.estimate):
+    if not has_answer(optimum.estimate.result):
         return []
     std = deviations(optimum.estimate.covariance)
     return list(zip(optimum.likelihood.model.parameters, optimum.values.tolist(), std.tolist(), strict=False))

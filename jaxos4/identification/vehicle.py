@@ -1,7 +1,6 @@
-"""Recordings of a vehicle: its data at several sample times, and its parameters with the disturbances."""
+"""Recordings of a vehicle: its data at several sample times, with the likelihood of innovations."""
 
 import dataclasses
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,36 +11,21 @@ from jaxtyping import Float
 from ..airframe import YAW, Airframe
 from ..analysis.prediction import HORIZONS, starts
 from ..bracket import Bracket
-from ..errors import InputError, TrainingError, shortened
-from ..estimate import AbstractEstimator
-from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
+from ..errors import InputError, shortened
 from ..flight import CHANNEL_NAMES, Flight
 from ..logs import Recording
 from ..models.flight_model import FlightModel
 from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
-from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.voltage import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, input_innovations, lagged
-from .answers import Solution
-from .checks import check_vehicle
-from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, versions
+from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions
 from .problem import Intervals, bracket_of
-from .results import Identification
-from .sample_time import chosen_place, fit_sample_times, sample_time_of
-from .search import search
-from .settings import VehicleSettings, name_and_class
-from .uncertainty import at_lowest
-
-DEFAULT = "filter-error"
-"""The estimator of a vehicle, which flies in closed loop."""
-
 
 SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
 RECORDINGS = 4  # from twice this many on, there are more segments
 MIN_SEGMENT = 1.25  # s
-TOLERANCE = 1e-3  # of `FilterError`: it stops within 0.05 standard deviations of the minimum
 # Up to this sample time [s], torque hardly answers what is measured in its own sample, if that is an instant or if
 # motors follow commands. These need the innovations of the samples before, too (`lagged`).
 UNANSWERED = 0.005
@@ -50,46 +34,20 @@ GUESS_REACH = 4.0  # alpha8 may be this many times a guess too small or too larg
 
 
 @dataclasses.dataclass(frozen=True)
-class VehicleCase:
-    """Recordings of a vehicle, and how it is identified.
+class VehicleSettings:
+    """Settings of the identification of a vehicle.
 
-    - `data`: at several sample times, the shortest first, with the likelihood of innovations.
-    - `estimator`, `name`: what searches it. `seed`: for training a network.
-    - `choose`: whether the sample time is chosen; otherwise it is the first.
+    - `terms`: of `jaxos4.TERMS`; by default those that the recordings allow.
+    - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.
+    - `sample_time`: average to samples of this length [s]; by default 0.004 s if the recordings have shorter ones.
+    - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
     """
 
-    data: tuple[Data[InnovationsProblem], ...]
-    estimator: str | AbstractEstimator
-    name: str
-    choose: bool
-    seed: int
-
-    def solve(self, progress: Progress) -> Solution:
-        """The parameters and the disturbances at the chosen sample time.
-
-        `FilterError` searches at all sample times, and another estimator then at the chosen one.
-        """
-        solver, is_default = FilterError(tolerance=TOLERANCE), self.estimator == DEFAULT
-        data = self.data[0]
-        compared = self.data if is_default or len(self.data) > 1 else ()
-        fitted, optima, rows = fit_sample_times(compared, solver, choose=self.choose, progress=progress)
-        place = chosen_place(rows) if self.choose and rows else 0
-        if fitted:
-            data = fitted[place]
-        if is_default:
-            optimum = optima[place]
-        else:
-            data, solver = with_estimator(data, self.estimator, seed=self.seed, progress=progress)
-            optimum = search(solver, data.likelihood, progress=progress)
-        answer = at_lowest(optimum, data, solver, progress=progress)
-        rows[place : place + 1] = [sample_time_of(answer)]
-        # After a restart, the other sample times have the minimum that was left.
-        return Solution(data, answer, (rows[place],) if answer.restarts else tuple(rows))
-
-    def check(self, solution: Solution, progress: Progress) -> Identification:
-        """The estimate of each quantity, and the doubts about it."""
-        progress("checking the answer")
-        return check_vehicle(*solution, self.name, progress)
+    terms: Sequence[str] | None = None
+    begin: float | None = None
+    end: float | None = None
+    sample_time: float | None = None
+    holdout: float | None = None
 
 
 def prepare_vehicle(
@@ -97,23 +55,10 @@ def prepare_vehicle(
     airframe: Airframe,
     settings: VehicleSettings,
     *,
-    estimator: str | AbstractEstimator | None = None,
     bracket: Intervals = None,
-    network: GivenNetwork = None,
     validate: Recording | None = None,
-    seed: int = 0,
-) -> VehicleCase:
-    """Recordings of a vehicle at several sample times. Arguments as of `identify`."""
-    estimator = DEFAULT if estimator is None else estimator
-    name, kind = name_and_class(estimator)
-    if not kind.in_closed_loop:
-        fitting = ", ".join(each for each, other in ESTIMATORS.items() if other.in_closed_loop)
-        raise InputError(
-            f"`estimator` {name}: is biased by a controller that answers gusts, as every vehicle has; use one of "
-            f"{fitting}."
-        )
-    if network is not None or isinstance(estimator, Hybrid):
-        raise InputError("`network`: a vehicle's network is trained for its own flights; use `estimator` hybrid.")
+) -> list[Data[InnovationsProblem]]:
+    """The data at several sample times, the shortest first. Arguments as of `identify`."""
     if validate is not None and settings.holdout:
         raise InputError("`holdout`: `validate` is predicted instead of a part of the flights; leave one of them out.")
     if validate is not None and any(validate.same_data(recording) for recording in recordings):
@@ -126,11 +71,10 @@ def prepare_vehicle(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
     # All sample times share one program, with room for the shortest, the finest.
-    data = [
+    return [
         _data(recordings, airframe, settings, each, prepared[0], bracket=bracket, validate=validate)
         for each in prepared
     ]
-    return VehicleCase(tuple(data), estimator, name, settings.sample_time is None, seed)
 
 
 def _data(
@@ -191,27 +135,6 @@ def _data(
         follows_commands=COMMANDS in prepared.available,
         clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),
     )
-
-
-def with_estimator(
-    data: Data[InnovationsProblem], estimator: str | AbstractEstimator, *, seed: int, progress: Progress
-) -> tuple[Data[InnovationsProblem], AbstractEstimator]:
-    """The estimator, with a network that is trained for the data if it needs one; the data, with a note on that."""
-    if not isinstance(estimator, str):
-        return data, estimator
-    if not ESTIMATORS[estimator].needs_network:
-        return data, make_estimator(estimator)
-    progress("training a network for these flights")
-    begin, seen = time.perf_counter(), liveliest(data.problem)
-    name, method = str((data.provenance.flights or ["flight"])[0]), IBSS()
-    try:
-        method = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)
-        what = f"its network was trained for these flights in {time.perf_counter() - begin:.0f} s"
-    except TrainingError as error:
-        what = f"no network for these flights ({error}); IBSS searched the whole bracket"
-    notes = [*data.provenance.notes, f"{estimator}: {what}"]
-    provenance = msgspec.structs.replace(data.provenance, notes=notes)
-    return dataclasses.replace(data, provenance=provenance), method
 
 
 def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingProblem:

@@ -1,6 +1,6 @@
 """A verdict for each quantity: whether it can be trusted, and if not, the reasons.
 
-A doubt counts against a quantity by how far the quantity would move if the doubt were true.
+An issue counts against a quantity by how far the quantity would move if the issue were true.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,9 +27,11 @@ ADVICE = {
 """Whether to use a quantity, by its status, in words."""
 
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
+RESERVATION, CONTRADICTION = "successful", "implausible"
+"""Severities of an issue, by the result code to which it leads."""
 
 
-# A doubt that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. By
+# An issue that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. By
 # more than one of them, it makes a reservation; by neither, it is a note. A mere `reservation` contradicts only if it
 # moves the quantity by more than its own size. Errors of discretisation reach 3 %. Moves add up; see `judge`.
 MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
@@ -42,7 +44,7 @@ IMPROBABLE = 1e-3  # a smaller probability exceeds chance
 
 
 class Move(msgspec.Struct, frozen=True):
-    """The change of a quantity if a doubt were true.
+    """The change of a quantity if an issue were true.
 
     - `share`: of the quantity. Parameters can be 0: theirs is a share of the half-width of their bracket.
     - `deviations`: the same in standard deviations of the estimate.
@@ -58,58 +60,44 @@ class Move(msgspec.Struct, frozen=True):
 
 
 Moves = Mapping[str, Move | None]
-"""Quantities by name, each with how far it would move; `None`: nothing says how far."""
+"""Quantities by name, and how far each would move; `None`: nothing says how far."""
 
 
-class Doubt(msgspec.Struct, frozen=True):
-    """A reason not to trust an estimate, or a part of it. Made by `reservation`, `refusal`, `contradiction`.
+class Issue(msgspec.Struct, frozen=True):
+    """What speaks against an estimate, or a part of it.
 
-    - `result`: the name of the result code to which it leads if it refuses what was asked; see `severity`.
+    - `severity`: `CONTRADICTION` by physics, the airframe or the data; `RESERVATION`, which refuses nothing; otherwise
+      the flights or the search do not show the quantities, and this is the name of the result code to which it leads.
     - `cause`, `remedy`: what is wrong, and what to do.
-    - `moves`: the quantities that it concerns, each with how far it would move if the doubt were true.
+    - `moves`: the quantities that it concerns, and how far each would move if the issue were true.
     """
 
-    result: str
+    severity: str = msgspec.field(name="result")
     cause: str
     remedy: str
-    moves: dict[str, Move | None] = {}
+    moves: Moves = {}
 
     def __str__(self) -> str:
         return f"{self.cause}; {self.remedy}"
 
     @property
-    def severity(self) -> str:
+    def status(self) -> str:
         """The status that it leaves to a quantity if nothing says how far the quantity would move."""
-        return {"successful": RESERVED, "implausible": CONTRADICTED}.get(self.result, MISSING)
+        return {RESERVATION: RESERVED, CONTRADICTION: CONTRADICTED}.get(self.severity, MISSING)
 
     def share_of(self, name: str) -> float:
         """By which share the quantity of this name would move; 0 if nothing says how far."""
         return 0.0 if (move := self.moves.get(name)) is None else move.share
 
     def status_left(self, name: str) -> str:
-        """The status of the quantity of this name if this were the only doubt."""
+        """The status of the quantity of this name if this were the only issue."""
         if name not in self.moves:
             return IDENTIFIED
         if (move := self.moves[name]) is None:
-            return self.severity
+            return self.status
         # Nobody can use a value that may be off by more than itself.
-        worst = RESERVED if self.severity == RESERVED and move.share <= 1 else CONTRADICTED
+        worst = RESERVED if self.severity == RESERVATION and move.share <= 1 else CONTRADICTED
         return (IDENTIFIED, RESERVED, worst)[move.limits_exceeded]
-
-
-def reservation(cause: str, remedy: str, moves: Moves) -> Doubt:
-    """A doubt that refuses nothing."""
-    return Doubt("successful", cause, remedy, dict(moves))
-
-
-def refusal(result: str, cause: str, remedy: str, moves: Moves) -> Doubt:
-    """A doubt because the flights or the search do not show the quantities. `result`: the name of its result code."""
-    return Doubt(result, cause, remedy, dict(moves))
-
-
-def contradiction(cause: str, remedy: str, moves: Moves) -> Doubt:
-    """A doubt because physics, the airframe or the data contradict the estimate."""
-    return Doubt("implausible", cause, remedy, dict(moves))
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -135,7 +123,7 @@ class Quantity(NamedTuple):
 
     - `value`: see `Verdict`. `spread`: half of its 95 % interval, as a share of it; 0 if it can be 0.
     - `missing`: why there is no estimate, and what to do; empty if there is one.
-    - `reservations`: caveats that are not doubts.
+    - `reservations`: caveats that are not issues.
     - `remedy`: what to do if the interval is too long.
     - `requires`: the quantities without which it cannot be trusted either.
     """
@@ -148,37 +136,13 @@ class Quantity(NamedTuple):
     requires: tuple[str, ...] = ()
 
 
-class Judgement(NamedTuple):
-    """The verdict for each quantity, and the doubts that refuse it: their places, and the result codes they lead to."""
-
-    verdicts: dict[str, Verdict]
-    refusals: dict[str, list[tuple[int, str]]]
-
-    def result(self, search: str, required: Iterable[str]) -> str:
-        """The name of the result code: `"successful"` if all required quantities can be trusted.
-
-        Otherwise that of the first doubt that refuses one of them; `search`, of the search, if it has no answer.
-        """
-        refused = [name for name in required if not self.verdicts[name].trusted]
-        if not refused:
-            return "successful"
-        without_doubt = (0, search if search != "successful" else "unidentifiable")
-        return min((each for name in refused for each in self.refusals[name]), default=without_doubt)[1]
-
-
-def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt]) -> Judgement:
-    """The verdict for each quantity. `doubts`: all of the identification."""
-    verdicts, refusals = {}, {}
+def judge(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> dict[str, Verdict]:
+    """The verdict for each quantity. `issues`: all of the identification."""
+    verdicts = {}
     for name, quantity in quantities.items():
         causes: dict[str, list[str]] = {status: [] for status in STATUSES}
-        refusals[name] = []
-        for place, status in enumerate(_statuses_left(doubts, name)):
-            causes[status].append(_reason(doubts[place], name))
-            # A reservation that contradicts together with another decides nothing by itself.
-            doubt = doubts[place]
-            is_reservation, alone = doubt.severity == RESERVED, doubt.status_left(name)
-            if status not in _TRUSTED and (not is_reservation or alone not in _TRUSTED):
-                refusals[name].append((place, "implausible" if is_reservation else doubt.result))
+        for issue, status in zip(issues, _statuses_left(issues, name), strict=True):
+            causes[status].append(_reason(issue, name))
         causes[RESERVED] += quantity.reservations
         if quantity.missing and not causes[MISSING]:
             causes[MISSING].append(quantity.missing)
@@ -194,31 +158,51 @@ def judge(quantities: Mapping[str, Quantity], doubts: Sequence[Doubt]) -> Judgem
         if lacking and verdicts[name].trusted:
             why = f"it cannot be trusted without {' and '.join(lacking)}"
             verdicts[name] = Verdict(MISSING, quantity.value, (why,))
-    return Judgement(verdicts, refusals)
+    return verdicts
 
 
-def _statuses_left(doubts: Sequence[Doubt], name: str) -> list[str]:
-    """The status that each doubt leaves to the quantity of this name.
+def result_of(verdicts: Mapping[str, Verdict], issues: Sequence[Issue], search: str, required: Iterable[str]) -> str:
+    """The name of the result code: `"successful"` if all required quantities can be trusted.
 
-    Reservations of known size add up. If one of them is impossible, and together they exceed what one doubt may move,
-    they contradict the quantity: an impossible parameter shows that the model errs, and another doubt by how much.
+    Otherwise that of the first issue that refuses one of them. If there is none: `search`, the code of the search, or
+    `"unidentifiable"` if the search was successful.
     """
-    alone = [doubt.status_left(name) for doubt in doubts]
+    refused = [name for name in required if not verdicts[name].trusted]
+    if not refused:
+        return "successful"
+    left = {name: _statuses_left(issues, name) for name in refused}
+    for place, issue in enumerate(issues):
+        for name in (each for each in refused if left[each][place] not in _TRUSTED):
+            if issue.severity != RESERVATION:
+                return issue.severity
+            # A reservation that contradicts together with another decides nothing by itself.
+            if issue.status_left(name) not in _TRUSTED:
+                return CONTRADICTION
+    return search if search != "successful" else "unidentifiable"
+
+
+def _statuses_left(issues: Sequence[Issue], name: str) -> list[str]:
+    """The status that each issue leaves to the quantity of this name.
+
+    Reservations of known size add up. If one of them is impossible, and together they exceed what one issue may move,
+    they contradict the quantity: an impossible parameter shows that the model errs, and another issue by how much.
+    """
+    alone = [issue.status_left(name) for issue in issues]
     reserved = (i for i, status in enumerate(alone) if status == RESERVED)
-    sized = {i: move for i in reserved if (move := doubts[i].moves[name]) is not None}
+    sized = {i: move for i in reserved if (move := issues[i].moves[name]) is not None}
     total = Move(sum(move.share for move in sized.values()), sum(move.deviations for move in sized.values()))
-    if all(doubts[i].severity == RESERVED for i in sized) or total.limits_exceeded < 2:
+    if all(issues[i].severity == RESERVATION for i in sized) or total.limits_exceeded < 2:
         return alone
     return [CONTRADICTED if i in sized else status for i, status in enumerate(alone)]
 
 
-def _reason(doubt: Doubt, name: str) -> str:
-    """The doubt in words, with how far it moves this quantity, or the inertias if it is this quantity's own."""
-    if (move := doubt.moves.get(name)) is not None:
-        return f"{doubt.cause} (this would move it by {percent(move.share)})"
-    moves = {each: doubt.moves.get(each) for each in INERTIAS}
+def _reason(issue: Issue, name: str) -> str:
+    """The issue in words, with how far it moves this quantity, or the inertias if it is this quantity's own."""
+    if (move := issue.moves.get(name)) is not None:
+        return f"{issue.cause} (this would move it by {percent(move.share)})"
+    moves = {each: issue.moves.get(each) for each in INERTIAS}
     sizes = [f"{each} by {percent(move.share)}" for each, move in moves.items() if move is not None]
-    return f"{doubt} (this would move {', '.join(sizes)})" if sizes else str(doubt)
+    return f"{issue} (this would move {', '.join(sizes)})" if sizes else str(issue)
 
 
 def headline(statuses: Mapping[str, str]) -> dict[str, str]:
@@ -241,17 +225,17 @@ def pooled_status(statuses: Iterable[str]) -> str:
     return max([each for each in given if each in _TRUSTED] or given, key=STATUSES.index)
 
 
-def reason_lines(verdicts: dict[str, Verdict], doubts: Sequence[Doubt]) -> list[str]:
+def reason_lines(verdicts: dict[str, Verdict], issues: Sequence[Issue]) -> list[str]:
     """How far predictions reach; each reason with the quantities that it concerns; then mere notes."""
     concerned: dict[str, list[str]] = {}
     for status in STATUSES:
         for name, verdict in verdicts.items():
             for reason in verdict.reasons if verdict.status == status else ():
                 concerned.setdefault(reason, []).append(name)
-    notes = [doubt for doubt in doubts if all(doubt.status_left(name) == IDENTIFIED for name in verdicts)]
+    notes = [issue for issue in issues if all(issue.status_left(name) == IDENTIFIED for name in verdicts)]
     predicted = verdicts.get(PREDICTIONS)
     return [
         *([f"{PREDICTIONS}: {predicted.value}."] if predicted is not None and predicted.trusted else []),
         *(f"{', '.join(names)}: {reason}." for reason, names in concerned.items()),
-        *(f"note: {doubt}. It affects no quantity." for doubt in notes if verdicts),
+        *(f"note: {issue}. It affects no quantity." for issue in notes if verdicts),
     ]

@@ -201,7 +201,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     top = max(top, 2.0)  # [Hz]; an axis has two ends
     x, panels = Scale("log", (1.0, top), {at: f"{at}" for at in (1, 2, 5, 10, 20, 40)}, "frequency [Hz]"), []
     turns = Scale(ends=(-180, 180), ticks={at: f"{at}" for at in range(-180, 181, 90)})
-    for name, axis in found._asdict().items():
+    for name, axis in zip(MOTIONS, found, strict=True):
         degrees, half = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
         phase = _response(axis, degrees, np.array([degrees - half, degrees + half]), 0.0, look)
         panels += [

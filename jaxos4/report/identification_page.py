@@ -11,7 +11,7 @@ from markupsafe import Markup
 from ..airframe import INERTIAS
 from ..errors import printable
 from ..identification.physical import centers_of_mass, physical_quantities
-from ..identification.results import Identification
+from ..identification.results import Identification, OS4Identification, VehicleIdentification
 from ..identification.verdict import headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from . import identification_figures as figures
@@ -37,19 +37,22 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     top = [text(verdict(found), "verdict" if found.successful else "verdict warning")]
     top.append(text(warning_lines(found)))
     top += [text(each[0].upper() + each[1:], id="next") for each in next_lines(found)]
+    is_vehicle = isinstance(found, VehicleIdentification)
     drawn, notes = _signals(found, look), notes_of(found)
     sections = [
         Section("quantities", "Physical quantities", _quantities(found), "Quantities"),
         Section("predictions", "Measured, predicted, residual", drawn and [*drawn, text(notes)], "Signals"),
         Section("vehicle", "Identified vehicle", [_vehicle(found, look)], "Vehicle"),
-        Section("sample-times", "Moment of inertia against sample time", _sample_times(found, look)),
+        Section(
+            "sample-times", "Moment of inertia against sample time", _sample_times(found, look) if is_vehicle else ()
+        ),
         Section("estimates", "Parameters", [_parameters(found)], "Parameters"),
         Section("posteriors", "Estimates in their brackets", _posteriors(found, look)),
         Section("residuals", "Residuals", _residuals(found), "Residuals"),
         Section("paths", "Path", _path(found, look)),
-        Section("disturbances", "Disturbances", _disturbances(found)),
-        Section("skills", "Skill of predictions", _skill(found), "Skill"),
-        Section("responses", "Frequency response", _response(found, look), "Response"),
+        Section("disturbances", "Disturbances", _disturbances(found) if is_vehicle else ()),
+        Section("skills", "Skill of predictions", _skill(found) if is_vehicle else (), "Skill"),
+        Section("responses", "Frequency response", _response(found, look) if is_vehicle else (), "Response"),
     ]
     write_page(
         path,
@@ -84,7 +87,7 @@ def _signals(found: Identification, look: Style) -> list[Markup]:
     if not (drawn := identified_signals(found, look)):
         return []
     words = "Dashes: measured; line: predicted; horizontal: time [s], without gaps. "
-    if found.predictions is not None:
+    if isinstance(found, VehicleIdentification) and found.predictions is not None:
         words += (
             "Each point is a separate prediction: it starts from the rates measured that much earlier and uses the "
             f"recorded inputs. The band holds {100 * BAND:g} % of the errors of its rate at this horizon. "
@@ -95,7 +98,7 @@ def _signals(found: Identification, look: Style) -> list[Markup]:
             "Grey: fitted, and not predicted. Gusts: the angular acceleration that the model does not explain, as "
             "estimated by the filters; the axis shows 99 % of it."
         )
-    elif found.fit:
+    elif isinstance(found, OS4Identification) and found.fit:
         words += "The flight is simulated from its first sample with the estimated parameters, so that errors add up."
     return [signals(drawn, words, choice="Show")]
 
@@ -111,7 +114,7 @@ def _vehicle(found: Identification, look: Style) -> Markup:
     )
 
 
-def _sample_times(found: Identification, look: Style) -> list[Markup]:
+def _sample_times(found: VehicleIdentification, look: Style) -> list[Markup]:
     if not found.sample_times:
         return []
     figure = figures.inertias_by_sample_time(found.sample_times, found.provenance.sample_time, look)
@@ -124,18 +127,19 @@ def _sample_times(found: Identification, look: Style) -> list[Markup]:
 
 def _parameters(found: Identification) -> Markup:
     rows: list[str | tuple[str, ...]] = []
+    fixed, widened = (found.held, found.widened) if isinstance(found, VehicleIdentification) else ({}, {})
     for name, x in found.parameters.items():
         within = f"\nbracket {span(x.bracket)}" if x.bracket else ""
         rows.append((name, x.unit, plain(x.estimate, 4), span(x.ci95) + within, plain(x.bound, 2), x.note))
-    for why in dict.fromkeys(x.note for x in found.held.values()):
-        of_why = {name: x for name, x in found.held.items() if x.note == why}
+    for why in dict.fromkeys(x.note for x in fixed.values()):
+        of_why = {name: x for name, x in fixed.items() if x.note == why}
         rows += [f"fixed: {why}", *((name, x.unit, plain(x.value, 4), "", "", "") for name, x in of_why.items())]
     note = (
         "Bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found. A dash: not "
         "identifiable. Fixed: not estimated, but kept at this value."
     )
-    if found.widened:
-        factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
+    if widened:
+        factors = ", ".join(f"{name} {factor:.1f}" for name, factor in widened.items())
         note += f" Parts of the flights disagree, so that these intervals were widened by the factor: {factors}."
     headings = ("parameter", *_ESTIMATE, "bound", "note")
     return table("parameters", "Estimated parameters, then fixed parameters", headings, rows, [note])
@@ -163,7 +167,7 @@ def _posteriors(found: Identification, look: Style) -> list[Markup]:
 
 def _residuals(found: Identification) -> list[Markup]:
     parts = []
-    if found.fit:
+    if isinstance(found, OS4Identification) and found.fit:
         headings = ("channel", "unit", "fit [%]", "RMS", "level", "neighbours", "p, white", "p, inputs")
         rows = [
             (
@@ -199,7 +203,7 @@ def _path(found: Identification, look: Style) -> list[Markup]:
     return [picture(figures.path(found.traces, look), "The path of the vehicle, with one scale on both axes.")]
 
 
-def _disturbances(found: Identification) -> list[Markup]:
+def _disturbances(found: VehicleIdentification) -> list[Markup]:
     rows = [
         (name, x.unit, *(plain(each, 2) for each in (x.strength, x.correlation_time, x.sensor)))
         for name, x in found.disturbances.items()
@@ -213,7 +217,7 @@ def _disturbances(found: Identification) -> list[Markup]:
     return [table("disturbances-table", caption, headings, rows, [note])]
 
 
-def _skill(found: Identification) -> list[Markup]:
+def _skill(found: VehicleIdentification) -> list[Markup]:
     if (skill := found.skill) is None:
         return []
     rows: list[str | tuple[str, ...]] = []
@@ -233,11 +237,11 @@ def _skill(found: Identification) -> list[Markup]:
     return [table("skill", f"Skill by rate and horizon{starts}", headings, rows, [note])]
 
 
-def _response(found: Identification, look: Style) -> list[Markup]:
+def _response(found: VehicleIdentification, look: Style) -> list[Markup]:
     if found.response is None:
         return []
     gains = []
-    for name, axis in found.response._asdict().items():
+    for name, axis in zip(MOTIONS, found.response, strict=True):
         mean = axis.agreement()
         low, high = mean.interval
         known = f"{mean.ratio:.2f} ({low:.2f} to {high:.2f}) times the model"

@@ -11,7 +11,7 @@ from ..analysis.prediction import Predictions, decisive_horizon
 from ..analysis.traces import Traces
 from ..errors import printable
 from ..flight import STATE_NAMES, STATE_UNITS
-from ..identification.results import Identification
+from ..identification.results import Identification, VehicleIdentification
 from ..models.state import CASCADE_ORDER
 from .style import BOUND_DASHES, Style, style
 from .timeline import Axis, line, panel, signals, spans, view
@@ -28,7 +28,9 @@ def identified_signals(found: Identification, look: Style) -> str:
     A vehicle has a view for each horizon of its predictions, and one of trajectories. An OS4 has one for each group of
     channels.
     """
-    traces, ahead, look = found.traces, found.predictions, look._replace(dash=BOUND_DASHES[0])
+    traces, ahead, paths, look = found.traces, None, None, look._replace(dash=BOUND_DASHES[0])
+    if isinstance(found, VehicleIdentification):
+        ahead, paths = found.predictions, found.trajectories
     if traces is None:
         return ""
     validate, shown, shaded, before = found.provenance.validate or "", 0, [], None
@@ -42,7 +44,7 @@ def identified_signals(found: Identification, look: Style) -> str:
         ]
     elif ahead is not None:
         views = [_horizon(traces, ahead, i, axis, look) for i in range(ahead.horizons.size)]
-        if (paths := found.trajectories) is not None:
+        if paths is not None:
             views.append(_trajectories(traces, ahead, paths, axis, look))
         shown = decisive_horizon(ahead.horizons, np.isfinite(ahead.measured).any(axis=(0, 2)))
         shaded = spans(time, known)

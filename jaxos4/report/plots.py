@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..airframe import INERTIAS
+from ..airframe import INERTIAS, MOTIONS
 from ..analysis.frequency_response import HIGHEST
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
 from ..identification.physical import physical_quantities
-from ..identification.results import Identification
+from ..identification.results import Identification, VehicleIdentification
 from .identification_figures import gain
 from .matplotlib_figures import draw
 from .panels import Scale
@@ -29,7 +29,8 @@ class Plots(NamedTuple):
 
         Data that were not fitted. `rate`: `"p"`, `"q"` or `"r"`.
         """
-        if (ahead := self.found.predictions) is None:
+        ahead = self.found.predictions if isinstance(self.found, VehicleIdentification) else None
+        if ahead is None:
             raise InputError(
                 "the result has no predictions of data that were not fitted; give `holdout` or `validate`."
             )
@@ -67,9 +68,10 @@ class Plots(NamedTuple):
 
         `axis`: `"roll"`, `"pitch"` or `"yaw"`. Dashed: the model.
         """
-        if (response := self.found.response) is None:
+        response = self.found.response if isinstance(self.found, VehicleIdentification) else None
+        if response is None:
             raise InputError("the result has no frequency response: it is of an OS4, has no answer, or is older.")
-        panel = gain(axis, response[_place("axis", axis, response._fields)], self._look)
+        panel = gain(axis, [*response][_place("axis", axis, MOTIONS)], self._look)
         x = Scale("log", (1.0, HIGHEST), {at: f"{at}" for at in (1, 2, 5, 10, 20, 40)}, "frequency [Hz]")
         ax = _axes(ax)
         draw(panel._replace(x=x), ax)

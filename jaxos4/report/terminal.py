@@ -11,7 +11,7 @@ from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities, possible
-from ..identification.results import COLOURED, Constant, Identification
+from ..identification.results import COLOURED, Constant, Identification, OS4Identification, VehicleIdentification
 from ..identification.verdict import (
     CONTRADICTED,
     IDENTIFIED,
@@ -50,9 +50,9 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
     parts = [*warning_lines(found), *notes]
     if not found.has_answer:
         parts = [*notes, *_failure(found)]
-    elif not found.is_vehicle:
+    elif isinstance(found, OS4Identification):
         parts += [*_parameters(found), *_fit(found), *_inertias(found), *_validation(found)]
-    else:
+    elif isinstance(found, VehicleIdentification):
         parts = [*_quantities(found), *parts]
         parts += [*_parameters(found), *_held(found), *_inertias(found), *_of_vehicle(found)] if verbose else []
     if found.has_answer:
@@ -91,12 +91,13 @@ def _quantities(found: Identification) -> Section:
 
 def warning_lines(found: Identification) -> list[str]:
     """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
-    wide = {name: factor for name, factor in found.widened.items() if factor > _WIDENED}
+    widened = found.widened if isinstance(found, VehicleIdentification) else {}
+    wide = {name: factor for name, factor in widened.items() if factor > _WIDENED}
     factors = sorted({f"{each:.1f}" for each in (min(wide.values(), default=1.0), max(wide.values(), default=1.0))})
     flights, other = ("flights", ", or the flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "")
     said = f"warning: parts of the {flights} disagree, so that intervals were widened {' to '.join(factors)} times: "
     lacking = f"{said}{', '.join(wide)}. The model lacks an effect{other}."
-    return [*reason_lines(found.verdicts, found.doubts), *[lacking] * bool(wide)]
+    return [*reason_lines(found.verdicts, found.issues), *[lacking] * bool(wide)]
 
 
 def notes_of(found: Identification) -> list[str]:
@@ -142,14 +143,14 @@ def _parameters(found: Identification) -> Section:
         yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
 
 
-def _held(found: Identification) -> Section:
+def _held(found: VehicleIdentification) -> Section:
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
         reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
     yield from (f"fixed, {reason}: {', '.join(held)}." for reason, held in reasons.items())
 
 
-def _fit(found: Identification) -> Section:
+def _fit(found: OS4Identification) -> Section:
     percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
     yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
     coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
@@ -197,7 +198,7 @@ def _inertias(found: Identification) -> Section:
         yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}{verdict}."
 
 
-def _validation(found: Identification) -> Section:
+def _validation(found: OS4Identification) -> Section:
     if found.validation is None:
         return
     flight, fit = found.validation.flight, found.validation.fit
@@ -208,7 +209,7 @@ def _validation(found: Identification) -> Section:
     yield f"validation on {flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
 
 
-def _of_vehicle(found: Identification) -> Section:
+def _of_vehicle(found: VehicleIdentification) -> Section:
     rows = []
     for each in found.sample_times:
         chosen = " (chosen)" if math.isclose(each.sample_time, found.provenance.sample_time) else ""

@@ -11,7 +11,7 @@ from jaxos4.identification.results import (
     ChannelFit,
     Constant,
     FixedParameter,
-    Identification,
+    OS4Identification,
     ParameterEstimate,
     PredictionSkill,
     Provenance,
@@ -19,6 +19,7 @@ from jaxos4.identification.results import (
     RigidBody,
     SampleTime,
     Validation,
+    VehicleIdentification,
 )
 from jaxos4.identification.verdict import Verdict
 
@@ -45,7 +46,7 @@ SAMPLE_TIMES = tuple(
 )
 
 
-def identified_flight(*, provenance=None, **changes) -> Identification:
+def identified_flight(*, provenance=None, **changes) -> OS4Identification:
     settings = {"flight": "flight.csv", "channels": "rates", "windows": 1, "sample_time": 0.01}
     given = {
         "model": "published",
@@ -55,10 +56,10 @@ def identified_flight(*, provenance=None, **changes) -> Identification:
         "validation": Validation("other.csv", 10.0, {"p": COLOURED}),
         "provenance": Provenance(**VERSIONS | settings | (provenance or {})),
     }
-    return Identification(**COMMON | given | changes)
+    return OS4Identification(**COMMON | given | changes)
 
 
-def identified_vehicle(*, provenance=None, **changes) -> Identification:
+def identified_vehicle(*, provenance=None, **changes) -> VehicleIdentification:
     rate = RateSkill(
         [0.91, 0.731, None], [0.02, 0.14, None], [0.2, 0.4, None], [0.7, 0.8, 0.9], equation_error=[0.5, 0.41, None]
     )
@@ -73,7 +74,6 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
     if "predictions" in changes:
         changes = {"trajectories": None} | changes
     given = {
-        "model": "flight",
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN},
         "rigid_body": RigidBody(NOTED, 0.21, True),
         "verdicts": VERDICTS,
@@ -86,7 +86,7 @@ def identified_vehicle(*, provenance=None, **changes) -> Identification:
         "response": synthetic_response(),
         "provenance": Provenance(**VERSIONS | settings | (provenance or {})),
     }
-    return Identification(**COMMON | given | changes)
+    return VehicleIdentification(**COMMON | given | changes)
 
 
 def synthetic_response() -> FrequencyResponse:

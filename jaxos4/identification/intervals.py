@@ -12,6 +12,7 @@ two factors, each of which is at least 1:
 A likelihood can have several maxima. If the cost is lower at an end than at the optimum, the search starts there again.
 """
 
+import dataclasses
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -19,19 +20,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import as_float
-from ..airframe import INVERSES
+from ..airframe import AXES, INVERSES
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
-from ..results import NINETY_FIVE
-from ..shooting import InnovationsProblem
-from .answers import Answer
-from .data import Data, Progress, silent
-from .results import FixedParameter, has_answer
-from .search import Optimum, disturbances_of, search
+from ..results import NINETY_FIVE, has_answer, result_names
+from .answers import VehicleAnswer
+from .data import Progress, silent
+from .results import Constant, FixedParameter
+from .search import Optimum, deviations, disturbances_of, search
+from .verdict import Move
 
 PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
-_PLAIN_NOTE = "at the usual value, which these flights do not contradict"
+_NOMINAL_NOTE = "at the usual value, which these flights do not contradict"
 
 
 MAX_PARTS = 20  # of flights that are compared
@@ -47,36 +48,38 @@ MAX_MINIMA = 3  # whose ends are looked at
 _CLEAR = 1e-5  # the least share of a scaled unknown that the others do not explain, as a root
 
 
-def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping[str, float] = {}) -> Answer:
+def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAnswer:
     """The answer of a search: its intervals corrected, and without the parameters that are not identifiable.
 
     A parameter about which the flights say less than the bracket is not estimated.
 
     `profile`: the factors of the profile, by parameter.
     """
-    names, units, values = optimum.whole.names, optimum.whole.units, optimum.values
-    notes, jackknife, longer = dict.fromkeys(optimum.plain, _PLAIN_NOTE), np.ones(values.size), np.ones(values.size)
-    if has_answer(optimum.estimate):
-        free = np.flatnonzero(~np.isin(names, [*optimum.plain, *optimum.negative]))
-        jackknife[free] = _widening(optimum, free, data.clock.log)
+    names, units, values = optimum.unknowns.names, optimum.unknowns.units, optimum.values
+    problem, logs = optimum.data.problem, optimum.data.clock.log
+    notes, jackknife, longer = dict.fromkeys(optimum.nominal, _NOMINAL_NOTE), np.ones(values.size), np.ones(values.size)
+    if has_answer(optimum.estimate.result):
+        free = np.flatnonzero(~np.isin(names, [*optimum.nominal, *optimum.negative]))
+        jackknife[free] = _widening(optimum, free, logs)
         longer[: len(names)] = [profile.get(name, 1.0) for name in names]
         std = (jackknife * longer)[: len(names)] * optimum.std
-        known = np.asarray(is_identifiable(std, np.asarray(optimum.whole.half_width), GAUSSIAN_PRIOR))
+        known = np.asarray(is_identifiable(std, np.asarray(optimum.unknowns.half_width), GAUSSIAN_PRIOR))
         notes = {name: PRIOR_NOTE for name, is_known in zip(names, known, strict=True) if not is_known} | notes
 
     def of_free(factor: Float[np.ndarray, " unknowns"]) -> dict[str, float]:
         return {name: float(x) for name, x in zip(names, factor, strict=False) if x > 1 and name not in notes}
 
     covariance = as_float(optimum.covariance * np.outer(jackknife * longer, jackknife * longer))
-    sigma = np.array(data.problem.sigma)
-    sigma[data.problem.columns] = np.exp(optimum.noise.sensor)
+    sigma = np.array(problem.sigma)
+    sigma[problem.columns] = np.exp(optimum.noise.sensor)
     sigma = as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0))
-    return Answer(
-        problem=eqx.tree_at(lambda p: p.sigma, data.problem, sigma),
+    return VehicleAnswer(
+        problem=eqx.tree_at(lambda p: p.sigma, problem, sigma),
         estimate=eqx.tree_at(lambda e: e.covariance, optimum.estimate, covariance),
         bound=optimum.std,
         rollouts=optimum.rollouts,
         optimum=optimum,
+        negative=optimum.negative,
         fixed={x: FixedParameter(float(values[i]), units[i], notes[x]) for i, x in enumerate(names) if x in notes},
         disturbances=disturbances_of(optimum),
         widened=of_free(jackknife),
@@ -84,22 +87,17 @@ def corrected(optimum: Optimum, data: Data[InnovationsProblem], profile: Mapping
     )
 
 
-def at_lowest(
-    optimum: Optimum,
-    data: Data[InnovationsProblem],
-    estimator: AbstractEstimator,
-    *,
-    progress: Progress = silent,
-) -> Answer:
-    """The answer at the lowest minimum that was found, its intervals corrected by the profile too.
+def at_lowest(answer: VehicleAnswer, estimator: AbstractEstimator, *, progress: Progress = silent) -> VehicleAnswer:
+    """Profiles the likelihood, starts again at any lower minimum, and widens the intervals accordingly.
 
-    A search that did not converge has no profile.
+    A search that did not converge has no profile. `answer`: by `corrected`, of a search by the `estimator`.
     """
+    optimum, data = answer.optimum, answer.optimum.data
     for left in reversed(range(MAX_MINIMA)):
-        answer, factors, lower = corrected(optimum, data), {}, None
         if not optimum.converged:
             return answer
-        poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.whole.count])
+        factors, lower = {}, None
+        poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.unknowns.count])
         for place in sorted({*INVERSES} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
             end, fit = upper_end(optimum, place)
@@ -107,21 +105,23 @@ def at_lowest(
             if fit.converged and optimum.cost - fit.cost > LOWER:
                 lower = fit.values
                 break
-            factors[optimum.whole.names[place]] = max(end / NINETY_FIVE, 1.0)
+            factors[optimum.unknowns.names[place]] = max(end / NINETY_FIVE, 1.0)
         if lower is None:
-            return corrected(optimum, data, factors)
+            return corrected(optimum, factors)
         if not left:
             break
         progress("fitting again where the cost is lower")
         counted = optimum.likelihood.noise_feedthrough
         same = data.likelihood.with_noise_feedthrough(counted)  # costs compare in the same likelihood only
-        other = search(estimator, same, start=lower, progress=progress)
-        rollouts, is_lower = optimum.rollouts + other.rollouts, has_answer(other.estimate) and other.cost < optimum.cost
-        optimum = other._replace(restarts=optimum.restarts + 1) if is_lower else optimum
-        optimum = optimum._replace(rollouts=rollouts)
+        other = search(estimator, dataclasses.replace(data, likelihood=same), start=lower, progress=progress)
+        rollouts = optimum.rollouts + other.rollouts
+        is_lower = has_answer(other.estimate.result) and other.cost < optimum.cost
         if not is_lower:
+            optimum = optimum._replace(rollouts=rollouts)
             break
-    return corrected(optimum._replace(is_lowest=False), data)
+        optimum = other._replace(restarts=optimum.restarts + 1, rollouts=rollouts)
+        answer = corrected(optimum)
+    return corrected(optimum._replace(is_lowest=False))
 
 
 def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
@@ -138,7 +138,7 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
     unknowns, at, root, end, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
     for _ in range(MAX_FITS):
         unknowns, before, at = unknowns + (end - at) * along, at, end
-        fixed = {optimum.whole.names[place]: float(unknowns[place])}
+        fixed = {optimum.unknowns.names[place]: float(unknowns[place])}
         other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
         rise, unknowns, last = other.cost - optimum.cost, other.values, root
         if not other.converged or rise < -LOWER:
@@ -149,6 +149,38 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
         if abs(root - NINETY_FIVE) < CLOSE:
             break
     return end, other
+
+
+def consequences(
+    answer: VehicleAnswer, constants: Mapping[str, Constant], name: str, value: float
+) -> dict[str, Move | None]:
+    """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
+
+    Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
+    moves if the search did not find this parameter. `None`: there is no such fit.
+    """
+    model, optimum = answer.problem.model, answer.optimum
+    own, values = optimum.likelihood.problem.unknowns, optimum.values
+    if not np.asarray(own.free)[own.names.index(name)]:
+        return {}
+    other = optimum.restricted(FilterError(tolerance=PROFILE_TOLERANCE), {name: value})
+    others = {each: names for each, names in model.quantities.items() if name not in names}
+    if str(result_names(other.estimate.result)) not in ("successful", "at_bound"):
+        return dict.fromkeys((*constants, *others))
+    moved, std = other.values, deviations(answer.estimate.covariance)
+    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
+    factor = np.prod(moved[gains] / values[gains])
+    moves: dict[str, Move | None] = {}
+    for axis in AXES:
+        if (row := constants.get(axis.inertia)) is not None:
+            share = abs(factor * values[axis.place] / moved[axis.place] - 1)
+            moves[axis.inertia] = Move(float(share), float(share * row.estimate / row.std))
+    for quantity, names in others.items():
+        places = [i for i in map(own.names.index, names) if std[i] > 0]
+        if places:
+            change, width = np.abs(moved - values)[places], np.asarray(own.half_width)[places]
+            moves[quantity] = Move(float((change / width).max()), float((change / std[places]).max()))
+    return moves
 
 
 def _widening(
@@ -163,7 +195,7 @@ def _widening(
     number = recording[np.minimum(middle, recording.size - 1)][used]
     gradient = np.asarray(segments.gradient)[used][:, free]
     information = np.asarray(segments.information)[used][:, free[:, None], free]
-    prior = np.diag(1 / np.square(np.asarray(optimum.whole.half_width)[free]))
+    prior = np.diag(1 / np.square(np.asarray(optimum.unknowns.half_width)[free]))
     ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
     return np.max([np.ones(free.size), *ways], axis=0)
 

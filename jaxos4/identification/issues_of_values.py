@@ -1,22 +1,19 @@
-"""Doubts that the estimated values raise: physics or the airframe forbids them."""
+"""Issues of estimated values: physics or the airframe forbids them; Iz rests on a drag coefficient that few measure."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from ..airframe import AXES, INERTIAS, YAW, Airframe
+from ..airframe import AXES, INERTIAS, PITCH, ROLL, YAW, Airframe
 from ..analysis.inertia import fit_inertia
-from ..estimators import FilterError
 from ..models.abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..models.terms import DAMPED
 from ..recording.checks.evidence import HELD
-from ..results import result_names
-from .answers import Answer
+from .answers import Answer, drag_error, thrust_excess
 from .results import Constant, ParameterEstimate, RigidBody
-from .search import Optimum, deviations
-from .uncertainty import PROFILE_TOLERANCE
-from .verdict import IMPROBABLE, RIGID_BODY, SIGNIFICANT, Doubt, Move, Moves, contradiction, refusal, reservation
+from .verdict import CONTRADICTION, IMPROBABLE, MAX_PRIOR, RESERVATION, RIGID_BODY, SIGNIFICANT, Issue, Move, Moves
 
 Estimated = Mapping[str, tuple[float, float]]
 """Value and standard deviation of each parameter that has an estimate."""
@@ -28,9 +25,11 @@ HEAVIEST, LIGHTEST = 1.5, 0.01
 COUPLING = 0.25  # of alpha1, alpha4 and alpha7: aerodynamic moments may look like a gyroscopic coupling of this size
 MAX_DELAY = 0.04  # s; a longer delay of rotors is an error of clocks
 ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
+_FLAT = 0.6  # Iz over Ix + Iy of a vehicle with its rotors in a plane is rarely smaller; of a lamina it is 1
+MEASURE = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
 
 
-def doubts_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) -> Iterator[Doubt]:
+def issues_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) -> Iterator[Issue]:
     """The alphas of an OS4 that no rigid body has.
 
     They contradict the rigid body. Only an alpha outside its bracket is contradicted itself: the bracket says which
@@ -41,24 +40,24 @@ def doubts_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) ->
         row = table[name]
         if row.estimate is not None and row.std is not None and abs(row.estimate) - SIGNIFICANT * row.std > 1:
             cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as that of every rigid body"
-            yield contradiction(cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket))
+            yield Issue(CONTRADICTION, cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket))
     rotor, largest = body.constants.get("J_R"), body.constants.get(YAW.inertia)
     if rotor is not None and largest is not None:
-        remedy, room = "check `rotor_spins`, and which rotor is which", SIGNIFICANT * rotor.std
-        if rotor.estimate + room < 0:
-            yield contradiction(f"J_R = {rotor.estimate:.3g} kg m^2 is negative", remedy, moves)
-        elif rotor.estimate - room > largest.estimate:
+        remedy, margin = "check `rotor_spins`, and which rotor is which", SIGNIFICANT * rotor.std
+        if rotor.estimate + margin < 0:
+            yield Issue(CONTRADICTION, f"J_R = {rotor.estimate:.3g} kg m^2 is negative", remedy, moves)
+        elif rotor.estimate - margin > largest.estimate:
             cause = f"J_R = {rotor.estimate:.3g} kg m^2 is larger than the {YAW.inertia} of the vehicle"
-            yield contradiction(cause, remedy, moves)
+            yield Issue(CONTRADICTION, cause, remedy, moves)
     if body.consistency_p is not None and body.consistency_p < IMPROBABLE:
         cause = f"the alphas are not those of one rigid body (p = {body.consistency_p:.1g})"
-        yield contradiction(cause, f"use the alphas alone; if they should be of a rigid body, {gyro}", moves)
+        yield Issue(CONTRADICTION, cause, f"use the alphas alone; if they should be of a rigid body, {gyro}", moves)
     elif body.is_rigid_body is False:
         cause = "one moment of inertia exceeds the sum of the other two, which no rigid body allows"
-        yield contradiction(cause, "check `rotor_positions` and `drag_coefficient`", moves)
+        yield Issue(CONTRADICTION, cause, "check `rotor_positions` and `drag_coefficient`", moves)
 
 
-def doubts_of_values(
+def issues_of_values(
     model: AbstractModel,
     parameters: Mapping[str, ParameterEstimate],
     constants: Mapping[str, Constant],
@@ -67,8 +66,8 @@ def doubts_of_values(
     follow: Consequences = lambda name, value: {},
     *,
     motor_step: float = 0.0,
-) -> Iterator[Doubt]:
-    """The doubts about the parameters and moments of inertia of a vehicle.
+) -> Iterator[Issue]:
+    """The issues about the parameters and moments of inertia of a vehicle.
 
     `fixed`: parameters that are not estimated. `log_step`: the longest sample of the logs [s]; `motor_step`: the
     longest between new values of motors. `follow`: how far the quantities move if a parameter has another value.
@@ -79,7 +78,7 @@ def doubts_of_values(
     for name, row in parameters.items():
         if row.estimate is not None and row.std is not None:
             estimated[name], stds[name] = (row.estimate, row.std if row.bound is None else row.bound), row.std
-    yield from (doubt for _, doubt in contradicted(model, fixed, motor_step=motor_step))
+    yield from (issue for _, issue in contradicted(model, fixed, motor_step=motor_step))
     wrong = dict(contradicted(model, estimated, follow, motor_step=motor_step))
     yield from wrong.values()
     if not any(parameter.scales_torque for parameter in wrong):
@@ -92,15 +91,16 @@ def doubts_of_values(
 def _odd_motors(
     model: AbstractModel,
     parameters: Mapping[str, ParameterEstimate],
-    wrong: Mapping[Parameter, Doubt],
+    wrong: Mapping[Parameter, Issue],
     follow: Consequences,
-) -> Iterator[Doubt]:
+) -> Iterator[Issue]:
     """Parameters of the motors outside their brackets: what is unusual of a motor may be a fault of the model."""
     for parameter in (each for each in model.parameters if each.in_forcing and each not in wrong):
         row = parameters.get(parameter.name)
         if row is not None and row.is_outside_bracket and row.estimate is not None and isinstance(row.bracket, tuple):
             usual = float(np.clip(row.estimate, *row.bracket))
-            yield reservation(
+            yield Issue(
+                RESERVATION,
                 f"{parameter.name} = {row.estimate:.2g} is unusual (expected: {row.bracket[0]:.2g} to "
                 f"{row.bracket[1]:.2g})",
                 "log rotor speeds",
@@ -114,10 +114,10 @@ def contradicted(
     follow: Consequences = lambda name, value: {},
     *,
     motor_step: float = 0.0,
-) -> Iterator[tuple[Parameter, Doubt]]:
-    """The parameters whose values physics or the airframe forbid. `motor_step`: see `doubts_of_values`.
+) -> Iterator[tuple[Parameter, Issue]]:
+    """The parameters whose values physics or the airframe forbid. `motor_step`: see `issues_of_values`.
 
-    The doubt moves other quantities as if the parameter had the value expected from the airframe.
+    The issue moves other quantities as if the parameter had the value expected from the airframe.
     """
     owner = {name: quantity for quantity, names in model.quantities.items() for name in names}
     for parameter, usual in zip(model.parameters, np.asarray(model.alpha).tolist(), strict=True):
@@ -130,41 +130,10 @@ def contradicted(
             others = dict.fromkeys((*INERTIAS, "thrust")) if parameter.scales_torque else follow(parameter.name, usual)
             rare = ": motors were logged too rarely" * (why[0] == DAMPED and motor_step > HELD)
             cause = f"{parameter.name} = {value:.2g} {why[0]}{rare}"
-            yield parameter, contradiction(cause, why[1], {**others, **own})
+            yield parameter, Issue(CONTRADICTION, cause, why[1], {**others, **own})
 
 
-def consequences(
-    answer: Answer, optimum: Optimum, constants: Mapping[str, Constant], name: str, value: float
-) -> dict[str, Move | None]:
-    """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
-
-    Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
-    moves if the search did not find this parameter. `None`: there is no such fit.
-    """
-    model, own, values = answer.problem.model, optimum.likelihood.problem.unknowns, optimum.values
-    if not np.asarray(own.free)[own.names.index(name)]:
-        return {}
-    other = optimum.restricted(FilterError(tolerance=PROFILE_TOLERANCE), {name: value})
-    others = {each: names for each, names in model.quantities.items() if name not in names}
-    if str(result_names(other.estimate.result)) not in ("successful", "at_bound"):
-        return dict.fromkeys((*constants, *others))
-    moved, std = other.values, deviations(answer.estimate.covariance)
-    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
-    factor = np.prod(moved[gains] / values[gains])
-    moves: dict[str, Move | None] = {}
-    for axis in AXES:
-        if (row := constants.get(axis.inertia)) is not None:
-            share = abs(factor * values[axis.place] / moved[axis.place] - 1)
-            moves[axis.inertia] = Move(float(share), float(share * row.estimate / row.std))
-    for quantity, names in others.items():
-        places = [i for i in map(own.names.index, names) if std[i] > 0]
-        if places:
-            change, width = np.abs(moved - values)[places], np.asarray(own.half_width)[places]
-            moves[quantity] = Move(float((change / width).max()), float((change / std[places]).max()))
-    return moves
-
-
-def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) -> Iterator[Doubt]:
+def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) -> Iterator[Issue]:
     radius_squared = np.square(np.asarray(airframe.rotor_positions)).sum(axis=1).max()
     limit = float(airframe.mass) * radius_squared
     for name, row in constants.items():
@@ -173,7 +142,8 @@ def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) 
         if beyond or row.estimate + SIGNIFICANT * row.std < least:
             compared = f"more than the {largest:.2g}" if beyond else f"less than the {least:.2g}"
             scale = "`drag_coefficient`" if name == YAW.inertia else "`thrust_coefficient`, `max_rotor_speed`"
-            yield contradiction(
+            yield Issue(
+                CONTRADICTION,
                 f"{name} = {row.estimate:.3g} kg m^2 is {compared} of a vehicle with this mass and arms",
                 f"check `mass`, `rotor_positions` and {scale} in the airframe, and which rotor is which",
                 {name: None},
@@ -187,7 +157,8 @@ def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) 
                 if name == YAW.inertia
                 else "check `rotor_positions`"
             )
-            yield contradiction(
+            yield Issue(
+                CONTRADICTION,
                 f"{name} = {one.estimate:.3g} exceeds {second} + {third} = {two.estimate + three.estimate:.3g} "
                 "kg m^2, which no rigid body allows",
                 remedy,
@@ -195,7 +166,7 @@ def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) 
             )
 
 
-def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) -> Iterator[Doubt]:
+def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) -> Iterator[Issue]:
     """Roll and pitch must answer the rotors, and no axis with the opposite sign; else nothing was identified.
 
     If none has, gyroscopic couplings must be those of a rigid body with these inertias.
@@ -206,13 +177,14 @@ def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) 
         value, std = estimated.get(name, (0.0, 0.0))
         if value + SIGNIFICANT * std < 0:
             opposite = True
-            yield contradiction(
+            yield Issue(
+                CONTRADICTION,
                 f"{name} = {value:.3g} is negative: {axis.motion} answers the rotors with the opposite sign",
                 "check `rotor_positions` and `rotor_spins`, and the axes of the log",
                 moves,
             )
         elif value <= SIGNIFICANT * std and axis != YAW:
-            yield refusal(
+            yield Issue(
                 "unidentifiable",
                 f"{axis.motion} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
                 f"fly more {axis.motion}, or check `rotor_positions` in the airframe, and which rotor is which",
@@ -232,7 +204,8 @@ def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) 
             variance[i] = np.inf if name == YAW.inverse and airframe.guesses_drag else stds[name] ** 2
     p_value, without_yaw = (_p_value(model, alpha, variance, unknown) for unknown in ([], [YAW.place]))
     if p_value < IMPROBABLE:
-        yield contradiction(
+        yield Issue(
+            CONTRADICTION,
             f"alpha1, alpha4 and alpha7 contradict the inertias of alpha3, alpha6 and alpha8 (p = {p_value:.1g})",
             "check the axes and signs of the gyro, `rotor_positions` and `drag_coefficient`",
             ALL_INERTIAS if without_yaw < IMPROBABLE else {YAW.inertia: None},
@@ -247,11 +220,12 @@ def _p_value(model: CorrectedOS4, alpha: np.ndarray, variance: np.ndarray, unkno
     return float(fit_inertia(model, alpha, np.diag(variance)).p_value)
 
 
-def _unseen(estimated: Estimated, log_step: float, follow: Consequences) -> Iterator[Doubt]:
+def _unseen(estimated: Estimated, log_step: float, follow: Consequences) -> Iterator[Issue]:
     """A lag or delay of the rotors that the log is too slow to show. `log_step`: its longest sample [s]."""
     lag, error = estimated.get("rotor_lag", (np.inf, 0.0))
     if -SIGNIFICANT * error <= lag < log_step - SIGNIFICANT * error:
-        yield contradiction(
+        yield Issue(
+            CONTRADICTION,
             f"rotor_lag = {lag:.2g} s is shorter than a sample of the log, {log_step:.2g} s",
             "log faster, or leave out the term `motor` or `lag`",
             {**follow("rotor_lag", log_step), "motors": None},
@@ -259,8 +233,85 @@ def _unseen(estimated: Estimated, log_step: float, follow: Consequences) -> Iter
     delay, error = estimated.get("rotor_delay", (0.0, 0.0))
     if abs(delay) - SIGNIFICANT * error > MAX_DELAY:
         how = "late" if delay < 0 else "early"
-        yield contradiction(
+        yield Issue(
+            CONTRADICTION,
             f"rotor_delay = {delay:.2g} s: motors are recorded {1e3 * abs(delay):.0f} ms {how}, more than any rotor",
             "check the time stamps of motors and gyro",
             {**follow("rotor_delay", float(np.copysign(MAX_DELAY, delay))), "motors": None},
         )
+
+
+def issues_of_iz(
+    answer: Answer, table: Mapping[str, ParameterEstimate], constants: Mapping[str, Constant]
+) -> Iterator[Issue]:
+    """The issues about Iz. `table`: of the parameters. `constants`: the moments of inertia that are judged."""
+    if YAW.inertia in constants:
+        yield from _drag(answer)
+        # All of these would be one fault: a wrong drag coefficient.
+        signs = [*_flat(constants), *_rotor_inertia(table, constants[YAW.inertia])]
+        yield from sorted(signs, key=lambda issue: issue.share_of(YAW.inertia))[-1:]
+
+
+def _drag(answer: Answer) -> Iterator[Issue]:
+    """A ratio of drag to thrust that nobody measured: Iz is proportional to it."""
+    excess, moves = thrust_excess(answer), {YAW.inertia: None}
+    if answer.problem.model.airframe.guesses_drag:
+        yield Issue("unidentifiable", "`drag_coefficient` is a guess, to which Iz is proportional", MEASURE, moves)
+    elif drag_error(answer):
+        cause = (
+            f"the rotors give {100 * abs(excess):.0f} % {'more' if excess > 0 else 'less'} thrust than the airframe "
+            "says, so that the ratio of drag to thrust, to which Iz is proportional, may be off as much"
+        )
+        yield Issue("unidentifiable", cause, MEASURE, moves)
+
+
+def _flat(constants: Mapping[str, Constant]) -> Iterator[Issue]:
+    """An Iz that is too small beside Ix + Iy for a flat vehicle."""
+    if not {ROLL.inertia, PITCH.inertia} <= constants.keys():
+        return
+    x, y, z = (constants[axis.inertia] for axis in (ROLL, PITCH, YAW))
+    least, error = _FLAT * (x.estimate + y.estimate), math.hypot(z.std, _FLAT * x.std, _FLAT * y.std)
+    if least - z.estimate > SIGNIFICANT * error:
+        share = z.estimate / (x.estimate + y.estimate)
+        yield Issue(
+            RESERVATION,
+            f"Iz is only {share:.2g} times Ix + Iy; of a flat vehicle it is {_FLAT:g} to 1 times",
+            f"if `drag_coefficient` is uncertain, {MEASURE}",
+            {YAW.inertia: Move(least / z.estimate - 1, (least - z.estimate) / z.std)},
+        )
+
+
+def _rotor_inertia(table: Mapping[str, ParameterEstimate], iz: Constant) -> Iterator[Issue]:
+    """The moments of inertia of a rotor by its reaction in yaw and by its gyroscopic torque in roll and pitch.
+
+    With the reaction J_R / Iz, and alpha2 = J_R / Ix beside alpha3 = 1 / Ix, the two agree if Iz is right.
+    """
+    by_yaw = _quotient(table, "rotor_reaction", YAW.inverse)
+    for gyroscopic, axis in (("alpha2", ROLL), ("alpha5", PITCH)):
+        by_axis = _quotient(table, gyroscopic, axis.inverse)
+        if by_yaw is None or by_axis is None:
+            continue
+        off = by_axis[0] - by_yaw[0]
+        if abs(off) > SIGNIFICANT * math.hypot(by_axis[1], by_yaw[1]):
+            yield Issue(
+                RESERVATION,
+                f"by {axis.motion}, the inertia of the rotors is {by_axis[0] / by_yaw[0]:.2g} times that by their "
+                "reaction in yaw",
+                f"fly more yaw; if `drag_coefficient` is uncertain, {MEASURE}",
+                {YAW.inertia: Move(abs(off) / by_yaw[0], abs(off) / by_yaw[0] * iz.estimate / iz.std)},
+            )
+
+
+def _quotient(table: Mapping[str, ParameterEstimate], name: str, inverse: str) -> tuple[float, float] | None:
+    """One parameter over another, if both are positive and no bracket gives more than a share of what is known."""
+    rows = [table.get(name), table.get(inverse)]
+    values, squares = [], 0.0
+    for row in rows:
+        if row is None or not row.estimate or row.estimate <= 0 or not row.std or not isinstance(row.bracket, tuple):
+            return None
+        if (row.std / (row.bracket[1] - row.bracket[0]) * 2) ** 2 > MAX_PRIOR:
+            return None
+        values.append(row.estimate)
+        squares += (row.std / row.estimate) ** 2
+    ratio = values[0] / values[1]
+    return ratio, ratio * math.sqrt(squares)

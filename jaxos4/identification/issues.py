@@ -1,6 +1,6 @@
-"""The doubts about an answer: each has a cause, a remedy, and the quantities that it would move.
+"""The issues of an answer: cause, remedy, and the quantities that they would move.
 
-Those that the estimated values themselves raise are in doubts_of_values.py, all others here.
+Issues of the estimated values are in issues_of_values.py, all others here.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,24 +14,23 @@ from ..analysis.prediction import decisive_horizon
 from ..estimate import REACH
 from ..models.abstract import AbstractModel
 from ..recording.checks import Finding
-from ..results import meaning, result_names
-from .answers import Answer, overwhelmed
+from ..results import meaning
+from .answers import Answer, VehicleAnswer, dominated
 from .data import Data
-from .doubts_of_iz import doubts_of_iz
-from .doubts_of_values import ALL_INERTIAS, consequences, doubts_of_alphas, doubts_of_values
+from .intervals import consequences
+from .issues_of_values import ALL_INERTIAS, issues_of_alphas, issues_of_iz, issues_of_values
 from .results import (
     COLOURED,
     ChannelFit,
     Constant,
     Disturbance,
-    ParameterEstimate,
+    OS4Identification,
     PredictionSkill,
-    RigidBody,
     SampleTime,
+    VehicleIdentification,
 )
 from .sample_time import is_white, moved
-from .search import Optimum
-from .verdict import MAX_SHARE, PREDICTIONS, RIGID_BODY, Doubt, Move, contradiction, refusal, reservation
+from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_BODY, Issue, Move, Moves
 
 # s; fitted measurements that last less give moments of inertia a reservation; those that last less than half of it do
 # not identify them. Segments last 1.25 s, and the jackknife compares at least four parts.
@@ -45,30 +44,30 @@ _NOT_LOWEST = (
 )
 
 
-def doubts_of_os4(
-    data: Data, search: str, table: Mapping[str, ParameterEstimate], body: RigidBody, fit: Mapping[str, ChannelFit]
-) -> list[Doubt]:
-    """The doubts about the alphas of an OS4.
+def issues_of_os4(data: Data, found: OS4Identification, fit: Mapping[str, ChannelFit]) -> list[Issue]:
+    """The issues about the alphas of an OS4.
 
-    **Arguments:** `search`: the name of the result code of the search. `fit`: of the channels whose residuals are white
-    if the model is right; see `coloured`.
+    **Arguments:** `found`: with the result code of the search. `fit`: of the channels whose residuals are white if the
+    model is right; see `coloured`.
     """
+    search, table = found.result, found.parameters
     every = (*table, RIGID_BODY)
     # A flight that hardly depends on one alpha says nothing against the others.
     unseen = [name for name, row in table.items() if row.estimate is None and search == "unidentifiable"]
     return [
-        *doubts_of_log(data.findings, every),
-        *doubts_of_alphas(table, body),
+        *issues_of_log(data.findings, every),
+        *issues_of_alphas(table, found.rigid_body),
         *coloured(fit, every),
-        *_doubts_of_search(search, unseen or every),
+        *_issues_of_search(search, unseen or every),
     ]
 
 
-def coloured(fit: Mapping[str, ChannelFit], quantities: Iterable[str]) -> Iterator[Doubt]:
+def coloured(fit: Mapping[str, ChannelFit], quantities: Iterable[str]) -> Iterator[Issue]:
     """Residuals that are not white. A reservation, and no refusal: the noise of the sensors may be coloured."""
     channels = {name: row.correlation for name, row in fit.items() if row.correlation > COLOURED}
     if channels:
-        yield reservation(
+        yield Issue(
+            RESERVATION,
             f"the residuals of {', '.join(channels)} are not white (neighbours correlate by up to "
             f"{max(channels.values()):.2g}): the model does not explain the flight, or the noise is coloured",
             "check the scales, the axes and the time stamps of the log, or use another model",
@@ -76,77 +75,71 @@ def coloured(fit: Mapping[str, ChannelFit], quantities: Iterable[str]) -> Iterat
         )
 
 
-def doubts_of_vehicle(
-    data: Data,
-    answer: Answer,
-    optimum: Optimum,
-    sample_times: Sequence[SampleTime],
-    table: Mapping[str, ParameterEstimate],
-    constants: Mapping[str, Constant],
-    quantities: Iterable[str],
+def issues_of_vehicle(
+    answer: VehicleAnswer,
+    found: VehicleIdentification,
     response: FrequencyResponse,
     *,
-    skill: PredictionSkill | None,
+    sample_times: Sequence[SampleTime],
+    quantities: Iterable[str],
     still: Sequence[str],
-) -> list[Doubt]:
-    """The doubts about the estimate of a vehicle.
+) -> list[Issue]:
+    """The issues about the estimate of a vehicle.
 
-    **Arguments:** `table`: of the parameters. `constants`: the moments of inertia that are judged. `quantities`: the
-    names of all. `skill`, `still`: see `doubts_of_predictions`.
+    **Arguments:** `found`: parameters, the moments of inertia that are judged, the skill of predictions, and the result
+    code of the search. `quantities`: the names of all. `still`: see `issues_of_predictions`.
     """
-    search, follow = str(result_names(answer.estimate.result)), partial(consequences, answer, optimum, constants)
-    weak, judged = overwhelmed(answer), table
+    search, constants, weak = found.result, found.rigid_body.constants, dominated(answer)
+    optimum, data, judged = answer.optimum, answer.optimum.data, found.parameters
     if YAW.motion in weak:
-        judged = {name: row for name, row in table.items() if name not in (YAW.coupling, YAW.inverse)}
+        judged = {name: row for name, row in judged.items() if name not in (YAW.coupling, YAW.inverse)}
     # What is known of a fixed parameter is its bracket.
-    widths = dict(zip(optimum.whole.names, np.asarray(optimum.whole.half_width).tolist(), strict=True))
-    fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | answer.negative
+    widths = dict(zip(optimum.unknowns.names, np.asarray(optimum.unknowns.half_width).tolist(), strict=True))
+    fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | dict(answer.negative)
+    follow = partial(consequences, answer, constants)
     return [
-        *(() if optimum.is_lowest else [refusal("max_sweeps", *_NOT_LOWEST, dict.fromkeys(quantities))]),
-        *doubts_of_log(data.findings),
+        *(() if optimum.is_lowest else [Issue("max_sweeps", *_NOT_LOWEST, dict.fromkeys(quantities))]),
+        *issues_of_log(data.findings),
         *few_parts(data.seconds),
-        *_doubts_of_weak_axes(weak),
-        *doubts_of_iz(answer, table, constants),
-        *doubts_of_values(
+        *(
+            Issue("unidentifiable", weak[x.motion], f"fly more {x.motion}, or in calmer air", {x.inertia: None})
+            for x in AXES
+            if x.motion in weak
+        ),
+        *issues_of_iz(answer, found.parameters, constants),
+        *issues_of_values(
             answer.problem.model, judged, constants, fixed, data.log_step, follow, motor_step=data.motor_step
         ),
-        *doubts_of_predictions(skill, still),
-        *_doubts_of_sample_time(data, answer, sample_times, constants),
+        *issues_of_predictions(found.skill, still),
+        *_issues_of_sample_time(answer, sample_times, constants),
         *stronger_or_weaker(response, constants),
-        *((search == "at_bound" and [*_doubts_of_limits(answer)]) or _doubts_of_search(search, quantities)),
+        *((search == "at_bound" and [*_issues_of_limits(answer)]) or _issues_of_search(search, quantities)),
     ]
 
 
-def doubts_of_log(findings: Sequence[Finding], quantities: Iterable[str] | None = None) -> Iterator[Doubt]:
+def issues_of_log(findings: Sequence[Finding], quantities: Iterable[str] | None = None) -> Iterator[Issue]:
     """The findings in the logs, as contradictions or as reservations. `quantities`: by default those of each."""
     for finding in findings:
-        make = contradiction if finding.contradicted else reservation
+        severity = CONTRADICTION if finding.contradicted else RESERVATION
         concerned = finding.quantities if quantities is None else quantities
-        yield make(f"{finding.cause} ({finding.size})", finding.remedy, dict.fromkeys(concerned))
+        yield Issue(severity, f"{finding.cause} ({finding.size})", finding.remedy, dict.fromkeys(concerned))
 
 
-def _doubts_of_search(search: str, quantities: Iterable[str]) -> Iterator[Doubt]:
-    """The doubt about a search that did not end well. `search`: the name of its result code."""
+def _issues_of_search(search: str, quantities: Iterable[str]) -> Iterator[Issue]:
+    """The issue about a search that did not end well. `search`: the name of its result code."""
     if search != "successful":
         cause, remedy = meaning(search).rsplit(": ", 1)
-        yield refusal(search, cause, remedy, dict.fromkeys(quantities))
+        yield Issue(search, cause, remedy, dict.fromkeys(quantities))
 
 
-def _doubts_of_limits(answer: Answer) -> Iterator[Doubt]:
+def _issues_of_limits(answer: Answer) -> Iterator[Issue]:
     """Parameters that a search ended at their limit with, and the quantities that depend on them."""
     model, own, values = answer.problem.model, answer.problem.unknowns, np.asarray(answer.estimate.parameters)
     off = np.abs(values[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
     for i in (place for place in answer.free if off[place] > 0.99 * REACH):
         concerned = dict.fromkeys(model_quantities(model, own.names[i]))
         cause = f"{own.names[i]} = {values[i]:.3g} {own.units[i]} is at the limit of the search around its bracket"
-        yield refusal("at_bound", cause, "correct the airframe, or give a wider `bracket`", concerned)
-
-
-def _doubts_of_weak_axes(weak: Mapping[str, str]) -> Iterator[Doubt]:
-    """Axes on which disturbances are larger than the torque of the rotors; see `overwhelmed`."""
-    inertias = {axis.motion: axis.inertia for axis in AXES}
-    for motion, why in weak.items():
-        yield refusal("unidentifiable", why, f"fly more {motion}, or in calmer air", {inertias[motion]: None})
+        yield Issue("at_bound", cause, "correct the airframe, or give a wider `bracket`", concerned)
 
 
 def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
@@ -161,15 +154,15 @@ def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
     return (*of_axis, *own) or INERTIAS
 
 
-def few_parts(seconds: float) -> Iterator[Doubt]:
+def few_parts(seconds: float) -> Iterator[Issue]:
     """Measurements that last too few `seconds` to compare parts: nothing shows whether intervals are too narrow."""
     if seconds < MIN_SECONDS:
-        cause = f"only {seconds:.1f} s were fitted, too few to compare parts of the flight"
-        said = f"{cause}: intervals may be too narrow", f"fly for {2 * MIN_SECONDS:g} s or longer", ALL_INERTIAS
-        yield refusal("unidentifiable", *said) if 2 * seconds < MIN_SECONDS else reservation(*said)
+        severity = "unidentifiable" if 2 * seconds < MIN_SECONDS else RESERVATION
+        cause = f"only {seconds:.1f} s were fitted, too few to compare parts of the flight: intervals may be too narrow"
+        yield Issue(severity, cause, f"fly for {2 * MIN_SECONDS:g} s or longer", ALL_INERTIAS)
 
 
-def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Constant]) -> Iterator[Doubt]:
+def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Constant]) -> Iterator[Issue]:
     """An axis that clearly answers the rotors more or less strongly than the model, by its frequency response.
 
     A reservation, and no refusal, because the frequency response has two to three times the error of the fit.
@@ -181,7 +174,8 @@ def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Cons
             # Beyond twice, the inertia would move by more than what is left of it.
             share = ratio - 1 if ratio > 2 else abs(1 / ratio - 1)
             verb = f"{axis.motion}es" if axis == PITCH else f"{axis.motion}s"
-            yield reservation(
+            yield Issue(
+                RESERVATION,
                 f"from {agreement.low:g} to {agreement.high:g} Hz, the vehicle {verb} {_compared(ratio)} the "
                 f"model (95 %: {low:.2f} to {high:.2f} times)",
                 f"fly more {axis.motion}, or look at its frequency response for what the model lacks",
@@ -196,14 +190,15 @@ def _compared(ratio: float) -> str:
     return f"{ratio:.2g} times as strongly as"
 
 
-def _doubts_of_sample_time(
-    data: Data, answer: Answer, sample_times: Sequence[SampleTime], constants: Mapping[str, Constant]
-) -> Iterator[Doubt]:
+def _issues_of_sample_time(
+    answer: VehicleAnswer, sample_times: Sequence[SampleTime], constants: Mapping[str, Constant]
+) -> Iterator[Issue]:
     """Innovations that are not white; an inertia that changes with the sample time."""
     step, steps = float(answer.problem.flight.dt), [each.sample_time for each in sample_times]
+    vibrates = answer.optimum.data.vibrates
     place = steps.index(step) if step in steps else 0
     if len(steps) < 2:
-        yield from vibration(answer.disturbances, step, vibrates=data.vibrates)
+        yield from vibration(answer.disturbances, step, vibrates=vibrates)
         if sample_times:
             yield from _correlated(sample_times[place], {})
         return
@@ -213,22 +208,23 @@ def _doubts_of_sample_time(
         name: Move(abs(two.estimate / one.estimate - 1), abs(two.estimate - one.estimate) / max(one.std, two.std))
         for name, one, two in both
     }
-    yield from vibration(answer.disturbances, step, moves, data.vibrates)
+    yield from vibration(answer.disturbances, step, moves, vibrates)
     yield from _correlated(own, moves)
     for name in (each for each in moved(own, other) if each in constants):
         values = [f"{each.constants[name].estimate:.3g} at {1e3 * each.sample_time:.3g} ms" for each in (own, other)]
-        yield contradiction(
+        yield Issue(
+            CONTRADICTION,
             f"{name} depends on the sample time: {' and '.join(values)}",
             "the sensors vibrate, or the model lacks an effect: see the figure of inertia against sample time",
             {name: moves[name]},
         )
 
 
-def _correlated(row: SampleTime, moves: Mapping[str, Move]) -> Iterator[Doubt]:
+def _correlated(row: SampleTime, moves: Mapping[str, Move]) -> Iterator[Issue]:
     """Innovations that are less correlated than by vibration, and yet not white."""
     if not is_white(row) and abs(row.correlation) <= VIBRATION:
         cause = f"innovations of the body rates correlate by {row.correlation:.2g} at {1e3 * row.sample_time:.3g} ms"
-        yield reservation(cause, "log faster, or before the filters of the gyro", moves)
+        yield Issue(RESERVATION, cause, "log faster, or before the filters of the gyro", moves)
 
 
 def vibration(
@@ -236,7 +232,7 @@ def vibration(
     sample_time: float,
     moves: Mapping[str, Move] = {},
     vibrates: Mapping[str, float] = {},
-) -> Iterator[Doubt]:
+) -> Iterator[Issue]:
     """A gyro whose noise is not white: the controller answers it, and filter error is biased.
 
     **Arguments:** `sample_time`: of the fitted data [s]. `moves`: of the moments of inertia to another sample time.
@@ -248,7 +244,8 @@ def vibration(
         if row is not None and abs(row.correlation) > VIBRATION:
             frequency = vibrates.get(axis.rate)
             why = "the model lacks an effect, or the gyro vibrates"
-            yield contradiction(
+            yield Issue(
+                CONTRADICTION,
                 f"the noise of {axis.rate} is not white (innovations correlate by {row.correlation:.2g}): "
                 f"{why if frequency is None else f'the gyro vibrates at {frequency:.0f} Hz'}",
                 f"{longer}damp the vibration, or log faster",
@@ -256,12 +253,12 @@ def vibration(
             )
 
 
-def doubts_of_predictions(skill: PredictionSkill | None, still: Sequence[str] = ()) -> Iterator[Doubt]:
+def issues_of_predictions(skill: PredictionSkill | None, still: Sequence[str] = ()) -> Iterator[Issue]:
     """Predictions that are no better than constant rates. `still`: the axes about which nothing can be predicted."""
     if skill is None:
         return
     if len(still) == len(AXES):
-        yield refusal(
+        yield Issue(
             "no_skill",
             "the held-out part hardly turns, so that no prediction checks the fit",
             "choose another part with `begin` and `end`, or another flight with `validate`",
@@ -269,7 +266,7 @@ def doubts_of_predictions(skill: PredictionSkill | None, still: Sequence[str] = 
         )
         return
     poor, named, near = [], [], False
-    moves: dict[str, None] = {PREDICTIONS: None}
+    moves: Moves = {PREDICTIONS: None}
     for axis in AXES:
         own = getattr(skill, axis.rate)
         values = np.array(own.skill, dtype=float)
@@ -285,5 +282,5 @@ def doubts_of_predictions(skill: PredictionSkill | None, still: Sequence[str] = 
     if poor:
         motions = " and ".join(poor)
         cause = f"the fit predicts {motions} no better than constant rates (skill {', '.join(named)})"
-        said = cause, f"fly more {motions}, or check the airframe and the time stamps", moves
-        yield refusal("no_skill", *said) if near else reservation(*said)
+        remedy = f"fly more {motions}, or check the airframe and the time stamps"
+        yield Issue("no_skill" if near else RESERVATION, cause, remedy, moves)
