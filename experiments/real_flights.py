@@ -127,7 +127,9 @@ def real_flight(
 def alone(recordings: list[Recording], end: float | None) -> Row:
     """The result, the doubts and the moments of inertia of these recordings; or why they are refused."""
     row, found = identified(recordings, CRAZYFLIE, settings=jaxos4.VehicleSettings(sample_time=STEP, end=end))
-    return row | {"constants": {} if found is None else constants(found)}
+    if found is None:
+        return row | {"constants": {}}
+    return row | {"doubts": [doubt.cause for doubt in found.doubts], "constants": constants(found)}
 
 
 def public_flights(
