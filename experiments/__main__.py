@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -19,13 +19,26 @@ import typer
 from experiments.monte_carlo import machine
 from experiments.published import FOLDER, RECORDER, read, render
 
+MODULES = ("studies", "standard_flights", "real_flights", "figures")  # of several scripts, by their names in `SCRIPTS`
+
 
 def scripts() -> Iterator[str]:
-    """The names of all scripts: the modules with a `main`."""
+    """The names of all scripts: the modules with a `main`, and those of `MODULES`."""
     for path in sorted(Path(__file__).parent.glob("*/*.py")):
-        text = path.read_text(encoding="utf-8")
-        if "\ndef main(" in text or "\nmain = " in text:
+        if "\ndef main(" in path.read_text(encoding="utf-8"):
             yield f"{path.parent.name}.{path.stem}"
+    yield from shared_modules()
+
+
+def shared_modules() -> dict[str, Callable[..., None]]:
+    """The functions of `MODULES`, by the names of their scripts."""
+    modules = (importlib.import_module(f"experiments.{name}") for name in MODULES)
+    return {name: main for module in modules for name, main in module.SCRIPTS.items()}
+
+
+def main_of(name: str) -> Callable[..., None]:
+    """The function of a script."""
+    return shared_modules().get(name) or importlib.import_module(f"experiments.{name}").main
 
 
 def published(arguments: list[str]) -> str | None:
@@ -42,13 +55,13 @@ def published(arguments: list[str]) -> str | None:
 
 def run(name: str, arguments: list[str]) -> None:
     """Runs a script with its arguments."""
+    jax.config.update("jax_enable_x64", True)
     if name not in scripts():
         raise SystemExit(f"{name}: no such script; give one of {', '.join(scripts())}, again or render.")
     result = published(arguments)
     command = [name, *arguments]
-    jax.config.update("jax_enable_x64", True)
-    app = typer.Typer(add_completion=False)
-    app.command()(RECORDER.watching(importlib.import_module(f"experiments.{name}").main))
+    app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
+    app.command()(RECORDER.watching(main_of(name)))
     try:
         app(arguments, prog_name=f"python -m experiments {name}")
     except SystemExit as end:

@@ -1,8 +1,9 @@
 """The loop of experiments that simulate, fit and count: rows in a JSON file that is continued, and their table."""
 
+import itertools
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from experiments.published import RECORDER, Table as Published, commit
 from jaxos4.results import NINETY_FIVE
 
 Row = dict[str, Any]
+LOST = "lost"  # the result of a vehicle that turned over: nobody has its log
+Column = str | Callable[[Row], Any]  # the entry of a row that a table shows, or a function of the row
 
 
 def continued(out: Path | None, settings: Row, rows: str) -> Row:
@@ -68,44 +71,60 @@ def fill(out: Path | None, report: Row, rows: list[Row], trials: Iterable[Row], 
     RECORDER.commit = ", ".join(report["commits"])
 
 
-def monte_carlo(
-    out: Path | None,
-    settings: Row,
-    cases: Iterable[Row],
-    flights_of: Callable[..., Sequence[Any]],
-    row_of: Callable[..., Row],
-    summary: Callable[[list[Row]], Row],
-) -> Row:
-    """The report of all cases, with a row for each flight and a summary; continued if `out` exists.
+def product(**axes: Iterable[Any]) -> Iterator[Row]:
+    """All combinations of the values on these axes, as trials or cases."""
+    return (dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values()))
 
-    **Arguments:**
 
-    - `cases`: the entries by which each case is known, such as `{"estimator": "ibss"}`.
-    - `flights_of(**case)`: the flights of a case; `None`: one that was lost.
-    - `row_of(flight, i, **case)`: the row of flight number `i`, without this number.
-    - `summary`: of the rows of a case.
+def study(
+    out: Path | None, settings: Row, trials: Iterable[Row], row_of: Callable[..., Row], *, rows: str = "rows"
+) -> list[Row]:
+    """The rows of all trials, continued if `out` exists. See `continued` and `fill`."""
+    report = continued(out, settings, rows)
+    fill(out, report, report[rows], trials, row_of)
+    return report[rows]
+
+
+def groups(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by their values of these entries. Flights that were lost are left out."""
+    found: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        if row.get("result") != LOST:
+            found.setdefault(tuple(row[name] for name in names), []).append(row)
+    return found
+
+
+def statistics(error: np.ndarray, std: np.ndarray) -> Row:
+    """Figures over flights of an error and its standard deviation, with their Monte-Carlo errors.
+
+    `std`: root mean square of the standard deviations. `covered`: share of the 95 % intervals that hold the truth.
+    `width`: median half-width of these intervals.
     """
-    report = continued(out, settings, "cases")
-    for known in cases:
-        case = find(report["cases"], known)
-        if case is None:
-            case = {**known, "flights": [], "summary": {}}
-            report["cases"].append(case)
-        flights = flights_of(**known)
-
-        def row(flight: int, flights=flights, known=known) -> Row:
-            return row_of(flights[flight], flight, **known)
-
-        flown = ({"flight": i} for i, flight in enumerate(flights) if flight is not None)
-        fill(out, report, case["flights"], flown, row)
-        case["summary"] = summary(case["flights"])
-        write_report(out, report)
-    return report
+    count, covered = len(error), float(np.mean(np.abs(error) <= NINETY_FIVE * std))
+    rmse, claimed = (float(np.sqrt(np.mean(np.square(x)))) for x in (error, std))
+    return {
+        "flights": count,
+        "mean": float(error.mean()),
+        "mean_error": float(error.std(ddof=1) / np.sqrt(count)) if count > 1 else None,
+        "rmse": rmse,
+        "std": claimed,
+        "covered": covered,
+        "covered_error": covered_error(covered, count),
+        "width": float(NINETY_FIVE * np.median(std)),
+    }
 
 
 def covered_error(covered: float, count: int) -> float:
     """The Monte-Carlo error of a share of covered intervals, as if at most 95 % were covered."""
     return float(np.sqrt(max(covered * (1 - covered), 0.05 * 0.95) / count))
+
+
+def share(part: int, whole: int) -> str:
+    """A share with its Monte-Carlo error, of at least half an event [%]."""
+    if not whole:
+        return ""
+    p = np.clip(part / whole, 0.5 / whole, 1 - 0.5 / whole)
+    return f"{100 * part / whole:.3g} +- {100 * np.sqrt(p * (1 - p) / whole):.1f}"
 
 
 def count_results(names: np.ndarray) -> dict[str, int]:
@@ -119,17 +138,22 @@ def in_words(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {what}" for what, count in counts.items())
 
 
-def interval(value: Row | None, scale: float, digits: str = "2f", error_digits: str = "2f") -> str:
+def plus_minus(row: Row, name: str = "mean", scale: float = 100.0) -> str:
+    """A figure of `statistics` with its Monte-Carlo error, by default in percent, as the text of a table cell."""
+    error = row[f"{name}_error"]
+    return number(scale * row[name]) + ("" if error is None else f" +- {number(scale * error, 2)}")
+
+
+def interval(value: Row | None, scale: float) -> str:
     """An estimate with its 95 % interval as the text of a table cell; empty if there is none."""
-    if value is None or value["estimate"] is None:
+    if value is None or value.get("estimate") is None:
         return ""
-    estimate, half_width = scale * value["estimate"], NINETY_FIVE * scale * value["std"]
-    return f"{estimate:.{digits}} +- {half_width:.{error_digits}}"
+    return f"{scale * value['estimate']:.2f} +- {NINETY_FIVE * scale * value['std']:.2f}"
 
 
-def results_of(case: Row) -> str:
-    """The results of a case's flights as the text of a table cell."""
-    return in_words(count_results(np.array([row["result"] for row in case["flights"]])))
+def results_of(rows: list[Row]) -> str:
+    """The results of flights as the text of a table cell."""
+    return in_words(count_results(np.array([row["result"] for row in rows])))
 
 
 def print_table(
@@ -152,3 +176,23 @@ def print_table(
     for row in rows:
         table.add_row(*map(escape, row))
     Console(width=width).print(table)
+
+
+def print_rows(title: str, rows: Iterable[Row], columns: dict[str, Column], width: int = 170) -> None:
+    """Prints a table of rows. `columns`: by their headings."""
+    cells = ([text(row[one] if isinstance(one, str) else one(row)) for one in columns.values()] for row in rows)
+    print_table(title, list(columns), cells, width)
+
+
+def text(value: Any) -> str:
+    """A value as a table cell: numbers have three digits, counts of results are words, and `None` is empty."""
+    if value is None:
+        return ""
+    if isinstance(value, dict):
+        return in_words(value)
+    return number(value) if isinstance(value, float) else str(value)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with so many significant digits, or all of a whole number."""
+    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"

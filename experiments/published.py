@@ -23,7 +23,7 @@ import jaxos4
 ROOT = Path(__file__).parents[1]
 FOLDER = Path(__file__).with_name("results")
 PAGES = ROOT / "README.md", ROOT / "experiments" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))
-_MARKED = re.compile(r"(<!-- result: (\S+) / (.+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_MARKED = re.compile(r"(<!-- result: (\S+) / ([^\n]+) -->)\n(.*?)(<!-- end -->|(?=<!-- result: )|\Z)", re.DOTALL)
 
 
 class Table(msgspec.Struct):
@@ -77,7 +77,7 @@ class Recorder:
         @functools.wraps(main)
         def run(**arguments: Any) -> None:
             commit()  # of the code that runs, although a later one may be checked out when it ends
-            self.settings = {name: _plain(value) for name, value in arguments.items()}
+            self.settings = msgspec.to_builtins(arguments, enc_hook=str)
             main(**arguments)
 
         return run
@@ -102,12 +102,6 @@ class Recorder:
 RECORDER = Recorder()
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
-    return value if isinstance(value, (int, float, str, type(None))) else str(value)
-
-
 def read(name: str, folder: Path = FOLDER) -> Result:
     """The published result of this name. Ends the script if there is none."""
     path = folder / f"{name}.json"
@@ -130,8 +124,14 @@ def markdown(name: str, title: str, folder: Path = FOLDER) -> str:
 
 
 def rendered(page: str, folder: Path = FOLDER) -> str:
-    """The text of a page with its tables of results as the files say."""
-    return _MARKED.sub(lambda mark: f"{mark[1]}{markdown(mark[2], mark[3], folder)}{mark[5]}", page)
+    """The text of a page with its tables of results as the files say. Ends the script if a table has no end."""
+
+    def table(mark: re.Match[str]) -> str:
+        if not mark[5]:
+            raise SystemExit(f"{mark[1]}: has no <!-- end -->; write one after its table.")
+        return f"{mark[1]}\n{markdown(mark[2], mark[3], folder)}{mark[5]}"
+
+    return _MARKED.sub(table, page)
 
 
 def shown(pages: tuple[Path, ...] = PAGES) -> Iterator[tuple[Path, str, str]]:

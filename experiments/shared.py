@@ -1,50 +1,47 @@
-"""Functions that the experiments share: batched identification, tables, Datasets and figure files."""
+"""Functions that the experiments share: standard flights and their identification, studies, and files."""
 
-import functools
 import itertools
-import json
 import os
-import resource
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import typer
 import xarray as xr
 from jaxtyping import Array, Float, Key as Keys
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from experiments.drawing import rendered
-from experiments.monte_carlo import count_results, in_words, print_table
+import jaxos4
+from experiments.benchmarks.worker import peak_mib
+from experiments.monte_carlo import Column, Row, count_results, in_words, print_table
 from jaxos4._custom_types import Key, States
-from jaxos4._files import write_file, write_netcdf
+from jaxos4._files import write_netcdf
 from jaxos4.analysis.evaluation import cramer_rao_bound
 from jaxos4.bracket import Bracket
 from jaxos4.cli.studies import run_with_bar
 from jaxos4.estimate import AbstractEstimator, Estimate
 from jaxos4.excitation import multisine
 from jaxos4.flight import Flight
+from jaxos4.models import MODELS
 from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import SENSOR_SIGMA, AbstractNoise, WhiteNoise
-from jaxos4.report.matplotlib_figures import as_matplotlib, drawing
 from jaxos4.report.study_tables import scenarios
-from jaxos4.report.style import Style
 from jaxos4.report.text import plain
 from jaxos4.results import result_names
 from jaxos4.shooting import ShootingProblem
 from jaxos4.simulation import simulate
-from jaxos4.study import Study, device_name, metrics, read_results
+from jaxos4.study import Study, device_name, metrics
 from jaxos4.study.dataset import RESULTS_FILE, provenance
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""
 DT = 0.01  # of a standard flight [s]
 CHUNK = 250  # flights in one call, limited by the memory for the derivatives of the residuals
+Folder = Annotated[Path, typer.Option(help="Folder of the results: a new one, or one of a study to be resumed.")]
 
 
 def flight_files(folder: Path | None, names: Iterable[str]) -> list[Path]:
@@ -68,8 +65,9 @@ def run_studies(studies: dict[str, Study], out: Path) -> None:
     for name, study in studies.items():
         begin = time.perf_counter()
         found[name] = run_with_bar(study, out / name)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        spent.append((name or study.title, f"{study.flights:,}", f"{time.perf_counter() - begin:.0f}", f"{peak:,.0f}"))
+        spent.append(
+            (name or study.title, f"{study.flights:,}", f"{time.perf_counter() - begin:.0f}", f"{peak_mib():,.0f}")
+        )
     print_table("time and memory of this run", ("study", "flights", "time [s]", "peak memory [MiB]"), spent)
     titles = {f"{study.title}: {study.flights} flights, seed {study.seed}" for study in studies.values()}
     error = 1 / np.sqrt(2 * max(study.flights for study in studies.values()))
@@ -151,8 +149,9 @@ def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: 
     return jax.vmap(one)(keys)
 
 
-def many_times(bracket: Bracket, flights: int) -> Bracket:
-    """The same bracket for each flight."""
+def brackets_at(model: AbstractModel, offset: float, flights: int) -> Bracket:
+    """The same bracket for each flight: of the default width, `offset` half-widths from the truth."""
+    bracket = Bracket.around(model.alpha + offset * model.half_width, model.half_width)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), bracket)
 
 
@@ -181,7 +180,7 @@ def fit_noisy(
     return found, (time.perf_counter() - begin) / flights
 
 
-def scores(problem: ShootingProblem, found: Estimate) -> dict[str, Any]:
+def scores(problem: ShootingProblem, found: Estimate) -> Row:
     """A row of a table: errors, in bounds of the problem's flight, and coverage of those that have an answer."""
     results = result_names(found.result)
     answered = np.isin(results, metrics.CONVERGED)
@@ -202,60 +201,32 @@ def scores(problem: ShootingProblem, found: Estimate) -> dict[str, Any]:
     }
 
 
-def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) -> None:
-    """Draws a figure in the style of this library and writes it as SVG and PDF; nothing if `draw` returns `None`."""
-    directory.mkdir(parents=True, exist_ok=True)
-    with drawing():
-        figure = draw()
-        if figure is None:
-            return
-        for kind in ("svg", "pdf"):
-            write_file(directory / f"{name}.{kind}", rendered(figure, kind))
+class Fit(NamedTuple):
+    """Noisy standard flights of one kind, and the estimator that identifies them."""
+
+    estimator: AbstractEstimator
+    model: str = "published"
+    channels: str = "all"
+    scale: float = 1.0
+    known: bool = True
+    windows: int = 1
+
+    @property
+    def problem(self) -> ShootingProblem:
+        """The flight without noise."""
+        settings = {"scale": self.scale, "known": self.known, "windows": self.windows}
+        return standard_problem(MODELS[self.model](jaxos4.OS4), self.channels, **settings)
+
+    def row(self, flights: int, seed: int, noise: AbstractNoise | None = None) -> tuple[Row, Estimate]:
+        """The row of this many flights, with the seconds for each, and their estimates."""
+        problem = self.problem
+        found, seconds = fit_noisy(self.estimator, problem, flights, seed, noise)
+        return scores(problem, found) | {"seconds": seconds}, found
 
 
-def of_study(draw: Callable[[xr.Dataset], Any]) -> Callable[[xr.Dataset], Figure | None]:
-    """A figure of a study's page, drawn by Matplotlib."""
-
-    def drawn(data: xr.Dataset) -> Figure | None:
-        figure = draw(data)
-        return None if figure is None else as_matplotlib(figure)
-
-    return drawn
-
-
-def plotter(read: Callable[[Path], Any], drawn: dict[str, Callable[[Any], Figure | None]]) -> Callable[..., None]:
-    """The command that reads the results of an experiment and draws figures, by the names of their files."""
-
-    def main(results: Path, figures: Path) -> None:
-        """Draws the results of the experiment."""
-        found = read(results)
-        for name, draw in drawn.items():
-            write_figure(functools.partial(draw, found), figures, name)
-
-    return main
-
-
-def read_by_noise(directory: Path) -> xr.Dataset:
-    """The Dataset of a study, by noise scale and estimator alone."""
-    return read_results(directory).squeeze([d for d in metrics.SCENARIO if d not in ("scale", "estimator")])
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Reads what an experiment wrote as JSON."""
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def read_each(directory: Path) -> dict[str, xr.Dataset]:
-    """The Datasets of the studies in a folder, by the names of their folders."""
-    return {path.parent.name: read_results(path.parent) for path in sorted(directory.glob("*/results.nc"))}
-
-
-def draw_spread(panel: Axes, x: np.ndarray, values: xr.DataArray, look: Style, label: str) -> None:
-    """Draws the geometric mean over the parameters at each x, with a bar from the smallest to the largest."""
-    values = values.transpose(..., "parameter")
-    finite = values.notnull().any("parameter").values
-    logarithm = xr.apply_ufunc(np.log, values.where(values > 0))
-    mean = np.exp(logarithm.mean("parameter").values)
-    panel.plot(x, mean, color=look.color, marker=look.marker, linestyle=look.dash, label=label)
-    low, high = (end.values[finite] for end in (values.min("parameter"), values.max("parameter")))
-    panel.vlines(x[finite], low, high, color=look.color, linewidth=1.0)
+# Columns of tables.
+EFFICIENCY: dict[str, Column] = {
+    name: lambda row, i=i: row["efficiency"][i] if row["efficiency"] else None for i, name in enumerate(PARAMETERS)
+}
+SPAN: dict[str, Column] = {"RMSE / bound": lambda row: span(np.asarray(row["efficiency"] or []))}
+ENDED: dict[str, Column] = {"rollouts": "rollouts", "results": "results"}

@@ -8,10 +8,9 @@ import tomllib
 import pytest
 import typer
 from helpers import ROOT, blocks
-from small_experiments import load
 from typer.main import get_command
 
-from experiments.__main__ import again, published, render, scripts
+from experiments.__main__ import again, main_of, published, render, scripts
 from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.airframe import airframe_table
 from jaxos4.cli._app import app
@@ -71,7 +70,7 @@ def parser(line: str):
     assert words[0] in (*scripts(), *own)
     published(words)
     script = typer.Typer()
-    script.command()(own.get(words[0]) or load(*words[0].split(".")).main)
+    script.command()(own.get(words[0]) or main_of(words[0]))
     return get_command(script), words[1:]
 
 

@@ -7,10 +7,12 @@ import sys
 
 import numpy as np
 import pytest
-from small_experiments import load, plot, result_of
+from small_experiments import plot, result_of
 
-from experiments import shared
+from experiments import figures, shared
+from experiments.__main__ import main_of, scripts
 from experiments.published import RECORDER, read
+from experiments.real_flights import agreement
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
@@ -38,7 +40,7 @@ def run(tmp_path):
     """Runs and plots the small configuration of an experiment with a script."""
 
     def results(name, **options):
-        load(name).main(small(name), tmp_path / "out", **options)
+        main_of(f"{name}.run")(small(name), tmp_path / "out", **options)
         plot(tmp_path, name, results="out")
         return tmp_path / "out"
 
@@ -51,7 +53,7 @@ def test_configurations(name):
     """The full configuration is valid, and no smaller than the small one."""
     real, short = load_study(EXPERIMENTS / name / "study.toml"), load_study(small(name))
     assert real.count * real.batch >= short.count * short.batch
-    assert (EXPERIMENTS / name / "run.py").exists() == (name not in STUDIES)
+    assert (f"{name}.run" in scripts()) == (name not in STUDIES)
 
 
 @pytest.mark.slow
@@ -101,7 +103,7 @@ def test_frontier(run):
 @pytest.mark.slow
 def test_rollout_budget(run):
     data = shared.load_results(run("rollout_budget", limits=[1, 10])).squeeze()
-    reached, (few, enough) = load("rollout_budget", "plot").accuracy(data), data["rollouts"].mean("flight").T
+    reached, (few, enough) = figures.accuracy(data), data["rollouts"].mean("flight").T
     # One sweep, or one step, of each stage is nearly as good as the complete search: the rates are nearly linear.
     assert (reached.isel(limit=0) < 1.2).all()
     assert (few < 0.7 * enough).all()
@@ -128,7 +130,7 @@ def test_published_corrected(run):
 
 @pytest.mark.slow
 def test_inverse_crime(run):
-    out, bias = run("inverse_crime", fit_methods=["euler", "rk4"], dts=[0.01]), load("inverse_crime", "plot").bias
+    out, bias = run("inverse_crime", fit_methods=["euler", "rk4"], dts=[0.01]), figures.bias
     euler, rk4 = (bias(read_results(out / f"{fit} 0.01 s")).squeeze() for fit in ("euler", "rk4"))
     assert float(euler.sel({"method": "rk4"})) > 8 * float(euler.sel({"method": "euler"}))
     assert float(rk4.sel({"method": "rk4"})) < float(euler.sel({"method": "rk4"})) / 8
@@ -240,7 +242,7 @@ def test_defaults(tmp_path):
 @pytest.mark.slow
 def test_robust_intervals():
     """Those by the residuals hold the truth under coloured noise; those by the bound of white noise do not."""
-    load("coverage", "robust").main(flights=16, seed=13)
+    main_of("coverage.robust")(flights=16, seed=13)
     white, robust = (float(row[-1]) for row in RECORDER.tables[-1].rows)
     assert white < 70 < 80 < robust
 
@@ -248,13 +250,13 @@ def test_robust_intervals():
 @pytest.mark.slow
 def test_times_of_commands(monkeypatch):
     monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
-    load("speed", "commands").main(repeats=1, commands=["simulate --help"])
+    main_of("speed.commands")(repeats=1, commands=["simulate --help"])
     ((command, cold, again),) = RECORDER.tables[-1].rows
     assert command == "jaxos4 simulate --help"
     assert 0 < float(cold)
     assert again.count(again.split()[0]) == 3  # one run: median, least and most are one number
     with pytest.raises(SystemExit, match="missing.csv"):
-        load("speed", "commands").main(repeats=1, commands=["estimate missing.csv"])
+        main_of("speed.commands")(repeats=1, commands=["estimate missing.csv"])
 
 
 @pytest.mark.slow
@@ -272,7 +274,7 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
     def row(value):
         return {"constants": {name: {"estimate": value, "std": 1.0} for name in ("Ix", "Iy")}}
 
-    agreement, rows = load("public_flights").agreement, {"a": row(0.0), "b": row(2.7), "c": row(2.9)}
+    rows = {"a": row(0.0), "b": row(2.7), "c": row(2.9)}
     found = agreement(rows | {"refused": {"constants": {}}})  # 1.96 sqrt(2) = 2.77
     assert (found["pairs"], found["share"]) == (6, pytest.approx(2 / 3))
     assert found["ci95"][0] <= found["share"] <= found["ci95"][1]

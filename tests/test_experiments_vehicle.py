@@ -6,6 +6,10 @@ from scipy.signal import lfilter
 from small_experiments import load, plot, result_of
 
 import jaxos4
+from experiments.__main__ import main_of
+from experiments.fits import summary
+from experiments.monte_carlo import groups
+from experiments.real_flights import disagreements
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
@@ -23,16 +27,16 @@ def test_real_flight(shared_flights, tmp_path):
 def test_flights_that_disagree_are_found():
     rows = {name: {"constants": {"Ix": {"estimate": x, "std": 3.0}}} for name, x in (("one", 1.0), ("two", 11.0))}
     rows |= {"three": {"constants": {}}}
-    found = load("real_flight").disagreements(rows)
-    assert found == {"Ix": {"one, two": pytest.approx(10 / np.sqrt(18))}}
+    found = disagreements(rows)
+    assert found == {"Ix": {("one", "two"): pytest.approx(10 / np.sqrt(18))}}
 
 
 def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
     with pytest.raises(SystemExit, match="--flights: no flights in None: give"):
-        load("real_flight").main(out=tmp_path / "out")
+        main_of("real_flight.run")(out=tmp_path / "out")
     with pytest.raises(SystemExit, match="--flights: no arpl_crazyflie_rollpitch.csv in"):
-        load("real_flight").main(flights=tmp_path, out=tmp_path / "out")
+        main_of("real_flight.run")(flights=tmp_path, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -42,19 +46,20 @@ def test_closed_loop(monkeypatch, tmp_path):
     cases |= {"estimators": ["equation-error", "output-error"]}
     report = result_of(tmp_path, "closed_loop", **cases)
     plot(tmp_path, "closed_loop")
-    assert [len(case["flights"]) for case in report["cases"]] == [3, 3]
+    cases = groups(report["rows"], "estimator").values()
+    assert [len(rows) for rows in cases] == [3, 3]
     # A controller that answers gusts makes both biased by tens of percent, and their intervals do not know it.
-    for row in (row for case in report["cases"] for row in case["summary"].values()):
-        assert (row["bias"] > 0.2, row["covered"]) == (True, 0)
+    for row in (row for rows in cases for row in summary(rows).values()):
+        assert (row["mean"] > 0.2, row["covered"]) == (True, 0)
 
 
 def test_effects(tmp_path):
     """The effects of real flights are flown, identified and drawn."""
     report = result_of(tmp_path, "closed_loop", "effects", flights=1, duration=10.0, effects=["clock"])
     plot(tmp_path, "closed_loop", "plot_effects")
-    for case in report["cases"]:
-        assert [row["result"] for row in case["flights"]] == ["successful"]
-        assert abs(case["summary"]["thrust"]["mean"]) < 0.05
+    (row,) = report["rows"]
+    assert row["result"] == "successful"
+    assert abs(row["thrust"]["error"]) < 0.05
 
 
 def test_a_soft_flight_has_no_steps_and_the_mix_of_effects_stays_what_it_was():
@@ -113,10 +118,11 @@ def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
 def test_sample_times(tmp_path):
     """Every sample time has the same answer, within its interval."""
     report = result_of(tmp_path, "sample_times", flights=2, sample_times=[0.004, 0.016], duration=16.0)
-    for case in report["cases"]:
-        assert {row["result"] for row in case["flights"]} == {"successful"}
-        assert all(abs(case["summary"][name]["mean"]) < 0.08 for name in ("Ix", "Iy"))
-        assert case["summary"]["Ix"]["covered"] == 1
+    for rows in groups(report["rows"], "sample_time").values():
+        assert {row["result"] for row in rows} == {"successful"}
+        found = load("sample_times").summary(rows, load("sample_times").truth_of("speeds", 0.004))
+        assert all(abs(found[name]["mean"]) < 0.08 for name in ("Ix", "Iy"))
+        assert found["Ix"]["covered"] == 1
 
 
 def test_rotorpy(tmp_path):
@@ -134,9 +140,9 @@ def test_rotorpy(tmp_path):
     expected = np.square(speeds).mean(axis=1) @ vehicle.mixer[:3].T / vehicle.inertia
     for axis in range(3):
         assert np.corrcoef(change[:, axis], expected[:, axis])[0, 1] > 0.9
-    (case,) = report["cases"]
-    assert [row["result"] for row in case["flights"]] == ["successful"]
-    assert all(abs(case["summary"][name]["mean"]) < 0.05 for name in ("Ix", "Iy", "Iz", "thrust"))
+    (row,) = report["rows"]
+    assert row["result"] == "successful"
+    assert all(abs(row[name]["error"]) < 0.05 for name in ("Ix", "Iy", "Iz", "thrust"))
 
 
 def test_the_order_of_a_disturbance_decides_on_the_thrust():

@@ -55,3 +55,9 @@ def test_results_are_computed_again_by_their_own_commands(tmp_path):
     assert list(commands(["all"], tmp_path)) == ["one", "two"]
     with pytest.raises(SystemExit, match="three: no such result"):
         commands(["three"], tmp_path)
+
+
+def test_a_table_without_an_end_is_named_and_eats_no_text():
+    page = "<!-- result: one / errors -->\ntext\n<!-- result: two / errors -->\n<!-- end -->\n"
+    with pytest.raises(SystemExit, match="<!-- result: one / errors -->: has no <!-- end -->; write one"):
+        rendered(page)

@@ -6,10 +6,9 @@ alternate, so that each ratio compares laps under the same load of the machine.
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 import jaxos4
 from experiments.benchmarks.case import ALL, RATES, Case, costs, trajectories
@@ -157,23 +156,32 @@ def roofline(shot_rows: dict[str, Any], skipped: list[str]) -> dict[str, Any]:
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of flights in one call.")] = 1000,
-    alone: Annotated[int, typer.Option(help="Number of flights for contenders that take one after another.")] = 10,
-    repeats: Annotated[int, typer.Option(help="Number of laps.")] = 7,
-    steps: Annotated[int, typer.Option(help="Number of steps of a flight.")] = 500,
-    starts: Annotated[list[str], typer.Option(help="Initial states: known, free.")] = ("known", "free"),
-    contenders: Annotated[list[str], typer.Option(help="Names of the fits; by default the quick ones.")] = QUICK,
-    shooters: Annotated[list[str], typer.Option(help="Names of the shots; by default all.")] = tuple(SHOTS),
-    growing: Annotated[str, typer.Option(help="The estimator whose growth is measured; empty: none.")] = "output-error",
-    grow_flights: Annotated[list[int], typer.Option(help="Numbers of flights.")] = (1, 10, 100, 1000, 10_000, 100_000),
-    grow_steps: Annotated[list[int], typer.Option(help="Numbers of steps.")] = (100, 1000, 10_000, 100_000),
-    grow_parameters: Annotated[list[int], typer.Option(help="Numbers of parameters.")] = (1, 2, 4, 8),
-    network_steps: Annotated[int, typer.Option(help="Steps of the network's training; 0: no networks.")] = 3000,
-    simulations: Annotated[int, typer.Option(help="Simulated flights for sbi; 0: without sbi.")] = 10_000,
-    seed: Annotated[int, typer.Option(help="Of noise and starts.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    flights: int = 1000,
+    alone: int = 10,
+    repeats: int = 7,
+    steps: int = 500,
+    starts: list[str] = ("known", "free"),
+    contenders: list[str] = QUICK,
+    shooters: list[str] = tuple(SHOTS),
+    growing: str = "output-error",
+    grow_flights: list[int] = (1, 10, 100, 1000, 10_000, 100_000),
+    grow_steps: list[int] = (100, 1000, 10_000, 100_000),
+    grow_parameters: list[int] = (1, 2, 4, 8),
+    network_steps: int = 3000,
+    simulations: int = 10_000,
+    seed: int = 0,
+    out: Path | None = None,
 ) -> None:
-    """Time all contenders, and print tables."""
+    """Time all contenders, and print tables.
+
+    - `flights`: Number of flights in one call. `alone`: The same for contenders that take one after another.
+    - `repeats`: Number of laps. `steps`: Number of steps of a flight. `starts`: Initial states: known, free.
+    - `contenders`: Names of the fits; by default the quick ones. `shooters`: Names of the shots; by default all.
+    - `growing`: The estimator whose growth is measured; empty: none. `grow_flights`: Numbers of flights.
+    - `grow_steps`: Numbers of steps. `grow_parameters`: Numbers of parameters.
+    - `network_steps`: Steps of the network's training; 0: no networks.
+    - `simulations`: Simulated flights for sbi; 0: without sbi.
+    """
     skipped: list[str] = []
     report: dict[str, Any] = {
         "provenance": {

@@ -9,22 +9,25 @@ smaller. The battery of `battery` sags under load.
 """
 
 import functools
-import itertools
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.closed_loop.run import CHUNK, DELAY, DT, LAG, LARGEST, VEHICLE, stacked, turned_over
-from experiments.fits import fit, given_airframe, print_summaries, summary
-from experiments.monte_carlo import Row, monte_carlo
+from experiments.fits import WRONG_INERTIA, fit, given_airframe, print_summaries
+from experiments.monte_carlo import Row, product, study
 from jaxos4.excitation import STANDARD_TONES
 
+VEHICLE = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
+LAG, DELAY = 0.05, 0.01
+DT = 0.004  # s
+# The largest references of all flights: angles [rad] and vertical acceleration [m/s^2].
+LARGEST = np.array([0.3, 0.3, 0.3, 1.5])
+CHUNK = 25  # flights of one call
 GUST = 5.0  # [rad/s^2]
 VERTICAL_TONES = (0.4, 0.8, 1.2)  # of the vertical acceleration [Hz]
 
@@ -94,8 +97,32 @@ def effect_of(kind: str, random: np.random.Generator) -> Effect:
     return Effect(air, sensors, loop, motor, fastest, *fixed)
 
 
-def flights_of(kind: str, flights: int, duration: float, seed: int, gust: float = GUST) -> list[jaxos4.Flight | None]:
-    """The flights of a case, in batches of `CHUNK`; `None`: the vehicle is lost."""
+def turned_over(flight: jaxos4.Flight) -> bool:
+    """True if the gusts threw the vehicle on its side: then it is lost, and nobody has its log."""
+    angles = np.asarray(flight.states)[:, [jaxos4.STATE_NAMES.index(name) for name in ("phi", "theta")]]
+    return bool(flight.result != jaxos4.RESULTS.successful) or bool((np.abs(angles) > np.pi / 2).any())
+
+
+def stacked(modules: list) -> object:
+    """Modules of equal shapes as one batch."""
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *modules)
+
+
+def flights_of(
+    kind: str,
+    flights: int,
+    duration: float,
+    seed: int,
+    gust: float = GUST,
+    *,
+    wrong: float = WRONG_INERTIA,
+    references: np.ndarray | None = None,
+) -> list[jaxos4.Flight | None]:
+    """The flights of a case, in batches of `CHUNK`; `None`: the vehicle is lost.
+
+    `wrong`: error of the moments of inertia that the controller knows, as a share. `references`: of all flights; by
+    default random, other ones for each flight.
+    """
     loops, keys = [], []
     for i in range(flights):
         effect = effect_of(kind, np.random.default_rng([seed, i]))
@@ -106,7 +133,7 @@ def flights_of(kind: str, flights: int, duration: float, seed: int, gust: float 
             vehicle,
             air=jaxos4.Air(**effect.air),
             sensors=jaxos4.Sensors(**effect.sensors),
-            controller_inertia=given_airframe(vehicle, i).inertia,
+            controller_inertia=given_airframe(vehicle, i, inertia=wrong).inertia,
             **{"log_every": effect.log_every, "logged": effect.logged, **settings},
         )
         loops.append(loop)
@@ -114,7 +141,8 @@ def flights_of(kind: str, flights: int, duration: float, seed: int, gust: float 
     flown: list[jaxos4.Flight | None] = []
     for first in range(0, flights, CHUNK):
         some = slice(first, first + CHUNK)
-        batch = _fly(stacked(loops[some]), jnp.stack(keys[some]), duration, soft=kind != ALL and EFFECTS[kind].soft)
+        soft = kind != ALL and EFFECTS[kind].soft
+        batch = _fly(stacked(loops[some]), jnp.stack(keys[some]), duration, references, soft=soft)
         for k in range(len(keys[some])):
             flight = jax.tree.map(lambda x, k=k: np.asarray(x)[k], batch)
             flown.append(None if turned_over(flight) else flight)
@@ -132,30 +160,35 @@ def sines(*, duration: float, dt: float, key: jax.Array) -> jaxos4.closed_loop.R
 
 
 @eqx.filter_jit
-def _fly(loops: jaxos4.ClosedLoop, keys: jax.Array, duration: float, *, soft: bool) -> jaxos4.Flight:
+def _fly(
+    loops: jaxos4.ClosedLoop, keys: jax.Array, duration: float, references: np.ndarray | None, *, soft: bool
+) -> jaxos4.Flight:
     def one(loop: jaxos4.ClosedLoop, key: jax.Array) -> jaxos4.Flight:
-        settings = {"duration": duration, "dt": DT, "key": jax.random.fold_in(key, 0)}
-        references = sines(**settings) if soft else jaxos4.random_references(amplitude=LARGEST.tolist(), **settings)
-        return jaxos4.fly_closed_loop(loop, references, dt=DT, key=jax.random.fold_in(key, 1))
+        flown, settings = references, {"duration": duration, "dt": DT, "key": jax.random.fold_in(key, 0)}
+        if flown is None:
+            flown = sines(**settings) if soft else jaxos4.random_references(amplitude=LARGEST.tolist(), **settings)
+        return jaxos4.fly_closed_loop(loop, flown, dt=DT, key=jax.random.fold_in(key, 1))
 
     return eqx.filter_vmap(one)(loops, keys)
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of flights of each case.")] = 50,
-    effects: Annotated[list[str], typer.Option(help="The cases.")] = (*EFFECTS, ALL),
-    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
-    seed: Annotated[int, typer.Option(help="Random seed of references, gusts, noise and effects.")] = 22,
-    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = ("filter-error",),
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+    flights: int = 50,
+    effects: list[str] = (*EFFECTS, ALL),
+    duration: float = 20.0,
+    seed: int = 22,
+    estimators: list[str] = ("filter-error",),
+    out: Path | None = None,
 ) -> None:
-    """Measure errors and coverage for each effect."""
-    settings = {"flights": flights, "duration": duration, "seed": seed}
-    cases = [{"kind": kind, "estimator": name} for kind, name in itertools.product(effects, estimators)]
+    """Measure errors and coverage for each effect.
+
+    - `effects`: The cases.
+    """
     flown = functools.cache(lambda kind: flights_of(kind, flights, duration, seed))
 
-    def row_of(flight: jaxos4.Flight, i: int, kind: str, estimator: str) -> Row:
-        return fit(estimator, flight, VEHICLE, i)
+    def row_of(kind: str, estimator: str, flight: int) -> Row:
+        return fit(estimator, flown(kind)[flight], VEHICLE, flight)
 
-    report = monte_carlo(out, settings, cases, lambda kind, **_: flown(kind), row_of, summary)
-    print_summaries(f"effects of real flights, {duration:g} s in closed loop", report)
+    trials = product(kind=effects, estimator=estimators, flight=range(flights))
+    rows = study(out, {"flights": flights, "duration": duration, "seed": seed}, trials, row_of)
+    print_summaries(f"effects of real flights, {duration:g} s in closed loop", rows)

@@ -4,27 +4,21 @@ Each error is in units of the Cramer-Rao bound at that flight's own truth.
 """
 
 import os
-import resource
 import time
-from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, count_results, in_words, print_table, write_report
-from experiments.shared import CHUNK, DT, PARAMETERS, identify, many_times, measure, standard_problem
+from experiments.benchmarks.worker import peak_mib
+from experiments.monte_carlo import Column, Row, count_results, print_rows, print_table, write_report
+from experiments.shared import CHUNK, DT, EFFICIENCY, ENDED, brackets_at, identify, measure, standard_problem
 from jaxos4.study import metrics
 
 LEVELS = (0.5, 0.9, 0.99)
-NOISES = (0.1, 1.0, 10.0)
-
-
 MODEL = jaxos4.PublishedOS4(jaxos4.OS4)
 BRACKET = jaxos4.Bracket.default(MODEL)
 NETWORKS = {
@@ -32,6 +26,15 @@ NETWORKS = {
     "raw, mlp": {"features": "raw", "steps": 3000},
     "score, cmac": {"architecture": "cmac"},
     "score, cmac, 10000 steps": {"architecture": "cmac", "steps": 10_000},
+}
+COLUMNS: dict[str, Column] = {
+    "estimator": "estimator",
+    "noise": "noise",
+    **EFFICIENCY,
+    "50, 90, 99 %": lambda row: " ".join(f"{100 * x:.1f}" for x in row["covered"]),
+    "hit": lambda row: None if row["hit_rate"] is None else 100 * row["hit_rate"],
+    "1/s": "flights_per_second",
+    **ENDED,
 }
 
 
@@ -50,54 +53,39 @@ def fly(problem: jaxos4.ShootingProblem, key: jax.Array) -> tuple[jax.Array, ...
 
 
 def unseen(
-    estimator: jaxos4.AbstractEstimator,
-    channels: str,
-    bound_channels: str,
-    noises: Iterable[float],
-    flights: int,
-    seed: int,
-) -> Iterator[tuple[float, dict]]:
-    """For each noise, identifies `flights` flights that do not diverge, with parameters drawn over the bracket."""
-    at_once = min(CHUNK, flights)
-    for noise in noises:
-        problem, compared = (standard_problem(MODEL, some, scale=noise) for some in (channels, bound_channels))
-        rows, seconds, chunk = [], [], 0
-        while sum(len(r["alpha"]) for r in rows) < flights and chunk < 20 + 20 * flights / at_once:
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), chunk), at_once)
-            alpha, states, bound, flown = fly(compared, keys)
-            begin, chunk = time.perf_counter(), chunk + 1
-            found = jax.block_until_ready(identify(estimator, problem, many_times(BRACKET, at_once), states))
-            seconds.append(time.perf_counter() - begin)
-            error = found.parameters - alpha
-            row = {
-                "alpha": alpha,
-                "error": error,
-                "bound": bound,
-                "result": jaxos4.result_names(found.result),
-                "rollouts": found.rollouts,
-                "covered": jnp.stack([jnp.abs(error) < found.half_width(level) for level in LEVELS], axis=1),
-            }
-            if found.seed is not None:
-                row["hit"] = ((alpha >= found.seed.lower) & (alpha <= found.seed.upper)).all(axis=1)
-            rows.append({name: np.asarray(value)[np.asarray(flown)] for name, value in row.items()})
-        data = {name: np.concatenate([r[name] for r in rows])[:flights] for name in rows[0]}
-        yield noise, summary(data) | {"flights_per_second": at_once / float(np.median(seconds))}
+    estimator: jaxos4.AbstractEstimator, channels: str, bound_channels: str, noise: float, flights: int, seed: int
+) -> Row:
+    """The row of `flights` flights that do not diverge, with parameters drawn over the bracket.
 
-
-def summary(data: dict[str, np.ndarray]) -> dict:
-    """A row of the table: errors of the converged flights, and the number of flights with each result."""
+    Errors and coverage are those of the flights that converged.
+    """
+    at_once, chunk, parts, seconds = min(CHUNK, flights), 0, [], []
+    problem, compared = (standard_problem(MODEL, some, scale=noise) for some in (channels, bound_channels))
+    brackets = brackets_at(MODEL, 0.0, at_once)
+    while sum(len(part["result"]) for part in parts) < flights and chunk < 20 + 20 * flights / at_once:
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), chunk), at_once)
+        alpha, states, bound, flown = fly(compared, keys)
+        begin, chunk = time.perf_counter(), chunk + 1
+        found = jax.block_until_ready(identify(estimator, problem, brackets, states))
+        seconds.append(time.perf_counter() - begin)
+        error = found.parameters - alpha
+        part = {"own": error / bound, "result": jaxos4.result_names(found.result), "rollouts": found.rollouts}
+        part["covered"] = jnp.stack([jnp.abs(error) < found.half_width(level) for level in LEVELS], axis=1)
+        if found.seed is not None:
+            part["hit"] = ((alpha >= found.seed.lower) & (alpha <= found.seed.upper)).all(axis=1)
+        parts.append({name: np.asarray(value)[np.asarray(flown)] for name, value in part.items()})
+    data = {name: np.concatenate([part[name] for part in parts])[:flights] for name in parts[0]}
     converged = np.isin(data["result"], metrics.CONVERGED)
-    error, bound = data["error"][converged], data["bound"][converged]
     return {
         "flights": len(converged),
         "answers": int(converged.sum()),
         "results": count_results(data["result"]),
-        "efficiency": np.sqrt(np.mean((error / bound) ** 2, axis=0)).tolist(),
-        "rms_ratio": np.sqrt(np.mean(error**2, axis=0) / np.mean(bound**2, axis=0)).tolist(),
+        "efficiency": np.sqrt(np.mean(data["own"][converged] ** 2, axis=0)).tolist(),
         "monte_carlo_error": float(1 / np.sqrt(2 * max(converged.sum(), 1))),
         "covered": data["covered"][converged].mean(axis=(0, 2)).tolist(),
         "rollouts": float(data["rollouts"].mean()),
         "hit_rate": float(data["hit"].mean()) if "hit" in data else None,
+        "flights_per_second": at_once / float(np.median(seconds)),
     }
 
 
@@ -106,14 +94,11 @@ def amortised(network: jaxos4.TrainedNetwork, channels: str, flights: int) -> di
     keys = jax.random.split(jax.random.key(3), flights)
     problem = standard_problem(MODEL, channels)
     noisy = measure(jaxos4.WhiteNoise(problem.sigma), problem.flight, keys)
-    arguments = network, problem, many_times(BRACKET, flights), noisy
-
-    def peak() -> float:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    arguments = network, problem, brackets_at(MODEL, 0.0, flights), noisy
 
     begin = time.perf_counter()
     compiled = identify.lower(*arguments).compile()
-    built, before = time.perf_counter(), peak()
+    built, before = time.perf_counter(), peak_mib()
     jax.block_until_ready(compiled(*arguments))
     seconds = time.perf_counter() - built
     return {
@@ -121,42 +106,35 @@ def amortised(network: jaxos4.TrainedNetwork, channels: str, flights: int) -> di
         "compile_seconds": built - begin,
         "seconds": seconds,
         "data_mib": noisy.nbytes / 2**20,
-        "peak_mib": peak(),
-        "added_mib": peak() - before,
+        "peak_mib": peak_mib(),
+        "added_mib": peak_mib() - before,
     }
 
 
-def cells(row: Row) -> tuple[str, ...]:
-    """A row of the table."""
-    return (
-        *(row["estimator"], f"{row['noise']:g}", *(f"{x:.2f}" for x in row["efficiency"])),
-        " ".join(f"{100 * x:.1f}" for x in row["covered"]),
-        "" if row["hit_rate"] is None else f"{100 * row['hit_rate']:.1f}",
-        *(f"{row['rollouts']:.0f}", f"{row['flights_per_second'] or 0:.0f}", in_words(row["results"])),
-    )
-
-
 def main(
-    flights: Annotated[int, typer.Option(help="New flights for each row.")] = 2000,
-    seed: Annotated[int, typer.Option(help="Random seed for the new flights; networks are trained with seed 0.")] = 7,
-    networks: Annotated[list[str], typer.Option(help="Names of the networks.")] = tuple(NETWORKS),
-    noises: Annotated[list[float], typer.Option(help="Noise scales.")] = NOISES,
-    channels: Annotated[
-        str, typer.Option(help="Channels that are measured, and that the hybrid and IBSS look at.")
-    ] = "all",
-    steps: Annotated[
-        int | None, typer.Option(help="Training steps of all networks; each has its own number without it.")
-    ] = None,
-    many: Annotated[int, typer.Option(help="Flights identified in one call.")] = 10_000,
-    separate: Annotated[bool, typer.Option(help="Train one network for each noise scale too.")] = True,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+    flights: int = 2000,
+    seed: int = 7,
+    networks: list[str] = tuple(NETWORKS),
+    noises: list[float] = (0.1, 1.0, 10.0),
+    channels: str = "all",
+    steps: int | None = None,
+    many: int = 10_000,
+    separate: bool = True,
+    out: Path | None = None,
 ) -> None:
-    """Networks, hybrid and IBSS on flights drawn over the whole bracket."""
+    """Networks, hybrid and IBSS on flights drawn over the whole bracket. Networks are trained with seed 0.
+
+    - `networks`: Names of the networks. `many`: Flights identified in one call.
+    - `channels`: Channels that are measured, and that the hybrid and IBSS look at.
+    - `steps`: Training steps of all networks; each has its own number without it.
+    - `separate`: Train one network for each noise scale too.
+    """
     report: Row = {"flights": flights, "seed": seed, "version": jaxos4.__version__, "load": os.getloadavg()}
     report |= {"rows": [], "training_seconds": {}}
 
-    def add(label: str, estimator: jaxos4.AbstractEstimator, seen: str, bound: str, scales: Iterable[float]) -> None:
-        for noise, row in unseen(estimator, seen, bound, scales, flights, seed):
+    def add(label: str, estimator: jaxos4.AbstractEstimator, seen: str, bound: str, scales: list[float]) -> None:
+        for noise in scales:
+            row = unseen(estimator, seen, bound, noise, flights, seed)
             report["rows"].append({"estimator": label, "noise": noise, **row})
             write_report(out, report)
 
@@ -187,6 +165,5 @@ def main(
     write_report(out, report)
     seconds = ((label, f"{spent:.0f}") for label, spent in report["training_seconds"].items())
     print_table("training", ("network", "time [s]"), seconds)
-    headings = "estimator", "noise", *PARAMETERS, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"
     title = f"RMSE / Cramer-Rao bound: of the rates for a network alone, of {channels} for the others"
-    print_table(title, headings, map(cells, report["rows"]), width=170)
+    print_rows(title, report["rows"], COLUMNS)

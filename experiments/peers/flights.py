@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 import jaxos4
-from experiments.closed_loop.run import VEHICLE as CRAZYFLIE, turned_over
-from experiments.real_flight.run import AIRFRAME as ARPL, AUTHORS
+from experiments.closed_loop.effects import VEHICLE as CRAZYFLIE, turned_over
+from experiments.real_flights import ARPL, AUTHORS, CRAZYFLIE as NANOBENCH, PENDULUM
 from experiments.sample_times.run import VEHICLE as CINERAT
 from experiments.shared import flight_files
 from jaxos4.recording import Recording, read_recording
@@ -22,8 +22,6 @@ VEHICLES = {  # with what is logged
     "x500": (jaxos4.load_airframe("x500"), "commands"),
 }
 SUBSTEPS = 4  # of MuJoCo, in a period of the controller
-NANOBENCH = jaxos4.load_airframe("crazyflie")
-PENDULUM = {"Ix": 7.21e-4, "Iy": 7.76e-4, "Iz": 8.86e-4}  # of the CineRat, by its authors; an error of 7 %
 PART = (10.0, 30.0)  # s
 REAL = {  # file, airframe, part of the flight, what is logged, reference [kg m^2]
     "CineRat": ("cinerat/cinerat_281.csv", CINERAT, PART, "speeds", PENDULUM),

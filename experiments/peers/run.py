@@ -12,17 +12,26 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.fits import INERTIAS, fit, given_airframe
-from experiments.monte_carlo import Row, continued, covered_error, fill, print_table
+from experiments.fits import INERTIAS, constants, fit, given_airframe, identified
+from experiments.monte_carlo import (
+    LOST,
+    Row,
+    continued,
+    covered_error,
+    fill,
+    interval,
+    plus_minus,
+    print_table,
+    product,
+    statistics,
+)
 from experiments.peers.flights import REAL, Case, cases, real
 from experiments.peers.log import Fit, Log
-from jaxos4.errors import InputError
 from jaxos4.recording import Recording
 from jaxos4.results import NINETY_FIVE
 
@@ -44,53 +53,43 @@ def installed(names: list[str]) -> dict[str, Any]:
     return found
 
 
-def shares(found: Fit, truth: np.ndarray) -> Row:
-    """Errors and standard deviations of the moments of inertia as shares of the truth."""
-    errors, stds = (found.inertia / truth - 1).tolist(), (found.std / truth).tolist()
-    return {name: {"error": e, "std": s} for name, e, s in zip(INERTIAS, errors, stds, strict=True)}
-
-
-def timed(peer: Any, log: Log, setting: Row) -> tuple[Fit | None, Row]:
-    """A fit, or `None` if the tool failed, with warnings and seconds as the begin of its row."""
+def fitted(peer: Any, log: Log, setting: Row) -> tuple[Row, Fit | None]:
+    """The begin of a row: warnings and seconds; and the fit, or `None` if the tool failed."""
     begin = time.perf_counter()
     try:
         found = peer.fit(log, **setting)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return None, {"warnings": [f"failed: {error}"], "seconds": time.perf_counter() - begin}
-    return found, {"warnings": found.warnings, "seconds": time.perf_counter() - begin}
+        return {"warnings": [f"failed: {error}"], "seconds": time.perf_counter() - begin}, None
+    return {"warnings": found.warnings, "seconds": time.perf_counter() - begin}, found
 
 
 def simulated(case: Case, flight: jaxos4.Flight | None, i: int, peer: Any, setting: Row) -> Row:
-    """The row of one simulated flight by one tool; `peer` is `None`: jaxos4."""
+    """The row of one simulated flight by one tool, in shares of the truth; `peer` is `None`: jaxos4."""
     if flight is None:
-        return {"lost": True}
+        return {"result": LOST}
     if peer is None:
         row = fit("filter-error", flight, case.vehicle, i)
-        warnings = [*row.pop("doubts", []), *([] if row["result"] == "successful" else [row["result"]])]
-        return row | {"warnings": warnings}
+        return row | {"warnings": row.pop("doubts") + [row["result"]] * (row["result"] != "successful")}
     log = Log.of(Recording.of(flight, "flight"), given_airframe(case.vehicle, i), commands=case.commands)
-    found, row = timed(peer, log, setting)
-    return row if found is None else row | shares(found, np.asarray(case.vehicle.inertia))
+    row, found = fitted(peer, log, setting)
+    if found is None:
+        return row
+    truth = np.asarray(case.vehicle.inertia)
+    pairs = zip(INERTIAS, (found.inertia / truth - 1).tolist(), (found.std / truth).tolist(), strict=True)
+    return row | {name: {"error": error, "std": std} for name, error, std in pairs}
 
 
 def measured(folder: Path | None, name: str, peer: Any, setting: Row) -> Row:
     """The row of one real flight by one tool: estimates and standard deviations [kg m^2]."""
     recording, (_, airframe, _, logged, _) = real(folder, name), REAL[name]
-    if peer is not None:
-        log = Log.of(recording, airframe, commands=logged == "commands")
-        found, row = timed(peer, log, setting)
-        if found is None:
-            return row
-        pairs = zip(found.inertia.tolist(), found.std.tolist(), strict=True)
-        return row | {n: {"estimate": x, "std": s} for n, (x, s) in zip(INERTIAS, pairs, strict=True)}
-    begin = time.perf_counter()
-    try:
-        found = jaxos4.identify(recording, airframe, settings=jaxos4.VehicleSettings(holdout=0.0))
-    except InputError as error:
-        return {"warnings": [str(error)], "seconds": time.perf_counter() - begin}
-    row: Row = {"warnings": [*map(str, found.issues)], "seconds": time.perf_counter() - begin}
-    known = found.rigid_body.constants
-    return row | {n: {"estimate": known[n].estimate, "std": known[n].std} for n in INERTIAS if n in known}
+    if peer is None:
+        row, found = identified(recording, airframe, settings=jaxos4.VehicleSettings(holdout=0.0))
+        return row | {"warnings": row.pop("doubts")} | ({} if found is None else constants(found))
+    row, found = fitted(peer, Log.of(recording, airframe, commands=logged == "commands"), setting)
+    if found is None:
+        return row
+    pairs = zip(INERTIAS, found.inertia.tolist(), found.std.tolist(), strict=True)
+    return row | {name: {"estimate": value, "std": std} for name, value, std in pairs}
 
 
 def best(rows: list[Row], tool: str, settings: tuple[Row, ...], air: str) -> int:
@@ -110,14 +109,10 @@ def figures(rows: list[Row]) -> Iterator[str]:
     for name in INERTIAS:
         error, std = (np.array([row[name][key] for row in rows if name in row]) for key in ("error", "std"))
         covered += (np.abs(error) <= NINETY_FIVE * std).tolist()
-        if not error.size:
-            yield from ("", "")
-            continue
-        apart = f" +- {100 * error.std(ddof=1) / np.sqrt(error.size):.2g}" if error.size > 1 else ""
-        yield f"{100 * error.mean():.2g}{apart}"
-        yield f"{100 * np.sqrt(np.mean(error**2)):.2g}"
-    share, flights = float(np.mean(covered)) if covered else 0.0, max(len(rows), 1)
-    yield f"{100 * share:.0f} +- {100 * covered_error(share, flights):.0f}" if covered else ""
+        known = statistics(error, std) if error.size else None
+        yield from (plus_minus(known), f"{100 * known['rmse']:.2g}") if known else ("", "")
+    share = float(np.mean(covered)) if covered else 0.0
+    yield f"{100 * share:.0f} +- {100 * covered_error(share, len(rows)):.0f}" if covered else ""
     yield f"{100 * np.mean([bool(row['warnings']) for row in rows]):.0f}"
     yield f"{np.median([row['seconds'] for row in rows]):.1f}"
 
@@ -134,7 +129,9 @@ def print_report(
     groups |= {f"all {air}": [case for case in groups if every[case].calm == (air == "calm")] for air in TUNED_ON}
     lines = []
     for (group, kinds), tool in itertools.product(groups.items(), (OURS, *tools)):
-        rows = [row for row in report["rows"] if row["case"] in kinds and row["tool"] == tool and "lost" not in row]
+        rows = [
+            row for row in report["rows"] if row["case"] in kinds and row["tool"] == tool and row.get("result") != LOST
+        ]
         if rows:
             lines.append((group, tool, str(len(rows)), *figures(rows)))
     errors = [f"{name} {what} [%]" for name in INERTIAS for what in ("mean", "RMS")]
@@ -143,8 +140,7 @@ def print_report(
     lines = []
     for row in report["real"]:
         scale = 10.0 ** np.floor(np.log10(REAL[row["flight"]][1].inertia[0]))
-        values = [row.get(name) for name in INERTIAS]
-        cells = [f"{x['estimate'] / scale:.2f} +- {NINETY_FIVE * x['std'] / scale:.2f}" if x else "" for x in values]
+        cells = [interval(row.get(name), 1 / scale) for name in INERTIAS]
         reference = REAL[row["flight"]][4]
         known = ", ".join(f"{reference[name] / scale:.2f}" for name in INERTIAS if name in reference)
         warned = "yes" if row["warnings"] else "no"
@@ -154,17 +150,22 @@ def print_report(
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of simulated flights in each row.")] = 20,
-    tuning: Annotated[int, typer.Option(help="Number of flights of a kind by which settings are chosen.")] = 1,
-    duration: Annotated[float, typer.Option(help="Length of a simulated flight [s].")] = 20.0,
-    seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 65,
-    only: Annotated[list[str] | None, typer.Option(help="Kinds of simulated flights; all by default.")] = None,
-    tools: Annotated[list[str], typer.Option(help="jaxos4 and the peers.")] = (OURS, *PEERS),
-    recorded: Annotated[list[str], typer.Option(help="Real flights; - for none.")] = tuple(REAL),
-    recordings: Annotated[Path | None, typer.Option(help="Folder of real flights; by default $JAXOS4_FLIGHTS.")] = None,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+    flights: int = 20,
+    tuning: int = 1,
+    duration: float = 20.0,
+    seed: int = 65,
+    only: list[str] | None = None,
+    tools: list[str] = (OURS, *PEERS),
+    recorded: list[str] = tuple(REAL),
+    recordings: Path | None = None,
+    out: Path | None = None,
 ) -> None:
-    """Fit the same flights by each tool."""
+    """Fit the same flights by each tool.
+
+    - `tuning`: Number of flights of a kind by which settings are chosen.
+    - `only`: Kinds of simulated flights; all by default. `tools`: jaxos4 and the peers.
+    - `recorded`: Real flights; - for none. `recordings`: Folder of real flights; by default $JAXOS4_FLIGHTS.
+    """
     report = continued(out, {"duration": duration, "seed": seed, "tuning": tuning}, "rows")
     for part in ("chosen", "real"):
         report.setdefault(part, [])
@@ -198,11 +199,11 @@ def main(
     compared = [name for name in tools if name == OURS or name in peers]
     trials = ({"case": c, "flight": i, "tool": t} for i in range(flights) for c in wanted for t in compared)
     fill(out, report, report["rows"], trials, row_of)
-    trials = ({"flight": name, "tool": tool} for name in recorded if name in REAL for tool in compared)
 
     def real_row(flight: str, tool: str) -> Row:
         return measured(recordings, flight, peers.get(tool), chosen(tool, "gusts") if tool in peers else {})
 
+    trials = product(flight=[name for name in recorded if name in REAL], tool=compared)
     fill(out, report, report["real"], trials, real_row)
     report["rows"].sort(key=lambda row: wanted.index(row["case"]))
     print_report(report, every, peers, duration, chosen)

@@ -4,25 +4,26 @@ import shutil
 import tomllib
 from html import escape
 from pathlib import Path
-from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
-import typer
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 import jaxos4
+from experiments.drawing import rendered
+from experiments.real_flights import PENDULUM
+from jaxos4._files import write_file
 from jaxos4.estimators.solver import before_search
 from jaxos4.identification.verdict import ADVICE
+from jaxos4.report.identification_figures import vehicle
+from jaxos4.report.matplotlib_figures import draw, drawing
+from jaxos4.report.style import style
 from jaxos4.results import NINETY_FIVE
 
 BLUE, ORANGE, INK, GREY = "#0072b2", "#d55e00", "#1b1e23", "#b9bec6"
 PICTURES = ("estimate", "halving", "sweeps", "floors", "real", "page")
-PENDULUM = {"Ix": 7.21e-4, "Iy": 7.76e-4, "Iz": 8.86e-4}  # of the CineRat, by its authors [kg m^2], to 7 %
 ROOMS = {
     "cli": "reads the arguments, calls the library, prints",
     "report": "tables, figures, HTML pages",
@@ -191,7 +192,10 @@ def real_picture(found: jaxos4.Identification) -> Figure:
     """A real flight of the CineRat: the vehicle, rates that were not fitted, moments of inertia with their verdicts."""
     figure = Figure(figsize=(9.6, 3.0), layout="constrained")
     above, rates, bars = figure.subfigures(1, 3, width_ratios=(0.75, 1.35, 1.3))
-    draw_from_above(above.subplots(), found.airframe)
+    axes = above.subplots()
+    draw(vehicle(found.airframe, {}, (), style(0)).panels[0], axes)
+    axes.set(title="3-inch quadrotor, 43 s")
+    axes.axis("off")
     ahead = found.predictions
     first = found.provenance.sample_time * ahead.start[: ahead.breaks[0]]  # the part that was not fitted first [s]
     for axes, rate in zip(rates.subplots(2, sharex=True), "pq", strict=True):
@@ -215,21 +219,6 @@ def real_picture(found: jaxos4.Identification) -> Figure:
     return figure
 
 
-def draw_from_above(axes, airframe: jaxos4.Airframe) -> None:
-    """Arms and rotors of a vehicle, front up; arrows in which the rotors turn."""
-    for number, ((x, y), spin) in enumerate(zip(airframe.rotor_positions, airframe.rotor_spins, strict=True), start=1):
-        x, y, radius = 1e3 * float(x), 1e3 * float(y), 34.0  # mm
-        axes.plot([0, -y], [0, x], color=GREY, lw=4, zorder=0)
-        axes.add_patch(Circle((-y, x), radius, facecolor="white", edgecolor=INK, lw=1.1))
-        turn = np.radians(np.linspace(200, 200 + 280 * float(spin), 60))
-        arc = 0.72 * radius * np.stack([np.cos(turn), np.sin(turn)], axis=1) + [-y, x]
-        axes.plot(*arc.T, color=BLUE, lw=1.2)
-        axes.annotate("", arc[-1], arc[-8], arrowprops={"arrowstyle": "-|>", "color": BLUE, "shrinkA": 0})
-        axes.text(-y, x, str(number), ha="center", va="center", fontweight="bold")
-    axes.set(aspect="equal", title="3-inch quadrotor, 43 s")
-    axes.axis("off")
-
-
 def page_picture(page: Path, picture: Path) -> None:
     """The top of a page of `jaxos4 estimate --report` as a browser shows it, as PNG."""
     from playwright.sync_api import sync_playwright  # brings no browser, and only this picture needs it
@@ -242,13 +231,19 @@ def page_picture(page: Path, picture: Path) -> None:
 
 
 def main(
-    out: Annotated[Path, typer.Argument(help="The folder to write to.")],
-    only: Annotated[list[str] | None, typer.Option(help=f"Some of {', '.join(PICTURES)}; all by default.")] = None,
-    pyproject: Annotated[Path, typer.Option(help="Where the floors are written.")] = Path("pyproject.toml"),
-    result: Annotated[Path | None, typer.Option(help="For `real`: README's result of the CineRat.")] = None,
-    page: Annotated[Path | None, typer.Option(help="For `page`: README's page of the simulated flight.")] = None,
+    out: Path,
+    only: list[str] | None = None,
+    pyproject: Path = Path("pyproject.toml"),
+    result: Path | None = None,
+    page: Path | None = None,
 ) -> None:
-    """Draws the pictures of the documentation."""
+    """Draws the pictures of the documentation.
+
+    - `out`: The folder to write to. `only`: Some of estimate, halving, sweeps, floors, real, page; all by default.
+    - `pyproject`: Where the floors are written.
+    - `result`: For `real`: README's result of the CineRat.
+    - `page`: For `page`: README's page of the simulated flight.
+    """
     chosen = only or list(PICTURES)
     for name, needed, given in (("real", "--result", result), ("page", "--page", page)):
         if name in chosen and given is None:
@@ -268,19 +263,7 @@ def main(
             "halving": lambda: halving_picture(problem, estimate),
             "sweeps": lambda: sweeps_picture(model, problem, bracket, estimate),
         }
-    look = {
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.titlesize": 10,
-        "font.size": 9,
-        "grid.color": "#e3e5e9",
-        "legend.frameon": False,
-        "savefig.facecolor": "white",
-        "svg.hashsalt": "jaxos4",
-    }
-    with mpl.rc_context(look):
-        for name, draw in drawings.items():
-            if name in chosen:
-                draw().savefig(out / f"{name}.svg", metadata={"Date": None})
+    for name, draw_picture in drawings.items():
+        if name in chosen:
+            with drawing():
+                write_file(out / f"{name}.svg", rendered(draw_picture(), "svg"))

@@ -6,112 +6,84 @@ in double precision, and networks are trained in it. Estimators that see the rat
 
 import io
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
+import equinox as eqx
 import jax
 import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, count_results, in_words, print_table, write_report
-from experiments.shared import PARAMETERS, brackets_around, identify, measure
+from experiments.monte_carlo import Column, Row, count_results, print_rows, product, write_report
+from experiments.shared import EFFICIENCY, Fit, brackets_around, identify, measure
 from jaxos4._custom_types import as_float
 from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.networks import encode_network
 
-MODEL, DT = jaxos4.PublishedOS4, 0.01
+PRECISIONS = ("float64", "float32")
+COLUMNS: dict[str, Column] = {
+    "estimator": "estimator",
+    "precision": "precision",
+    **EFFICIENCY,
+    "covered": "covered",
+    "largest difference": "largest_difference",
+    "results": "results",
+}
 
 
-class Case(NamedTuple):
-    """The inputs of all flights, the scale of their noise, and whether their start at rest is known."""
+def answers(network: bytes, name: str, *data: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Parameters, half-widths of the 95 % intervals and results of all flights, in the current precision.
 
-    omega: np.ndarray
-    scale: float
-    known: bool
-
-    def problem(self, states: np.ndarray, channels: str) -> jaxos4.ShootingProblem:
-        """The problem of a flight, in the current precision."""
-        flight = jaxos4.Flight(DT * np.arange(len(states)), self.omega, states)
-        start, sigma = np.zeros(12) if self.known else None, self.scale * jaxos4.SENSOR_SIGMA
-        return jaxos4.ShootingProblem(MODEL(jaxos4.OS4), flight, sigma=sigma, initial_state=start, channels=channels)
-
-
-class Answers(NamedTuple):
-    """Parameters of all flights, the half-widths of their 95 % intervals, and the names of the results."""
-
-    parameters: np.ndarray
-    half_width: np.ndarray
-    results: np.ndarray
-
-    @classmethod
-    def of(
-        cls, estimator: Any, problem: jaxos4.ShootingProblem, brackets: jaxos4.Bracket, states: np.ndarray
-    ) -> "Answers":
-        """The answers in the current precision."""
-        found = identify(estimator, problem, jax.tree.map(as_float, brackets), as_float(states))
-        if found.parameters.dtype != jax.numpy.result_type(float):
-            raise TypeError(f"the estimates are of {found.parameters.dtype}")
-        return cls(*map(np.asarray, (found.parameters, found.half_width(0.95))), jaxos4.result_names(found.result))
-
-    def summary(self, double: "Answers", truth: np.ndarray, bound: np.ndarray) -> dict[str, Any]:
-        """A row of the table. Differences from the answers in `double` precision are in multiples of the bound."""
-        error = self.parameters.astype(np.float64) - truth
-        return {
-            "efficiency": np.sqrt(np.mean((error / bound) ** 2, axis=0)).tolist(),
-            "covered": float(np.mean(np.abs(error) < self.half_width)),
-            "largest_difference": float(np.abs((self.parameters - double.parameters) / bound).max()),
-            "results": count_results(self.results),
-        }
+    `data`: problem, brackets and states.
+    """
+    loaded = jaxos4.load_network(io.BytesIO(network)) if ESTIMATORS[name].needs_network else None
+    data = jax.tree.map(lambda x: as_float(x) if eqx.is_inexact_array_like(x) else x, data)
+    found = identify(make_estimator(name, loaded), *data)
+    if found.parameters.dtype != jax.numpy.result_type(float):
+        raise TypeError(f"the estimates are of {found.parameters.dtype}")
+    half_width = np.asarray(found.half_width(0.95))
+    return np.asarray(found.parameters, dtype=np.float64), half_width, jaxos4.result_names(found.result)
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of flights.")] = 256,
-    seed: Annotated[int, typer.Option(help="Random seed for noise and brackets; networks: seed 0.")] = 0,
-    estimators: Annotated[list[str], typer.Option(help="Estimators, by name.")] = tuple(ESTIMATORS),
-    scale: Annotated[float, typer.Option(help="Noise, in multiples of the standard sensors'.")] = 1.0,
+    flights: int = 256,
+    seed: int = 0,
+    estimators: list[str] = tuple(ESTIMATORS),
+    scale: float = 1.0,
     known: Annotated[bool, typer.Option("--known/--free", help="Whether the initial state is known.")] = True,
-    steps: Annotated[int, typer.Option(help="Training steps of the network.")] = jaxos4.NetworkEstimator.steps,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+    steps: int = jaxos4.NetworkEstimator.steps,
+    out: Path | None = None,
 ) -> None:
     """RMSE / Cramer-Rao bound of each estimator in double and in single precision."""
-    model, (noise_key, bracket_key) = MODEL(jaxos4.OS4), jax.random.split(jax.random.key(seed))
-    exact = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=DT)
-    truth, flown, case = np.asarray(model.alpha), np.asarray(exact.states), Case(np.asarray(exact.omega), scale, known)
+    on_rates = Fit(jaxos4.IBSS(), channels="rates", known=known)
+    fits = {name: on_rates._replace(channels=ESTIMATORS[name].looks_at, scale=scale) for name in estimators}
+    problems = {name: fit.problem for name, fit in fits.items()}
+    standard, (noise_key, bracket_key) = on_rates.problem, jax.random.split(jax.random.key(seed))
     noise = jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
-    states = np.asarray(measure(noise, exact, jax.random.split(noise_key, flights)))
-    brackets = jax.tree.map(np.asarray, brackets_around(model, jax.random.split(bracket_key, flights)))
-    network = b""
+    states = np.asarray(measure(noise, standard.flight, jax.random.split(noise_key, flights)))
+    brackets = jax.tree.map(np.asarray, brackets_around(standard.model, jax.random.split(bracket_key, flights)))
+    network, truth = b"", np.asarray(standard.model.alpha)
     if any(ESTIMATORS[name].needs_network for name in estimators):
-        standard, bracket = case._replace(scale=1.0).problem(flown, "rates"), jaxos4.Bracket.default(model)
-        trained = jaxos4.NetworkEstimator(steps=steps).fit(standard, bracket, key=jax.random.key(0))
-        network = encode_network(trained)
-
-    bounds, found = {}, {}
-    for name in estimators:
-        bound = jaxos4.cramer_rao_bound(case.problem(flown, ESTIMATORS[name].looks_at), model.alpha)
-        bounds[name] = np.sqrt(np.diagonal(bound))
-    for precision in ("float64", "float32"):
+        training, bracket = jaxos4.NetworkEstimator(steps=steps), jaxos4.Bracket.default(standard.model)
+        network = encode_network(training.fit(standard, bracket, key=jax.random.key(0)))
+    bounds = {name: np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(one, truth))) for name, one in problems.items()}
+    found = {}
+    for precision in PRECISIONS:
         jax.clear_caches()  # JAX finds what it has traced in the other precision
         with jax.enable_x64(precision == "float64"):
-            for name in estimators:
-                loaded = jaxos4.load_network(io.BytesIO(network)) if ESTIMATORS[name].needs_network else None
-                problem = case.problem(np.zeros_like(flown), ESTIMATORS[name].looks_at)
-                found[name, precision] = Answers.of(make_estimator(name, loaded), problem, brackets, states)
+            for name, problem in problems.items():
+                found[name, precision] = answers(network, name, problem, brackets, states)
     report: Row = {"flights": flights, "seed": seed, "scale": scale, "known": known, "version": jaxos4.__version__}
-    report["rows"] = [
-        {"estimator": name, "precision": precision}
-        | found[name, precision].summary(found[name, "float64"], truth, bounds[name])
-        for name in estimators
-        for precision in ("float64", "float32")
-    ]
-    cells = (
-        (
-            *(row["estimator"], row["precision"], *(f"{x:.3g}" for x in row["efficiency"])),
-            *(f"{row['covered']:.3f}", f"{row['largest_difference']:.2g}", in_words(row["results"])),
-        )
-        for row in report["rows"]
-    )
+    report["rows"] = []
+    for case in product(estimator=estimators, precision=PRECISIONS):
+        name, (parameters, half_width, results) = case["estimator"], found[tuple(case.values())]
+        row = {
+            "efficiency": np.sqrt(np.mean(((parameters - truth) / bounds[name]) ** 2, axis=0)).tolist(),
+            "covered": float(np.mean(np.abs(parameters - truth) < half_width)),
+            "largest_difference": float(np.abs((parameters - found[name, "float64"][0]) / bounds[name]).max()),
+            "results": count_results(results),
+        }
+        report["rows"].append(case | row)
     title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
-    headings = "estimator", "precision", *PARAMETERS, "covered", "largest difference", "results"
-    print_table(title, headings, cells, width=170)
+    print_rows(title, report["rows"], COLUMNS)
     write_report(out, report)

@@ -6,15 +6,14 @@ same behind a low-pass filter). Both are whitened by their innovations model, AR
 zeros are real and searched; the rest is linear regression. The true gain is 1.
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import typer
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 import jaxos4
-from experiments.monte_carlo import print_table
+from experiments.monte_carlo import plus_minus, print_table, statistics
 from experiments.rotorpy.flights import VEHICLE, fly
 
 # Time constants of poles, then of zeros, at which searches start, in samples.
@@ -61,23 +60,18 @@ def thrust_of(flight: jaxos4.Flight) -> np.ndarray:
     return float(VEHICLE.thrust_coefficient) / float(VEHICLE.mass) * np.square(flight.omega).sum(axis=1)
 
 
-def main(
-    flights: Annotated[int, typer.Option(help="Number of flights.")] = 20,
-    gust: Annotated[float, typer.Option(help="Standard deviation of the wind along each axis [m/s].")] = 1.5,
-    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
-    seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 48,
-) -> None:
-    """Fit the scale of the thrust of RotorPy's Hummingbird in gusts."""
-    flown = [fly(gust, duration, 1000 * seed + i) for i in range(flights)]
+def main(flights: int = 20, gust: float = 1.5, duration: float = 20.0, seed: int = 48) -> None:
+    """Fit the scale of the thrust of RotorPy's Hummingbird in gusts.
+
+    - `gust`: Standard deviation of the wind along each axis [m/s].
+    """
+    flown = [fly(gust, duration, seed, i) for i in range(flights)]
     found = {order: [fit(np.asarray(f.specific_force)[:, 2], thrust_of(f), order) for f in flown] for order in STARTS}
     lines = []
     for order, fits in found.items():
-        error = np.array([one.gain - 1 for one in fits])
-        apart = np.abs(error) / [one.std for one in fits]
+        error, std = np.array([(one.gain - 1, one.std) for one in fits]).T
         better = np.array([one.likelihood - first.likelihood for one, first in zip(fits, found[1], strict=True)])
-        mean = f"{100 * error.mean():.1f} +- {100 * error.std() / np.sqrt(flights):.1f}"
-        lines.append(
-            (f"{order}", mean, f"{np.median(apart):.1f}", f"{100 * np.mean(apart < 1.96):.0f}", f"{better.mean():.0f}")
-        )
+        row, apart = statistics(error, std), f"{np.median(np.abs(error) / std):.1f}"
+        lines.append((str(order), plus_minus(row), apart, f"{100 * row['covered']:.0f}", f"{better.mean():.0f}"))
     headings = "order", "thrust too large [%]", "median error / std", "95 % intervals that hold [%]", "log-likelihood"
     print_table(f"scale of the thrust by the disturbance, {flights} flights", headings, lines)

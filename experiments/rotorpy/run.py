@@ -7,20 +7,16 @@ and measured rotor speeds. RotorPy's vehicle has effects that the model has othe
 """
 
 import functools
-import itertools
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.fits import fit, print_summaries, summary
-from experiments.monte_carlo import Row, continued, fill, monte_carlo, print_table
-from experiments.rotorpy.flights import GUSTS, VEHICLE, recorded
-from experiments.rotorpy.predictions import QUANTITIES, prediction
+from experiments.fits import INERTIAS, fit, given_airframe, print_summaries, whole
+from experiments.monte_carlo import Row, print_table, product, study
+from experiments.rotorpy.flights import GUSTS, VEHICLE, quad_params, recorded
 
-KINDS, ESTIMATORS = tuple(GUSTS), ("filter-error", "ibss", "hybrid")
+QUANTITIES = ("position", "velocity", "attitude", "rates")
 
 
 def read(recordings: Path, settings: Row, kind: str, *, captured: bool = False) -> list[jaxos4.Flight]:
@@ -30,30 +26,57 @@ def read(recordings: Path, settings: Row, kind: str, *, captured: bool = False) 
     return [jaxos4.read_flight(path) for path in paths]
 
 
-def predicted(out: Path | None, settings: Row, recordings: Path) -> list[Row]:
-    """Predictions of each gusty flight by the vehicle of the one before; continued if `out` exists."""
-    report, known = continued(out, settings, "predictions"), read(recordings, settings, "gusty", captured=True)
-    numbers = ({"flight": i} for i in range(settings["flights"]))
-    fill(out, report, report["predictions"], numbers, lambda flight: prediction(known, flight))
-    return report["predictions"]
+def true_parameters(vehicle: jaxos4.forecast.Vehicle) -> np.ndarray:
+    """RotorPy's vehicle as parameters of the model: all but its drag of second order and its translational lift."""
+    gain = float(VEHICLE.thrust_coefficient / vehicle.model.airframe.thrust_coefficient)
+    inertia, places = np.asarray(VEHICLE.inertia), np.asarray(VEHICLE.rotor_positions)
+    speeds = 4 * float(VEHICLE.hover_speed)
+    x, y = np.square(places).mean(axis=0)
+    # The axial drag of the rotors damps roll and pitch, and that in their plane damps yaw.
+    damping = (
+        speeds * np.array([quad_params["k_z"] * y, quad_params["k_z"] * x, quad_params["k_d"] * (x + y)]) / inertia
+    )
+    known = dict(zip([f"alpha{i}" for i in range(1, 9)], np.asarray(jaxos4.CorrectedOS4(VEHICLE).alpha), strict=True))
+    known |= {name: gain / moment for name, moment in zip(INERTIAS.values(), inertia, strict=True)}
+    known |= dict(zip(("roll_damping", "pitch_damping", "yaw_damping"), damping, strict=True)) | {"thrust_gain": gain}
+    drag = zip("xyz", ("k_d", "k_d", "k_z"), strict=True)
+    known |= {f"{axis}_drag": speeds * quad_params[name] / float(VEHICLE.mass) for axis, name in drag}
+    return np.array([float(known.get(name, 0.0)) for name in vehicle.model.parameter_names])
+
+
+def prediction(flights: list[jaxos4.Flight], i: int, horizon: float = 0.5) -> Row:
+    """Identify flight `i` and predict the next one. Errors and shares inside the 95 % band at the horizon."""
+    flight, other = flights[i], flights[(i + 1) % len(flights)]
+    found = jaxos4.identify(flight, given_airframe(VEHICLE, i), settings=whole(flight), estimator="filter-error")
+    vehicle = jaxos4.forecast.vehicle_of(found)
+    true = vehicle._replace(parameters=true_parameters(vehicle), covariance=0 * vehicle.covariance)
+    own, best = (jaxos4.predict(each, other, horizon=horizon).quality for each in (vehicle, true))
+    row: Row = {"result": found.result}
+    for name in QUANTITIES:
+        row[name] = {"error": own[name].error[-1], "true": best[name].error[-1], "held": own[name].coverage[-1]}
+    return row
 
 
 def main(
-    recordings: Annotated[Path, typer.Argument(help="Folder of the flights. Those that are missing are flown.")],
-    flights: Annotated[int, typer.Option(help="Number of flights of each kind.")] = 20,
-    kinds: Annotated[list[str], typer.Option(help="calm, gusty")] = KINDS,
-    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
-    seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 21,
-    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = ESTIMATORS,
-    predict: Annotated[
-        bool, typer.Option(help="Identify each gusty flight, with motion capture, and predict the next 0.5 s ahead.")
-    ] = False,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+    recordings: Path,
+    flights: int = 20,
+    kinds: list[str] = tuple(GUSTS),
+    duration: float = 20.0,
+    seed: int = 21,
+    estimators: list[str] = ("filter-error", "ibss", "hybrid"),
+    predict: bool = False,
+    out: Path | None = None,
 ) -> None:
-    """Fly and identify RotorPy's Hummingbird."""
+    """Fly and identify RotorPy's Hummingbird.
+
+    - `recordings`: Folder of the flights. Those that are missing are flown.
+    - `kinds`: calm, gusty.
+    - `predict`: Identify each gusty flight, with motion capture, and predict the next 0.5 s ahead.
+    """
     settings = {"flights": flights, "duration": duration, "seed": seed}
     if predict:
-        rows = predicted(out, settings, recordings)
+        known, trials = read(recordings, settings, "gusty", captured=True), product(flight=range(flights))
+        rows = study(out, settings, trials, lambda flight: prediction(known, flight), rows="predictions")
         headings = "", "error", "of the true parameters", "ratio", "inside the 95 % band [%]"
         means = {name: np.mean([list(row[name].values()) for row in rows], axis=0) for name in QUANTITIES}
         cells = [
@@ -63,10 +86,10 @@ def main(
         print_table("0.5 s ahead", headings, cells)
         return
 
-    def row_of(flight: jaxos4.Flight, i: int, kind: str, estimator: str) -> Row:
-        return fit(estimator, flight, VEHICLE, i)
-
-    cases = [{"kind": kind, "estimator": name} for kind, name in itertools.product(kinds, estimators)]
     flown = functools.cache(lambda kind: read(recordings, settings, kind))
-    report = monte_carlo(out, settings, cases, lambda kind, **_: flown(kind), row_of, summary)
-    print_summaries(f"RotorPy's Hummingbird, flights of {duration:g} s", report)
+
+    def row_of(kind: str, estimator: str, flight: int) -> Row:
+        return fit(estimator, flown(kind)[flight], VEHICLE, flight)
+
+    rows = study(out, settings, product(kind=kinds, estimator=estimators, flight=range(flights)), row_of)
+    print_summaries(f"RotorPy's Hummingbird, flights of {duration:g} s", rows)

@@ -10,32 +10,18 @@ references changed only where the log has a row, commands would change little in
 for n runs of the controller is late by (n - 1) / 2 runs: the true delay of the rotors is then negative.
 """
 
-import functools
-import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
 
 import equinox as eqx
 import jax
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, covered_error, monte_carlo, print_table, results_of
+from experiments.fits import identified
+from experiments.monte_carlo import Row, groups, plus_minus, print_table, product, results_of, statistics, study
 from jaxos4.recording import Recording
-from jaxos4.results import NINETY_FIVE
 
-VEHICLE = jaxos4.Airframe(
-    mass=0.428,
-    inertia=(6.3e-4, 7.5e-4, 8.9e-4),
-    rotor_positions=[(-0.0455, -0.0635), (0.0455, -0.0635), (-0.0455, 0.0635), (0.0455, 0.0635)],
-    rotor_spins=(-1.0, 1.0, 1.0, -1.0),
-    thrust_coefficient=2.66e-7,
-    drag_coefficient=2.66e-9,
-    rotor_inertia=9e-7,
-    max_rotor_speed=4100.0,
-)
+VEHICLE = jaxos4.load_airframe(Path(__file__).with_name("cinerat.toml"))
 SAMPLE_TIMES = (0, 0.004, 0.008, 0.016, 0.032)
 LAG, PERIOD = 0.025, 0.004  # of rotors and controller [s]
 TRUTH = {
@@ -69,17 +55,14 @@ def fly(logged: str, dt: float, duration: float, gust: float, noise: float, seed
 
 def fit(flight: jaxos4.Flight, sample_time: float) -> Row:
     """The answer at one sample time: value and standard deviation of each quantity."""
-    begin = time.perf_counter()
-    settings = jaxos4.VehicleSettings(sample_time=sample_time or None, holdout=0.0)
-    found = jaxos4.identify(flight, VEHICLE, settings=settings)
-    known = {name: (row.estimate, row.std) for name, row in found.rigid_body.constants.items()}
-    known |= {name: (row.estimate, row.std) for name, row in found.parameters.items() if name in TRUTH}
-    return {
-        "result": found.result,
-        "sample_time": found.provenance.sample_time,
-        "seconds": time.perf_counter() - begin,
-        "found": {name: pair for name, pair in known.items() if None not in pair},
-    }
+    row, found = identified(
+        flight, VEHICLE, settings=jaxos4.VehicleSettings(sample_time=sample_time or None, holdout=0.0)
+    )
+    if found is None:
+        return row | {"found": {}}
+    known = {name: one for name, one in (found.parameters | found.rigid_body.constants).items() if name in TRUTH}
+    pairs = {name: (one.estimate, one.std) for name, one in known.items() if None not in (one.estimate, one.std)}
+    return row | {"sampled": found.provenance.sample_time, "found": pairs}
 
 
 def truth_of(logged: str, dt: float) -> dict[str, float]:
@@ -89,54 +72,52 @@ def truth_of(logged: str, dt: float) -> dict[str, float]:
 
 
 def summary(rows: list[Row], true: dict[str, float]) -> dict[str, Row]:
-    """For each quantity: mean error with its Monte-Carlo error, and coverage. Shares of the truth if that is not 0."""
+    """The `statistics` of each quantity. Shares of the truth if that is not 0."""
     found = {}
     for name, truth in true.items():
         pairs = np.array([row["found"][name] for row in rows if name in row["found"]])
-        if len(pairs) < 2:
-            continue
-        error, scale = pairs[:, 0] - truth, (name not in UNITS and truth) or 1.0
-        covered = float(np.mean(np.abs(error) <= NINETY_FIVE * pairs[:, 1]))
-        found[name] = {
-            "flights": len(pairs),
-            "mean": float(error.mean() / scale),
-            "mean_error": float(error.std(ddof=1) / np.sqrt(len(pairs)) / scale),
-            "covered": covered,
-            "covered_error": covered_error(covered, len(pairs)),
-        }
+        if len(pairs) >= 2:
+            scale = (name not in UNITS and truth) or 1.0
+            found[name] = statistics((pairs[:, 0] - truth) / scale, pairs[:, 1] / scale)
     return found
 
 
-def table_rows(report: Row) -> Iterator[tuple[str, ...]]:
+def print_cases(rows: list[Row], true: dict[str, float]) -> None:
     """One line for each sample time and quantity."""
-    for case in report["cases"]:
-        for name, row in case["summary"].items():
+    lines = []
+    for (sample_time,), some in groups(rows, "sample_time").items():
+        for name, row in summary(some, true).items():
             factor, unit = UNITS.get(name, (100.0, "%"))
-            mean = f"{factor * row['mean']:.2g} +- {factor * row['mean_error']:.1g} {unit}"
-            covered = f"{100 * row['covered']:.0f} +- {100 * row['covered_error']:.0f}"
-            yield f"{1e3 * case['sample_time']:g}", name, str(row["flights"]), mean, covered, results_of(case)
+            mean, covered = f"{plus_minus(row, scale=factor)} {unit}", plus_minus(row, "covered")
+            lines.append((f"{1e3 * sample_time:g}", name, str(row["flights"]), mean, covered, results_of(some)))
+    headings = "ms", "", "flights", "mean error", "covered [%]", "results"
+    print_table("errors by sample time", headings, lines, width=120)
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of flights.")] = 40,
-    logged: Annotated[str, typer.Option(help="speeds or commands.")] = "speeds",
-    sample_times: Annotated[list[float], typer.Option(help="[s]; 0: the rule chooses.")] = SAMPLE_TIMES,
-    dt: Annotated[float, typer.Option(help="Sample time of the log [s].")] = 0.004,
-    noise: Annotated[float, typer.Option(help="Noise of rotor speeds, as a share of their median change.")] = 0.0,
-    gust: Annotated[float, typer.Option(help="Standard deviation of the gusts [rad/s^2].")] = 1.0,
-    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 60.0,
-    seed: Annotated[int, typer.Option(help="Random seed of the first flight; each has one more.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+    flights: int = 40,
+    logged: str = "speeds",
+    sample_times: list[float] = SAMPLE_TIMES,
+    dt: float = 0.004,
+    noise: float = 0.0,
+    gust: float = 1.0,
+    duration: float = 60.0,
+    seed: int = 0,
+    out: Path | None = None,
 ) -> None:
-    """Measure errors and coverage at several sample times."""
+    """Measure errors and coverage at several sample times.
+
+    - `logged`: speeds or commands. `dt`: Sample time of the log [s].
+    - `sample_times`: [s]; 0: the rule chooses.
+    - `noise`: Noise of rotor speeds, as a share of their median change.
+    - `gust`: Standard deviation of the gusts [rad/s^2].
+    - `seed`: Random seed of the first flight; each has one more.
+    """
     settings = {"logged": logged, "dt": dt, "noise": noise, "gust": gust, "duration": duration, "seed": seed}
     flown = [fly(logged, dt, duration, gust, noise, seed + i) for i in range(flights)]
-    cases = [{"sample_time": each} for each in sample_times]
 
-    def row_of(flight: jaxos4.Flight, i: int, sample_time: float) -> Row:
-        return fit(flight, sample_time)
+    def row_of(sample_time: float, flight: int) -> Row:
+        return fit(flown[flight], sample_time)
 
-    counted = functools.partial(summary, true=truth_of(logged, dt))
-    report = monte_carlo(out, settings, cases, lambda **_: flown, row_of, counted)
-    headings = "ms", "", "flights", "mean error", "covered [%]", "results"
-    print_table("errors by sample time", headings, table_rows(report), width=120)
+    rows = study(out, settings, product(sample_time=sample_times, flight=range(flights)), row_of)
+    print_cases(rows, truth_of(logged, dt))

@@ -12,9 +12,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from experiments.monte_carlo import print_table
 from experiments.shared import flight_files
@@ -52,12 +49,12 @@ def seconds_of(command: str, folder: Path, cache: Path) -> float:
     return time.perf_counter() - begin
 
 
-def main(
-    repeats: Annotated[int, typer.Option(help="Number of runs once more.")] = 3,
-    commands: Annotated[list[str], typer.Option(help="The commands.")] = COMMANDS,
-    flights: Annotated[Path | None, typer.Option(help="Folder of real flights; $JAXOS4_FLIGHTS by default.")] = None,
-) -> None:
-    """Time commands in processes of their own."""
+def main(repeats: int = 3, commands: list[str] = COMMANDS, flights: Path | None = None) -> None:
+    """Time commands in processes of their own.
+
+    - `repeats`: Number of runs once more. `commands`: The commands.
+    - `flights`: Folder of real flights; $JAXOS4_FLIGHTS by default.
+    """
     real = flight_files(flights, [REAL])[0] if flights or os.environ.get("JAXOS4_FLIGHTS") else None
     chosen = [*commands, *([f"estimate {REAL} --airframe crazyflie --report real.html"] if real else [])]
 

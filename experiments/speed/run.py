@@ -6,19 +6,25 @@ Double precision, on the device that JAX finds. Each time is the median of runs 
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
 import equinox as eqx
 import jax
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.monte_carlo import Row, machine, print_table, write_report
+from experiments.monte_carlo import Column, Row, machine, print_rows, write_report
 from experiments.shared import DT, standard_problem
 from jaxos4.simulation import METHODS
 
 STEPS = 500  # of the standard flight
+COLUMNS: dict[str, Column] = {
+    "measurement": "what",
+    "compile [s]": "compile_seconds",
+    "median [s]": "median_seconds",
+    "smallest [s]": "min_seconds",
+    "largest [s]": "max_seconds",
+    "M steps/s": lambda row: row["steps_per_second"] / 1e6,
+}
 
 
 def timed(function: Callable, *arguments, repeats: int) -> Row:
@@ -46,12 +52,11 @@ def slopes(problem: jaxos4.ShootingProblem, trials: jax.Array) -> tuple[jax.Arra
     return jax.vmap(lambda x: jax.jvp(problem.cost, (x,), (x,)))(trials)
 
 
-def main(
-    batch: Annotated[int, typer.Option(help="Number of shots in one call.")] = 4096,
-    repeats: Annotated[int, typer.Option(help="Number of runs for each time.")] = 7,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
-) -> None:
-    """Measure computing times."""
+def main(batch: int = 4096, repeats: int = 7, out: Path | None = None) -> None:
+    """Measure computing times.
+
+    - `batch`: Number of shots in one call.
+    """
     rows: list[Row] = []
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     trials = model.alpha * (1 + 0.1 * jax.random.normal(jax.random.key(0), (batch, 8)))
@@ -71,10 +76,7 @@ def main(
             return jax.vmap(lambda x: jaxos4.simulate(model, x, omega, dt=DT, method=method).states)(alphas)
 
         add(f"simulate, {method}", states, trials[:count], count=count)
-    seconds = "compile_seconds", "median_seconds", "min_seconds", "max_seconds"
-    cells = ((row["what"], *(f"{row[s]:.4g}" for s in seconds), f"{row['steps_per_second'] / 1e6:.1f}") for row in rows)
     provenance = machine()
     title = f"{STEPS} steps, float64, {provenance['device']}, {provenance['cores']} cores"
-    headings = "measurement", "compile [s]", "median [s]", "smallest [s]", "largest [s]", "M steps/s"
-    print_table(title, headings, cells, width=120)
+    print_rows(title, rows, COLUMNS)
     write_report(out, {"provenance": provenance, "rows": rows})

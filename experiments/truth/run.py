@@ -14,22 +14,17 @@ import os
 import runpy
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.fits import INERTIAS
-from experiments.monte_carlo import Row, continued, fill, print_table
-from experiments.verdicts.run import FAR, SURE, share
-from jaxos4.errors import InputError
+from experiments.fits import INERTIAS, identified
+from experiments.monte_carlo import Row, plus_minus, print_table, product, share, statistics, study
+from experiments.verdicts.run import FAR, SURE
 from jaxos4.identification.physical import physical_quantities
 from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED
-from jaxos4.recording import read_recording
 from jaxos4.results import NINETY_FIVE
 
 OTHERS = ("roll_damping", "pitch_damping", "yaw_damping", "z_drag", "thrust_gain")
@@ -79,17 +74,15 @@ def judged(case: Row, fly: Fly) -> Row:
 
     `missing`: the verdicts of moments of inertia without an estimate.
     """
-    begin = time.perf_counter()
-    row: Row = {"effect": case["effect"], "result": "refused", "quantities": {}, "missing": {}}
+    row: Row = {"effect": case["effect"], "quantities": {}, "missing": {}}
     with tempfile.TemporaryDirectory() as folder:
         fly(case, Path(folder))
         path = Path(folder) / case["name"]
         truth = json.loads(path.with_suffix(".truth.json").read_text(encoding="utf-8"))
-        try:
-            airframe = jaxos4.load_airframe(str(path.with_suffix(".toml")))
-            found = jaxos4.identify(read_recording(path.with_suffix(".csv"), airframe), airframe)
-        except InputError as error:
-            return row | {"why": str(error).replace(folder, ""), "seconds": time.perf_counter() - begin}
+        begun, found = identified(path.with_suffix(".csv"), jaxos4.load_airframe(str(path.with_suffix(".toml"))))
+    row |= begun
+    if found is None:
+        return row
     for each in physical_quantities(found):
         name = each.name.replace(" ", "_") + "_mm" * (each.unit == "mm")
         if name in truth and each.verdict is not None:
@@ -97,8 +90,7 @@ def judged(case: Row, fly: Fly) -> Row:
             row["quantities"][name] = {"truth": truth[name], "estimate": each.value, "std": each.std, **verdict}
     absent = (name for name in INERTIAS if name in found.verdicts and name not in row["quantities"])
     row["missing"] = {name: found.verdicts[name].status for name in absent}
-    notes = {"result": found.result, "notes": list(found.provenance.notes), "doubts": list(map(str, found.issues))}
-    return row | notes | {"seconds": time.perf_counter() - begin}
+    return row | {"notes": list(found.provenance.notes)}
 
 
 def errors_of(rows: list[Row], name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -137,19 +129,26 @@ def cell(row: Row, name: str) -> str:
     return f"{1 + off:.3f} {off / std:+.1f} {LETTERS[row['quantities'][name]['status']]}"
 
 
-def statistics(groups: dict[str, list[Row]]) -> Iterator[tuple[str, ...]]:
+def by_effect(groups: dict[str, list[Row]]) -> Iterator[tuple[str, ...]]:
     """For each group and moment of inertia: errors, their size in standard deviations, intervals and verdicts."""
     for effect, rows in groups.items():
         for name in INERTIAS:
             off, std = errors_of(rows, name)
             if not off.size:
                 continue
-            z, known = off / std, [row["quantities"][name]["status"] for row in rows if name in row["quantities"]]
-            held, trusted = int((np.abs(z) < NINETY_FIVE).sum()), sum(each in (IDENTIFIED, RESERVED) for each in known)
+            found, z = statistics(off, std), off / std
+            known = [row["quantities"][name]["status"] for row in rows if name in row["quantities"]]
+            trusted = sum(each in (IDENTIFIED, RESERVED) for each in known)
             yield (
-                *(effect, name, str(off.size), f"{100 * off.mean():.1f} +- {100 * off.std() / np.sqrt(off.size):.1f}"),
-                *(f"{z.mean():.2f} +- {z.std() / np.sqrt(z.size):.2f}", f"{np.sqrt(np.mean(z**2)):.2f}"),
-                *(share(held, off.size), f"{100 * NINETY_FIVE * np.median(std):.1f}", share(trusted, len(rows))),
+                *(
+                    effect,
+                    name,
+                    str(off.size),
+                    plus_minus(found),
+                    plus_minus(statistics(z, np.ones_like(z)), scale=1.0),
+                ),
+                *(f"{np.sqrt(np.mean(z**2)):.2f}", plus_minus(found, "covered"), f"{100 * found['width']:.1f}"),
+                share(trusted, len(rows)),
             )
 
 
@@ -176,23 +175,24 @@ def print_tables(rows: list[Row]) -> None:
     groups = {effect: [row for row in rows if row["effect"] == effect] for effect in (row["effect"] for row in rows)}
     several = {effect: some for effect, some in groups.items() if len(some) > 2}
     headings = "effect", "", "flights", "mean error [%]", "mean z", "rms z", "held [%]", "half-width [%]", "trusted [%]"
-    print_table("moments of inertia by effect", headings, statistics(several))
+    print_table("moments of inertia by effect", headings, by_effect(several))
     headings = "", "flights", "intervals that hold [%]", "of those identified [%]"
     print_table("damping and drag", headings, linearised(rows))
 
 
 def main(
-    truth: Annotated[Path | None, typer.Option(help="Folder of the simulator; $JAXOS4_TRUTH by default.")] = None,
-    cases: Annotated[list[str], typer.Option(help="Names of its cases; by default all, `none`: none.")] = (),
-    sag: Annotated[int, typer.Option(help="Flights of each vehicle and sag of the battery, commands logged.")] = 0,
-    clean: Annotated[int, typer.Option(help="Flights of each vehicle without a fault, speeds logged.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+    truth: Path | None = None, cases: list[str] = (), sag: int = 0, clean: int = 0, out: Path | None = None
 ) -> None:
-    """Judge answers against the truth of an independent simulator."""
+    """Judge answers against the truth of an independent simulator.
+
+    - `truth`: Folder of the simulator; $JAXOS4_TRUTH by default.
+    - `cases`: Names of its cases; by default all, `none`: none.
+    - `sag`: Flights of each vehicle and sag of the battery, commands logged.
+    - `clean`: Flights of each vehicle without a fault, speeds logged.
+    """
     known, fly = simulator(truth)
     if unknown := [name for name in cases if name not in (*known, "none")]:
         raise SystemExit(f"--cases: no {unknown[0]} in cases.jsonl; give one of {', '.join(known)}, or none.")
     chosen = {name: known[name] for name in cases or known if name in known} | studies(sag, clean)
-    report = continued(out, {"seed": SEED}, "rows")
-    fill(out, report, report["rows"], ({"case": name} for name in chosen), lambda case: judged(chosen[case], fly))
-    print_tables([row for row in report["rows"] if row["case"] in chosen])
+    rows = study(out, {"seed": SEED}, product(case=chosen), lambda case: judged(chosen[case], fly))
+    print_tables([row for row in rows if row["case"] in chosen])

@@ -8,18 +8,15 @@ for the right model and for wrong ones.
 import functools
 import math
 from pathlib import Path
-from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.closed_loop.effects import EFFECTS, GUST, flights_of
-from experiments.closed_loop.run import DELAY, LAG, VEHICLE
-from experiments.monte_carlo import Row, continued, fill, print_table
-from experiments.verdicts.run import LOST, agreements, print_responses, share
+from experiments.closed_loop.effects import DELAY, EFFECTS, GUST, LAG, VEHICLE, flights_of
+from experiments.monte_carlo import LOST, Row, print_table, share, study
+from experiments.verdicts.run import agreements, print_responses
 from jaxos4.airframe import MOTIONS
 from jaxos4.analysis.frequency_response import Agreement
 from jaxos4.identification.verdict import MAX_SHARE
@@ -29,6 +26,7 @@ from jaxos4.recording.prepared import prepare
 
 # Factors by which the torque of a wrong model is too weak: the gain is larger by as much.
 TOO_WEAK = (1.0, 1.12, 1.25, 1.5, 2.0)
+DESCRIBED = ("own gyro", "fast controller", "filters", "rotor speeds", "dropouts", "bad samples", "motors")
 
 
 def true_parameters(model: jaxos4.FlightModel, kind: str) -> jax.Array:
@@ -51,20 +49,19 @@ def answered(flight: jaxos4.Flight, kind: str) -> Row:
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of flights of each case.")] = 200,
-    gusts: Annotated[list[float], typer.Option(help="Their strengths, without other effects [rad/s^2].")] = (
-        *(2.5, 5.0, 10.0),
-    ),
-    effects: Annotated[list[str], typer.Option(help="Other effects, in gusts of 5 rad/s^2.")] = (
-        *("own gyro", "fast controller", "filters", "rotor speeds", "dropouts", "bad samples", "motors"),
-    ),
-    sample_times: Annotated[list[str], typer.Option(help="Those of the table.")] = ("4 ms", "8 ms"),
-    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
-    seed: Annotated[int, typer.Option(help="Random seed of references, gusts, noise and effects.")] = 48,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+    flights: int = 200,
+    gusts: list[float] = (2.5, 5.0, 10.0),
+    effects: list[str] = DESCRIBED,
+    sample_times: list[str] = ("4 ms", "8 ms"),
+    duration: float = 20.0,
+    seed: int = 48,
+    out: Path | None = None,
 ) -> None:
-    """Count how often the intervals of the frequency response hold 1 at the true parameters."""
-    report = continued(out, {"duration": duration, "seed": seed}, "rows")
+    """Count how often the intervals of the frequency response hold 1 at the true parameters.
+
+    - `gusts`: Their strengths, without other effects [rad/s^2]. `effects`: Other effects, in gusts of 5 rad/s^2.
+    - `sample_times`: Those of the table.
+    """
     kinds = [("gusts", gust) for gust in gusts] + [(kind, GUST) for kind in effects]
     flown = functools.cache(lambda kind, gust: flights_of(kind, flights, duration, seed, gust))
     trials = ({"kind": kind, "gust": gust, "flight": i} for kind, gust in kinds for i in range(flights))
@@ -73,9 +70,8 @@ def main(
         recorded = flown(kind, gust)[flight]
         return {"result": LOST} if recorded is None else answered(recorded, kind)
 
-    fill(out, report, report["rows"], trials, row_of)
     groups: dict[str, list[Row]] = {}
-    for row in report["rows"]:
+    for row in study(out, {"duration": duration, "seed": seed}, trials, row_of):
         name = f"gusts of {row['gust']:g}" if row["kind"] == "gusts" else row["kind"]
         for step in sample_times:
             own = row.get("responses", {}).get(step, {})

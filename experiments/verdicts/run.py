@@ -8,30 +8,24 @@ cause is right if a fault of `faults.py` is named as it is, wherever the answer 
 """
 
 import functools
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 import jaxos4
-from experiments.closed_loop.effects import ALL, EFFECTS, flights_of
-from experiments.closed_loop.run import VEHICLE
-from experiments.fits import INERTIAS, given_airframe, shares_of_truth
-from experiments.monte_carlo import Row, continued, fill, print_table
+from experiments.closed_loop.effects import ALL, EFFECTS, VEHICLE, flights_of
+from experiments.fits import INERTIAS, given_airframe, identified, shares_of_truth
+from experiments.monte_carlo import LOST, Row, plus_minus, print_table, share, statistics, study
 from experiments.verdicts.faults import FAULTS, Fault
 from jaxos4 import FrequencyResponse
 from jaxos4.airframe import MOTIONS
-from jaxos4.errors import InputError
 from jaxos4.identification.verdict import IDENTIFIED
 from jaxos4.recording import Recording
 from jaxos4.results import NINETY_FIVE
 
 JUDGED = "Ix", "Iy"
 SURE, FAR = 3.0, 0.12  # an answer beyond either is wrong: standard deviations, and share of the truth
-LOST = "lost"  # the result of a vehicle that turns over
 ROTORPY = {"RotorPy calm": "calm", "RotorPy gusts": "gusty"}
 CASES = {kind: (kind, None, 0.0) for kind in (*EFFECTS, ALL, *ROTORPY)}
 CASES |= {f"{name} {size:g}": ("gusts", fault, size) for name, fault in FAULTS.items() for size in fault.sizes}
@@ -50,22 +44,17 @@ def good_flights(
 
 def judged(vehicle: jaxos4.Airframe, flight: jaxos4.Flight, i: int, fault: Fault | None, size: float) -> Row:
     """The row of one flight. Errors and standard deviations are shares of the truth."""
-    begin, recording = time.perf_counter(), Recording.of(flight, "flight")
-    row: Row = {"result": "refused"}
-    try:
-        spoiled = recording if fault is None else fault.spoil(recording, size)
-        found = jaxos4.identify(spoiled, given_airframe(vehicle, i))
-    except InputError as error:
-        causes = [str(error)]
-    else:
-        row["result"] = found.result
-        causes = [*map(str, found.issues), *(r for v in found.verdicts.values() for r in v.reasons)]
-        causes += found.provenance.notes
+    recording = Recording.of(flight, "flight")
+    spoiled = recording if fault is None else fault.spoil(recording, size)
+    row, found = identified(spoiled, given_airframe(vehicle, i))
+    causes = row.pop("doubts")
+    if found is not None:
+        causes += [*(r for v in found.verdicts.values() for r in v.reasons), *found.provenance.notes]
         row |= {n: each | {"status": found.verdicts[n].status} for n, each in shares_of_truth(found, vehicle).items()}
         if found.response is not None:
             row["response"] = agreements(found.response)
     named = None if fault is None or not fault.cause else any(fault.cause in cause for cause in causes)
-    return row | {"named": named, "causes": causes, "seconds": time.perf_counter() - begin}
+    return row | {"named": named, "causes": causes}
 
 
 def agreements(response: FrequencyResponse) -> dict[str, list[float]]:
@@ -94,27 +83,16 @@ def counts(rows: list[Row]) -> dict[str, int]:
     return found
 
 
-def share(part: int, whole: int) -> str:
-    """A share with its Monte-Carlo error, of at least half an event [%]."""
-    if not whole:
-        return ""
-    p = np.clip(part / whole, 0.5 / whole, 1 - 0.5 / whole)
-    return f"{100 * part / whole:.3g} +- {100 * np.sqrt(p * (1 - p) / whole):.1f}"
-
-
-def errors_of(groups: dict[str, list[Row]]) -> Iterator[tuple[str, ...]]:
-    """For each group of good flights: mean errors, and shares of the 95 % intervals that hold the truth."""
-    for name, some in groups.items():
-        cells = []
-        for inertia in INERTIAS:
-            known = [row[inertia] for row in some if inertia in row]
-            error, std = (np.array([each[key] for each in known]) for key in ("error", "std"))
-            cells += ["", ""]
-            if known:
-                spread = 100 * error.std() / np.sqrt(len(known))
-                held = int((np.abs(error) < NINETY_FIVE * std).sum())
-                cells[-2:] = f"{100 * error.mean():.1f} +- {spread:.1f}", share(held, len(known))
-        yield name, *cells
+def errors_of(rows: list[Row]) -> list[str]:
+    """For each moment of inertia: the mean error, and the share of the 95 % intervals that hold the truth."""
+    cells = []
+    for inertia in INERTIAS:
+        known = [row[inertia] for row in rows if inertia in row]
+        cells += ["", ""]
+        if known:
+            found = statistics(*(np.array([each[key] for each in known]) for key in ("error", "std")))
+            cells[-2:] = plus_minus(found), plus_minus(found, "covered")
+    return cells
 
 
 def print_responses(title: str, groups: dict[str, list[Row]]) -> None:
@@ -153,21 +131,25 @@ def print_tables(rows: list[Row]) -> None:
     headings += "of unreserved far [%]", "refused, right [%]", "named [%]"
     print_table("verdicts of Ix and Iy", ("case", *headings), lines, width=140)
     headings = (f"{name} {what} [%]" for name in INERTIAS for what in ("mean error", "intervals that hold"))
-    print_table("errors of good flights", ("case", *headings), errors_of(unspoiled), width=160)
+    errors = ((name, *errors_of(some)) for name, some in unspoiled.items())
+    print_table("errors of good flights", ("case", *headings), errors, width=160)
     print_responses("frequency response of good flights", {"good flights": good})
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Number of flights of each effect.")] = 100,
-    spoiled: Annotated[int, typer.Option(help="Number of flights of each fault and size.")] = 20,
-    rotorpy: Annotated[int, typer.Option(help="Number of flights of RotorPy, calm and in gusts.")] = 20,
-    cases: Annotated[list[str], typer.Option(help="The cases.")] = tuple(CASES),
-    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
-    seed: Annotated[int, typer.Option(help="Random seed of references, gusts, noise and effects.")] = 48,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+    flights: int = 100,
+    spoiled: int = 20,
+    rotorpy: int = 20,
+    cases: list[str] = tuple(CASES),
+    duration: float = 20.0,
+    seed: int = 48,
+    out: Path | None = None,
 ) -> None:
-    """Count right and wrong verdicts for each effect, and for each fault in three sizes."""
-    report = continued(out, {"duration": duration, "seed": seed}, "rows")
+    """Count right and wrong verdicts for each effect, and for each fault in three sizes.
+
+    - `spoiled`: Number of flights of each fault and size.
+    - `rotorpy`: Number of flights of RotorPy, calm and in gusts.
+    """
     numbers = {name: spoiled if CASES[name][1] else rotorpy if name in ROTORPY else flights for name in cases}
     flown = functools.cache(lambda kind: good_flights(kind, max(numbers.values()), duration, seed))
     # An interrupted report has about as many flights of each case.
@@ -179,5 +161,5 @@ def main(
         recorded = flight_of(flight)
         return {"result": LOST} if recorded is None else judged(vehicle, recorded, flight, fault, size)
 
-    fill(out, report, report["rows"], trials, row_of)
-    print_tables([row for row in report["rows"] if row["result"] != LOST])
+    rows = study(out, {"duration": duration, "seed": seed}, trials, row_of)
+    print_tables([row for row in rows if row["result"] != LOST])

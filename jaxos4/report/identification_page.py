@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from ..airframe import INERTIAS
+from ..airframe import INERTIAS, MOTIONS
 from ..errors import printable
 from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification, OS4Identification, VehicleIdentification

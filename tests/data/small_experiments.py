@@ -8,7 +8,8 @@ import pathlib
 import pytest
 
 import jaxos4
-from experiments import shared
+from experiments import drawing
+from experiments.__main__ import main_of
 from experiments.drawing import rendered
 
 
@@ -23,7 +24,7 @@ def result_of(folder: pathlib.Path, name, script="run", **options):
     small.steps = jaxos4.NetworkEstimator.steps
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jaxos4, "NetworkEstimator", small)
-        load(name, script).main(**options, out=folder / "out.json")
+        main_of(f"{name}.{script}")(**options, out=folder / "out.json")
     return json.loads((folder / "out.json").read_text())
 
 
@@ -31,8 +32,8 @@ def plot(folder: pathlib.Path, name, script="plot", results="out.json", *, suffi
     """Draws the results of an experiment in a folder. Only the comparison is drawn as PDF too."""
     with pytest.MonkeyPatch.context() as patch:
         if ".pdf" not in suffixes:
-            patch.setattr(shared, "rendered", lambda figure, kind: rendered(figure, kind) if kind == "svg" else b"")
-        load(name, script).main(folder / results, folder / f"{name} {script}")
+            patch.setattr(drawing, "rendered", lambda figure, kind: rendered(figure, kind) if kind == "svg" else b"")
+        main_of(f"{name}.{script}")(folder / results, folder / f"{name} {script}")
     for suffix in suffixes:
         figures = list((folder / f"{name} {script}").glob(f"*{suffix}"))
         assert figures

@@ -1,0 +1,299 @@
+"""Experiments with recorded flights, from the folder `--flights`, or else `$JAXOS4_FLIGHTS`.
+
+The moments of inertia of two flights of one vehicle should differ by chance alone.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxos4
+from experiments.fits import INERTIAS, constants, identified
+from experiments.monte_carlo import Column, Row, interval, print_rows, print_table, product, study, text, write_report
+from experiments.public_flights.clocks import aligned
+from experiments.public_flights.gusts import measured_share, simulated
+from experiments.public_flights.rate_network import errors_of, trained
+from experiments.sample_times.run import VEHICLE as CINERAT
+from experiments.shared import flight_files
+from experiments.verdicts.faults import thinned
+from jaxos4.recording import Recording, read_recording
+from jaxos4.results import NINETY_FIVE
+
+CRAZYFLIE = jaxos4.load_airframe("crazyflie")
+ARPL = jaxos4.load_airframe(Path(__file__).parent / "real_flight" / "crazyflie.toml")
+AUTHORS = {"Ix": 1.03e-5, "Iy": 1.11e-5}  # of the same Crazyflie, as the flights' authors measured it
+PENDULUM = {"Ix": 7.21e-4, "Iy": 7.76e-4, "Iz": 8.86e-4}  # of the CineRat, by its authors, to 7 %
+ARPL_FLIGHTS = ("rollpitch", "yaw_a", "yaw_b", "hover")
+FITTED = ("B8_star_fast_rep1", "B5_helix_fast_mell_rep1", "B9_trefoil_fast_rep4")
+PREDICTED = ("B2_circle_fast_rep2", "B3_figure8_fast_rep1", "B3_figure8_fast_rep2", "B8_star_fast_rep2")
+AIRFRAMES = {f"arpl_crazyflie_{name}.csv": CRAZYFLIE for name in ARPL_FLIGHTS}
+AIRFRAMES |= {f"nanobench/{name}.csv": CRAZYFLIE for name in sorted((*FITTED, *PREDICTED))}
+AIRFRAMES |= {"cinerat/cinerat_281.csv": CINERAT}
+STEP = 0.01  # s; of the slower logs
+HORIZONS = (5, 10, 20, 30, 50)  # steps ahead, of a table
+AHEAD = 0.25  # s
+BOOTSTRAPS, SEEDS = 2000, 3
+SHOWN = {name: f"{name} [1e-5 kg m^2]" for name in ("Ix", "Iy")}
+
+
+def disagreements(rows: dict[str, Row]) -> dict[str, dict[tuple[str, str], float]]:
+    """For Ix and Iy, and each pair of flights that have them: their difference over its standard deviation."""
+    table: dict[str, dict[tuple[str, str], float]] = {}
+    for (one, first), (other, second) in itertools.combinations(rows.items(), 2):
+        for name in SHOWN:
+            a, b = (row["constants"].get(name) for row in (first, second))
+            if a and b:
+                z = abs(a["estimate"] - b["estimate"]) / (a["std"] ** 2 + b["std"] ** 2) ** 0.5
+                table.setdefault(name, {})[one, other] = z
+    return table
+
+
+def agreement(rows: dict[str, Row]) -> Row:
+    """The share of pairs whose difference is inside its 95 %, over Ix and Iy, with a bootstrap by flight.
+
+    Two draws of one flight are no pair. `None`: no pair.
+    """
+    names, found = [name for name, row in rows.items() if row["constants"]], disagreements(rows)
+    pairs = [(*pair, z <= NINETY_FIVE) for name in SHOWN for pair, z in found.get(name, {}).items()]
+    if not pairs:
+        return {"flights": names, "pairs": 0, "share": None, "ci95": None}
+    first, second = (np.array([names.index(pair[k]) for pair in pairs]) for k in (0, 1))
+    inside = np.array([pair[2] for pair in pairs])
+    draws = np.random.default_rng(0).integers(len(names), size=(BOOTSTRAPS, len(names)))
+    times = (draws[:, :, None] == np.arange(len(names))).sum(axis=1)  # that a flight was drawn
+    weights = times[:, first] * times[:, second]
+    weights = weights[weights.any(axis=1)]
+    ends = np.quantile(weights @ inside / weights.sum(axis=1), [0.025, 0.975])
+    return {"flights": names, "pairs": len(pairs), "share": float(inside.mean()), "ci95": ends.tolist()}
+
+
+def skill_ahead(skill: Row | None) -> dict[str, tuple[float, float]]:
+    """The skill of predictions of roll and pitch rate next to `AHEAD`, and its standard deviation."""
+    if skill is None:
+        return {}
+    place = min(range(len(skill["horizons"])), key=lambda place: abs(skill["horizons"][place] - AHEAD))
+    table = {rate: (skill[rate]["skill"][place], skill[rate]["std"][place]) for rate in "pq"}
+    return {rate: (value, std) for rate, (value, std) in table.items() if value is not None and std is not None}
+
+
+def real_flight(
+    flights: Path | None = None,
+    end: float | None = None,
+    names: list[str] = ARPL_FLIGHTS,
+    estimators: list[str] = ("filter-error", "ibss"),
+    out: Path | None = None,
+) -> None:
+    """Do flights of a real Crazyflie agree on its moments of inertia, and how well is the rest of a flight predicted?
+
+    Each flight is identified alone, and all of them together, by filter error and by IBSS on the same likelihood. The
+    last quarter of each flight is not fitted but predicted. Commands are not rotor speeds: thrust as a function of the
+    command is fitted to the accelerometer (`thrust_curve`, `thrust_gain`), and torques, and therefore inertias, are
+    proportional to this thrust.
+
+    `z` is the difference of two flights over its standard deviation; 99 % of such figures should be below 2.58.
+    """
+    paths = flight_files(flights, [f"arpl_crazyflie_{name}.csv" for name in names])
+    recordings = {name: read_recording(path, ARPL) for name, path in zip(names, paths, strict=True)}
+    groups = {name: [recording] for name, recording in recordings.items()}
+    if len(groups) > 1:
+        groups["all"] = list(recordings.values())
+    report: Row = {"version": jaxos4.__version__, "authors": AUTHORS, "estimators": {}}
+    for estimator in estimators:
+        rows = {}
+        for name, group in groups.items():
+            found = jaxos4.identify(group, ARPL, settings=jaxos4.VehicleSettings(end=end), estimator=estimator)
+            print(f"{estimator}, {name}: {found.seconds:.0f} s", flush=True)
+            rows[name] = found.to_dict()
+            rows[name]["ahead"] = skill_ahead(rows[name]["skill"])
+        z = {name: {", ".join(p): x for p, x in pairs.items()} for name, pairs in disagreements(rows).items()}
+        report["estimators"][estimator] = {"flights": rows, "z": z}
+        write_report(out, report)
+    columns: dict[str, Column] = {name: name for name in ("estimator", "flight", "result")}
+    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
+    for rate in "pq":
+        columns[f"skill {rate}"] = lambda row, r=rate: (
+            "{:.2f} +- {:.2f}".format(*row["ahead"][r]) if r in row["ahead"] else ""
+        )
+    every = report["estimators"].items()
+    lines = [{"estimator": e, "flight": f} | row for e, found in every for f, row in found["flights"].items()]
+    print_rows(f"moments of inertia with 95 % intervals, and the skill {AHEAD:g} s ahead", lines, columns)
+    for estimator, found in every:
+        worst = ", ".join(f"{name} {max(pairs.values()):.2g}" for name, pairs in found["z"].items())
+        print(f"{estimator}: the largest disagreement of two flights (z): {worst or 'no pair'}")
+
+
+def alone(recordings: list[Recording], end: float | None) -> Row:
+    """The result, the doubts and the moments of inertia of these recordings; or why they are refused."""
+    row, found = identified(recordings, CRAZYFLIE, settings=jaxos4.VehicleSettings(sample_time=STEP, end=end))
+    if found is None:
+        return row | {"constants": {}}
+    return row | {"doubts": [issue.cause for issue in found.issues], "constants": constants(found)}
+
+
+def public_flights(
+    flights: Path | None = None,
+    fitted: list[str] = FITTED,
+    predicted: list[str] = PREDICTED,
+    compared: list[str] = (*FITTED, *PREDICTED),
+    end: float | None = None,
+    batches: int = 300,
+    gusts: list[float] = (0.0, 2.0, 4.0, 8.0),
+    simulations: int = 5,
+    out: Path | None = None,
+) -> None:
+    """Public flights of a Crazyflie 2.1 (NanoBench): identified alone and together, and predicted whole.
+
+    The motion capture is moved to the clock of the gyro first (`clocks.py`). The flights `fitted` are identified
+    together, and those `predicted` are predicted: position, velocity, attitude and body rates, 50 steps of 10 ms ahead,
+    open loop, with the recorded commands and the offsets that the past of a flight shows. The errors stand beside those
+    of constant velocity and rates, of a regression that is fitted to the first half of the flight that it predicts, and
+    of a small network for the rates that is trained on the identified flights, in so many batches.
+
+    The flights `compared` are identified alone, and all together; what is refused has its cause. `pairs` has the share
+    of pairs of flights whose difference is inside its 95 %, with an interval from a bootstrap of the flights.
+
+    Commands answer what disturbs the vehicle after the start, which no prediction in open loop knows. How much that
+    costs is simulated with the true vehicle (`gusts.py`): flights through `gusts` of these strengths [rad/s^2].
+    """
+    names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
+    paths = flight_files(flights, [f"nanobench/{name}.csv" for name in names])
+    recordings = {
+        name: aligned(read_recording(path, CRAZYFLIE))._replace(name=name)
+        for name, path in zip(names, paths, strict=True)
+    }
+    together = [recordings[name] for name in fitted]
+    found = jaxos4.identify(together, CRAZYFLIE, settings=jaxos4.VehicleSettings(sample_time=STEP, end=end))
+    print(f"{', '.join(fitted)}: {found.result}, {found.seconds:.0f} s", flush=True)
+    vehicle = jaxos4.forecast.vehicle_of(found)
+    networks = [trained(together, batches=batches, seed=seed) for seed in range(SEEDS)]
+    report: Row = {"version": jaxos4.__version__, "identification": found.to_dict(), "flights": {}}
+    for name in predicted:
+        prediction = jaxos4.predict(vehicle, recordings[name], sample_time=STEP)
+        row = prediction.to_dict()
+        for quantity, errors in errors_of(networks, recordings[name], prediction).items():
+            row["quantities"][quantity] |= {"network": errors}
+            row["quantities"][quantity]["sum"] |= {"network": sum(errors)}
+        for axis, share in measured_share([prediction]).items():
+            row["quantities"][axis] |= {"share": share}
+        report["flights"][name] = row
+        write_report(out, report)
+    print_errors(report["flights"])
+    report["simulated"] = {f"{gust:g}": simulated(gust, simulations) for gust in gusts}
+    print_shares(report)
+    report["alone"] = {name: alone([recordings[name]], end) for name in compared}
+    trusted = {name: row for name, row in report["alone"].items() if row["result"] == "successful"}
+    report["pairs"] = {"not refused": agreement(trusted), "all that have a number": agreement(report["alone"])}
+    if len(compared) > 1:
+        report["alone"]["all together"] = alone([recordings[name] for name in compared], end)
+    write_report(out, report)
+    columns: dict[str, Column] = {"flight": "flight", "result": "result"}
+    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
+    columns |= {"results": lambda row: "; ".join(row["doubts"])}
+    rows = ({"flight": name} | row for name, row in report["alone"].items())
+    print_rows("each flight alone, 95 % intervals", rows, columns, width=180)
+    for which, one in report["pairs"].items():
+        print(f"{which}: {one['pairs']} pairs, share inside 95 %: {one['share']}, by flight {one['ci95']}")
+
+
+def print_errors(flights: dict[str, Row]) -> None:
+    """One line for each flight and quantity."""
+    kinds, lines = ("error", "constant", "regression", "network"), []
+    for flight, found in flights.items():
+        for quantity, row in found["quantities"].items():
+            sums = [row["sum"].get(kind) for kind in kinds]
+            values = sums + [row[kind][9] if kind in row else None for kind in kinds]
+            lines.append((flight, quantity, row["unit"], *map(text, values)))
+    headings = "flight", "quantity", "unit", *kinds, "0.1 s: error", *kinds[1:]
+    print_table("mean absolute error: the sum over 50 steps of 10 ms, and 0.1 s ahead", headings, lines)
+
+
+def print_shares(report: Row) -> None:
+    """One line for each flight, or strength of the simulated gusts, and axis."""
+    flights = {name: found["quantities"] for name, found in report["flights"].items()}
+    flights |= {f"simulated, true vehicle, {gust} rad/s^2": found for gust, found in report["simulated"].items()}
+    kinds = "share", "error", "constant"
+    rows = [
+        (name, axis, *(f"{found[axis][kind][n - 1]:.2g}" for kind in kinds for n in HORIZONS))
+        for name, found in flights.items()
+        for axis in "pq"
+    ]
+    ahead = [f"{STEP * n:g}" for n in HORIZONS]
+    headings = [x for kind in kinds for x in (f"{kind}, {ahead[0]} s", *ahead[1:])]
+    title = "share of a predicted rate that is measured, and mean absolute errors [rad/s]"
+    print_table(title, ("flight", "rate", *headings), rows, width=180)
+
+
+def radio(
+    flights: Path | None = None, every: list[int] = (1, 10, 20, 40), end: float | None = None, out: Path | None = None
+) -> None:
+    """What does a radio do to an identification? A flight that was logged on board, with fewer of its commands.
+
+    A radio brings each command as it was at one moment. The flight is one of `real_flight`, logged at 1 kHz. It is
+    identified with one command in so many, each held until the next.
+    """
+    (path,) = flight_files(flights, ["arpl_crazyflie_rollpitch.csv"])
+    recording, settings = read_recording(path, CRAZYFLIE), jaxos4.VehicleSettings(sample_time=STEP, end=end)
+    report: dict[int, Any] = {}
+    for n in every:
+        found = jaxos4.identify([thinned(recording, float(n))], CRAZYFLIE, settings=settings).to_dict()
+        report[n] = {name: found[name] for name in ("result", "doubts", "verdicts", "parameters", "constants")}
+        write_report(out, report)
+    columns: dict[str, Column] = {"one command of": "n"}
+    for name in ("roll_damping", "pitch_damping"):
+        columns[f"{name.replace('_', ' ')} [1/s]"] = lambda row, name=name: interval(row["parameters"].get(name), 1.0)
+    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
+    columns |= {f"verdict of {name}": lambda row, name=name: row["verdicts"][name]["status"] for name in SHOWN}
+    rows = ({"n": n} | row for n, row in report.items())
+    print_rows("thinned commands, 95 % intervals", rows, columns, width=180)
+
+
+def judged(path: Path, airframe: jaxos4.Airframe) -> Row:
+    """Result, value, standard deviation, verdict and reasons of each quantity."""
+    row, found = identified(path, airframe)
+    for name in INERTIAS if found is not None else ():
+        verdict = found.verdicts.get(name)
+        status, reasons = (found.result, []) if verdict is None else (verdict.status, list(verdict.reasons))
+        row[name] = {"status": status, "reasons": reasons} | constants(found).get(name, {})
+    return row
+
+
+def verdicts(flights: Path | None = None, names: list[str] = tuple(AIRFRAMES), out: Path | None = None) -> None:
+    """Which verdicts have moments of inertia on real flights, each identified alone; and do repeated flights agree?
+
+    The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.
+    """
+    paths = dict(zip(names, flight_files(flights, names), strict=True))
+    rows = study(out, {}, product(flight=names), lambda flight: judged(paths[flight], AIRFRAMES[flight]))
+    lines = []
+    vehicles: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        known = {name: row[name] for name in INERTIAS if name in row}
+        for name, one in known.items():
+            lines.append((row["flight"], name, interval(one, 1e5), one["status"], "; ".join(one["reasons"])))
+        if row["result"] == "refused":
+            lines.append((row["flight"], "", "", "refused", *row["doubts"]))
+        vehicle = row["flight"].split("/")[0] if "/" in row["flight"] else "arpl_crazyflie"
+        # With or without a reservation.
+        trusted = {n: one for n, one in known.items() if "estimate" in one and one["status"].startswith("identified")}
+        vehicles.setdefault(vehicle, {})[row["flight"]] = {"constants": trusted}
+    print_table("verdicts of real flights", ("flight", "", "1e-5 kg m^2, 95 %", "verdict", "reasons"), lines, width=200)
+    lines = []
+    for vehicle, flown in vehicles.items():
+        for name, apart in disagreements(flown).items():
+            known, inside = (
+                sum(name in each["constants"] for each in flown.values()),
+                [z <= NINETY_FIVE for z in apart.values()],
+            )
+            lines.append((vehicle, name, str(known), f"{sum(inside)} of {len(inside)}", f"{max(apart.values()):.2f}"))
+    headings = "vehicle", "", "identified", "differences inside their 95 %", "largest [std]"
+    print_table("repeated flights of one vehicle", headings, lines)
+
+
+SCRIPTS = {
+    "public_flights.radio": radio,
+    "public_flights.run": public_flights,
+    "real_flight.run": real_flight,
+    "verdicts.real": verdicts,
+}
