@@ -3,7 +3,7 @@
 The noise is among the unknowns of this likelihood. All searches return an `Optimum`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import jax
@@ -23,6 +23,8 @@ NEAR_PLAIN = 12.0  # standard deviations; further from its plain value, a parame
 # Parameters near their plain values are fixed there unless that raises the cost, prior included, by more: near a plain
 # value, a cost with kinks is not quadratic, and standard deviations are too small.
 MAX_RISE = 5.0
+# The delay of most motor drivers [s]. With commands, the cost has a minimum in the delay for each row of the log.
+SHORT_DELAY = 0.002
 
 
 class Optimum(NamedTuple):
@@ -120,10 +122,29 @@ def search(
     if first is None or not has_answer(first):
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
+    for other in _near_short_delay(estimator, likelihood, first):
+        spent += int(other.rollouts)
+        if has_answer(other) and float(other.cost) < float(first.cost):
+            first = other
     optimum = Optimum(likelihood, first, first, likelihood.problem.unknowns, spent)
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_plain_values(estimator, optimum, progress)
+
+
+def _near_short_delay(
+    estimator: AbstractEstimator, likelihood: InnovationsProblem, first: Estimate
+) -> Iterator[Estimate]:
+    """The minimum near a short delay of the motors, if short samples of commands led to another one."""
+    own = likelihood.problem.unknowns
+    if likelihood.answers_within or not {"rotor_lag", "rotor_delay"} <= set(own.names) or not has_answer(first):
+        return
+    delay = float(first.parameters[own.names.index("rotor_delay")])
+    if abs(delay - SHORT_DELAY) <= float(likelihood.flight.dt):
+        return
+    near = jax.block_until_ready(estimator(likelihood.fix({"rotor_delay": np.asarray(SHORT_DELAY)})))
+    if has_answer(near):
+        yield jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
 
 
 def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
