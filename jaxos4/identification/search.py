@@ -23,8 +23,8 @@ NEAR_PLAIN = 12.0  # standard deviations; further from its plain value, a parame
 # Parameters near their plain values are fixed there unless that raises the cost, prior included, by more: near a plain
 # value, a cost with kinks is not quadratic, and standard deviations are too small.
 MAX_RISE = 5.0
-# The delay of most motor drivers [s]. With commands, the cost has a minimum in the delay for each row of the log.
-SHORT_DELAY = 0.002
+# The cost has a minimum in the delay for each row of the log. The usual delay [s] of measured speeds, and of commands.
+USUAL_DELAY, USUAL_DELAY_OF_COMMANDS = 0.0, 0.002
 
 
 class Optimum(NamedTuple):
@@ -122,7 +122,7 @@ def search(
     if first is None or not has_answer(first):
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
-    for other in _near_short_delay(estimator, likelihood, first):
+    for other in _near_usual_delay(estimator, likelihood, first):
         spent += int(other.rollouts)
         if has_answer(other) and float(other.cost) < float(first.cost):
             first = other
@@ -132,17 +132,17 @@ def search(
     return _at_plain_values(estimator, optimum, progress)
 
 
-def _near_short_delay(
+def _near_usual_delay(
     estimator: AbstractEstimator, likelihood: InnovationsProblem, first: Estimate
 ) -> Iterator[Estimate]:
-    """The minimum near a short delay of the motors, if short samples of commands led to another one."""
-    own = likelihood.problem.unknowns
-    if likelihood.answers_within or not {"rotor_lag", "rotor_delay"} <= set(own.names) or not has_answer(first):
+    """The minimum near the usual delay of the rotors, if the search of short samples led to another one."""
+    names = likelihood.problem.unknowns.names
+    if likelihood.answers_within or "rotor_delay" not in names or not has_answer(first):
         return
-    delay = float(first.parameters[own.names.index("rotor_delay")])
-    if abs(delay - SHORT_DELAY) <= float(likelihood.flight.dt):
+    usual = USUAL_DELAY_OF_COMMANDS if "rotor_lag" in names else USUAL_DELAY
+    if abs(float(first.parameters[names.index("rotor_delay")]) - usual) <= float(likelihood.flight.dt) / 2:
         return
-    near = jax.block_until_ready(estimator(likelihood.fix({"rotor_delay": np.asarray(SHORT_DELAY)})))
+    near = jax.block_until_ready(estimator(likelihood.fix({"rotor_delay": np.asarray(usual)})))
     if has_answer(near):
         yield jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
 
