@@ -11,7 +11,7 @@ import sys
 import pytest
 import typer
 from helpers import CRAZYFLIE_TOML, refused
-from pages import words
+from pages import without_matplotlib, words
 from synthetic_results import vehicle_result
 
 import jaxos4
@@ -50,8 +50,9 @@ def test_simulate_writes_the_standard_flight(run, tmp_path):
     assert (a == b, a == c) == (True, False)
 
 
-def test_estimate_recovers_the_truth_within_its_intervals(run):
+def test_estimate_recovers_the_truth_within_its_intervals(run, monkeypatch):
     simulate(run, "flight.csv", "--noise", "1")
+    without_matplotlib(monkeypatch)
     code, out, err, report = estimate(run, "--report", "e.html")
     assert code == 0, err
     page = words(pathlib.Path("e.html").read_text(encoding="utf-8"))

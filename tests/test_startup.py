@@ -64,6 +64,10 @@ print(json.dumps([completed.getvalue().split(), packages()]))
 import jaxos4
 jaxos4.IBSS, jaxos4.identify, jaxos4.simulate, jaxos4.read_flight
 print(json.dumps([os.environ["XLA_FLAGS"], packages()]))
+jaxos4.report.write_report, jaxos4.report.write_flight_page, jaxos4.report.write_comparison
+jaxos4.report.write_log_page
+import jaxos4.report.design
+print(json.dumps(packages()))
 import jax, numpy as np
 assert jax.numpy.asarray(jaxos4.OS4.mixer).dtype == np.float32
 jax.config.update("jax_enable_x64", True)
@@ -76,7 +80,7 @@ assert abs(float(jaxos4.OS4.hover_speed) / (0.65 * 9.81 / 4 / 3.13e-5) ** 0.5 - 
 def test_a_command_imports_no_library_before_it_runs_and_the_package_imports_what_is_used():
     process = start(*(line for line, *_ in LINES), code=EACH + LIBRARY)
     assert process.returncode == 0, process.stderr
-    *answers, (completed, packages), (flags, of_library) = map(json.loads, process.stdout.splitlines())
+    *answers, (completed, packages), (flags, of_library), of_pages = map(json.loads, process.stdout.splitlines())
     for (line, code, said), (answered, ended, printed, imported) in zip(LINES, answers, strict=True):
         assert (answered, ended) == (line, code)
         assert said in printed, line
@@ -86,6 +90,7 @@ def test_a_command_imports_no_library_before_it_runs_and_the_package_imports_wha
     assert flags == f"{NATIVE} {WIDE}"
     assert "equinox" in of_library
     assert not set(of_library) & HEAVY
+    assert "matplotlib" not in of_pages  # see `without_matplotlib`
 
 
 @pytest.mark.slow
