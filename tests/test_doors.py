@@ -6,7 +6,6 @@ The doors of logs are tested in `test_logs_readers`, that of a network's file al
 import ast
 import io
 import json
-import math
 import os
 import subprocess
 import sys
@@ -22,9 +21,10 @@ import numpy as np
 import pytest
 import small_study
 import xarray as xr
+from flight_csvs import csv
 from helpers import refused
 from hypothesis import given, settings, strategies as st
-from recorded_logs import ACCIDENTS, damaged, table_csv
+from recorded_logs import ACCIDENTS, damaged, outcome, table_csv
 from strange import in_one_line, survives_strange_values
 from synthetic_results import held, provenance, vehicle_result
 from synthetic_study import synthetic_study
@@ -37,11 +37,10 @@ from jaxos4.export import TARGETS, export_vehicle, read_result
 from jaxos4.forecast import vehicle_of
 from jaxos4.identification.problem import bracket_of
 from jaxos4.logs import read_log
-from jaxos4.logs.messages import Messages
 from jaxos4.models import MODELS
 from jaxos4.networks.file import load_network
 from jaxos4.recording import read_recording
-from jaxos4.recording.inspection import airframe_draft, inspect_log
+from jaxos4.recording.inspection import airframe_draft
 from jaxos4.study import load_study, read_results
 from jaxos4.study.dataset import read_store
 
@@ -72,6 +71,14 @@ def bracket(path):
     bracket_of(read_toml(path), MODELS["published"]())
 
 
+def study(path):
+    """The numbers of a study are finite, and its flights can be flown."""
+    found = load_study(path)
+    assert found.cell(found.count - 1)
+    assert np.isfinite([found.dt, *found.durations, *found.scales, *found.widths]).all()
+    assert all(2 <= duration / found.dt <= 1e6 for duration in found.durations)
+
+
 def store(path):
     (path.parent / "study.json").write_bytes(path.read_bytes())
     read_store(path.parent)
@@ -83,10 +90,31 @@ DOORS = {
     "predict": (vehicle_of, json.dumps(RESULT)),
     "airframe": (load_airframe, MINE),
     "bracket": (bracket, "alpha1 = [-1.0, 1.0]\nalpha3 = [100, 200]\n"),
-    "study": (load_study, STUDY),
+    "study": (study, "dt = 0.01\nwidths = [1.0]\n" + STUDY),
     "study.json": (store, json.dumps(HEADER)),
+    "flight": (lambda path: outcome(read_log, path), csv()),
 }
 LITERALS = ["1e308", "1e999", "nan", "inf", "-1", "0", "0x" + 5000 * "f", '"\\u0007"', "[]", "{}", NESTED, "1979-05-27"]
+LITERALS += [
+    ",",
+    ";",
+    '"',
+    "1_0",
+    "1 2",
+    "-",
+    " ",
+    "\t1",
+    "\0",
+    "\r",
+    "\n",
+    "\u2028",
+    "\ufeff",
+    "x" * 60,
+    "١",
+    "½",
+    "1e-999",
+    "1e5",
+]
 
 
 @pytest.mark.slow
@@ -162,55 +190,48 @@ RESULTS = {
 
 
 @pytest.mark.parametrize("case", RESULTS)
-@pytest.mark.parametrize("command", ["export", "predict"])
-def test_a_result_that_nobody_wrote_is_refused(run, save, tmp_path, command, case):
-    save(RESULTS[case], "found.json")
-    save("t,omega1,omega2,omega3,omega4,p,q,r\n0,9,9,9,9,0,0,0\n0.01,9,9,9,9,0,0,0\n", "flight.csv")
-    arguments = ("--to", "rotorpy", "--out", "v.py") if command == "export" else ("flight.csv", "--json", "v.json")
-    refused(run(command, "found.json", *arguments), "found.json: ", "jaxos4 estimate")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["flight.csv", "found.json"]
+@pytest.mark.parametrize("reader", [read_result, vehicle_of])
+def test_a_result_that_nobody_wrote_is_refused(save, reader, case):
+    path = save(RESULTS[case], "found.json")
+    with pytest.raises(InputError, match="jaxos4 estimate") as caught:
+        reader(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).isprintable()
 
 
-SPOILT = {
-    "no coordinate": (lambda data: data.drop_vars("excitation"), "no excitation"),
-    "another kind": (lambda data: data.assign_coords(level=[-1, -1, -1, -1]), "level"),
-    "no codes": (lambda data: without(data), "codes"),
-    "another code": (
-        lambda data: data.assign(result=(data["result"] + 100).assign_attrs(data["result"].attrs)),
-        "code",
-    ),
-    "text of numbers": (lambda data: data.assign(std=data["std"].astype(str)), "std is of another kind"),
-    "infinite level": (lambda data: data.assign_coords(level=[0.5, 0.9, 0.95, np.inf]), "level"),
-    "control": (lambda data: data.assign_coords(estimator=["ibss", "a\x07"]), "`estimator` is not one line"),
-    "failures": (lambda data: data.assign_attrs(failures='[{"cell": 1}]'), "`failures`"),
-    "nested failures": (lambda data: data.assign_attrs(failures=NESTED[:50_000]), "`failures`"),
-    "empty": (lambda data: data.isel(flight=slice(0, 0)), "another kind or shape"),
-}
+# Folders of studies
 
 
-def without(data):
+def small_dataset():
+    return synthetic_study(flights=4, scales=(1.0,), estimators=("ibss", "hybrid"), spoiled=False)
+
+
+def changed(change):
+    """Writes a study's Dataset after this change."""
+    return lambda path: change(small_dataset()).to_netcdf(path, engine="h5netcdf")
+
+
+def linked(link):
+    """Writes a study's Dataset that leads to another place. A pipe would never answer."""
+
+    def write(path):
+        small_dataset().to_netcdf(path, engine="h5netcdf")
+        os.mkfifo(path.with_name("pipe"))
+        with h5py.File(path, "r+") as file:
+            link(file)
+
+    return write
+
+
+def without_attributes(data):
     data = data.copy()
     for each in data.variables.values():
         each.attrs = {}
     return data
 
 
-@pytest.mark.parametrize("case", SPOILT)
-def test_a_dataset_that_no_study_wrote_is_refused(run, tmp_path, case):
-    spoil, words = SPOILT[case]
-    (tmp_path / "study").mkdir()
-    data = synthetic_study(flights=4, scales=(1.0,), estimators=("ibss", "hybrid"), spoiled=False)
-    spoil(data).to_netcdf(tmp_path / "study" / "results.nc", engine="h5netcdf")
-    refused(run("report", "study"), "study/results.nc: ", words)
-    assert [path.name for path in (tmp_path / "study").iterdir()] == ["results.nc"]
-
-
-ELSEWHERE = {
-    "a pipe": lambda file: file.__setitem__("zz", h5py.ExternalLink("pipe", "/x")),
-    "a name": lambda file: file.__setitem__("zz", h5py.SoftLink("/zz")),
-    "a device": lambda file: file.create_dataset("zz", (4,), "f8", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)]),
-    "another file": lambda file: file.create_virtual_dataset("zz", virtual_layout()),
-}
+def another_code(data):
+    return data.assign(result=(data["result"] + 100).assign_attrs(data["result"].attrs))
 
 
 def virtual_layout():
@@ -219,17 +240,53 @@ def virtual_layout():
     return layout
 
 
+def no_dataset(path):
+    xr.Dataset({"truth": ("flight", np.zeros(3))}).to_netcdf(path, engine="h5netcdf")
+
+
+NO_STUDY = {
+    "no folder": (lambda path: path.parent.rmdir(), "is not there"),
+    "no file": (lambda path: None, "holds no results.nc"),
+    "text": (lambda path: path.write_text("not a netCDF file"), "not a netCDF file that can be read"),
+    "HDF5": (lambda path: h5py.File(path, "w").create_dataset("truth", data=np.zeros(3)).file.close(), "not the"),
+    "another Dataset": (no_dataset, "not the results of a study"),
+    "no bound": (changed(lambda data: data.drop_vars("bound")), "no bound"),
+    "another shape": (changed(lambda data: data.isel(model=0)), "not the results of a study"),
+    "no coordinate": (changed(lambda data: data.drop_vars("excitation")), "no excitation"),
+    "another kind": (changed(lambda data: data.assign_coords(level=[-1, -1, -1, -1])), "level"),
+    "no codes": (changed(without_attributes), "codes"),
+    "another code": (changed(another_code), "code"),
+    "text of numbers": (changed(lambda data: data.assign(std=data["std"].astype(str))), "std is of another kind"),
+    "infinite level": (changed(lambda data: data.assign_coords(level=[0.5, 0.9, 0.95, np.inf])), "level"),
+    "control": (changed(lambda data: data.assign_coords(estimator=["ibss", "a\x07"])), "`estimator` is not one line"),
+    "failures": (changed(lambda data: data.assign_attrs(failures='[{"cell": 1}]')), "`failures`"),
+    "nested failures": (changed(lambda data: data.assign_attrs(failures=NESTED[:50_000])), "`failures`"),
+    "empty": (changed(lambda data: data.isel(flight=slice(0, 0))), "another kind or shape"),
+    "a pipe": (linked(lambda file: file.__setitem__("zz", h5py.ExternalLink("pipe", "/x"))), "a link to another"),
+    "a name": (linked(lambda file: file.__setitem__("zz", h5py.SoftLink("/zz"))), "a link to another place"),
+    "a device": (
+        linked(lambda file: file.create_dataset("zz", (4,), "f8", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])),
+        "its arrays are in another file",
+    ),
+    "another file": (
+        linked(lambda file: file.create_virtual_dataset("zz", virtual_layout())),
+        "its arrays are in another file",
+    ),
+}
+
+
 @pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
-@pytest.mark.parametrize("case", ELSEWHERE)
-def test_a_dataset_that_leads_to_another_file_is_refused(case, tmp_path):
-    """A pipe would never answer."""
-    data = synthetic_study(flights=4, scales=(1.0,), estimators=("ibss", "hybrid"), spoiled=False)
-    data.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
-    os.mkfifo(tmp_path / "pipe")
-    with h5py.File(tmp_path / "results.nc", "r+") as file:
-        ELSEWHERE[case](file)
-    with pytest.raises(InputError, match=r"it has a link to another place|its arrays are in another file"):
-        read_results(tmp_path)
+@pytest.mark.parametrize("case", NO_STUDY)
+def test_a_folder_that_no_study_wrote_is_refused_and_unchanged(run, tmp_path, case):
+    write, words = NO_STUDY[case]
+    (tmp_path / "study").mkdir()
+    write(tmp_path / "study" / "results.nc")
+    before = [*tmp_path.rglob("*")]
+    _, out, err = result = run("report", "study")
+    refused(result, "study", words)
+    assert out == ""
+    assert "jaxos4 study" in err or "run the study again" in err
+    assert [*tmp_path.rglob("*")] == before
 
 
 @pytest.mark.slow
@@ -252,39 +309,35 @@ def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, ca
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
-def test_a_pipe_is_written_if_somebody_reads_it_and_else_refused(tmp_path):
-    """To open a pipe without a reader would wait for ever."""
-    os.mkfifo(pipe := tmp_path / "pipe")
-    with pytest.raises(InputError, match="pipe: nobody reads this pipe; start its reader first"):
-        write_file(pipe, "x")
-    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    write_file(pipe, "x")
-    assert os.read(reader, 9) == b"x"
-    os.close(reader)
-
-
 PIPES = {
     "result": jaxos4.read_result,
     "airframe": load_airframe,
     "log": read_log,
     "columns": lambda path: read_log(path.parent / "log.csv", columns=path),
     "network": load_network,
+    "written": lambda path: write_file(path, "x"),
 }
 
 
 @pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
 @pytest.mark.parametrize("door", PIPES)
-def test_a_pipe_that_nobody_writes_is_refused(door, tmp_path):
+def test_a_pipe_without_another_end_is_refused(door, tmp_path):
     """To open it would wait for ever."""
     os.mkfifo(pipe := tmp_path / "pipe")
     (tmp_path / "log.csv").write_text("t,gyro\n0,1\n1,2\n", encoding="utf-8")
-    with pytest.raises(InputError, match="pipe: "):
+    with pytest.raises(
+        InputError, match="pipe: nobody reads this pipe; start its r" if door == "written" else "pipe: "
+    ):
         PIPES[door](pipe)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
-def test_a_pipe_with_a_writer_is_read_to_its_end():
+def test_a_pipe_with_another_end_is_written_and_read_to_its_end(tmp_path):
+    os.mkfifo(pipe := tmp_path / "pipe")
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_file(pipe, "x")
+    assert os.read(reader, 9) == b"x"
+    os.close(reader)
     reader, writer = os.pipe()
     thread = threading.Thread(target=lambda: (time.sleep(0.1), os.write(writer, MINE.encode()), os.close(writer)))
     thread.start()
@@ -342,11 +395,10 @@ def test_hostile_names_are_in_comments_alone(tmp_path):
     law()
 
 
-def write_log(path, names="t,omega1,omega2,omega3,omega4,p,q,r", extra=()):
+def write_log(path):
     """A short log."""
-    time = 0.01 * np.arange(400)
-    motion = 0.1 * np.sin(np.outer(time, [3, 4, 5]))
-    path.write_bytes(table_csv(names.split(","), time, np.full((400, 4), 1740.0), motion, *extra))
+    time, names = 0.01 * np.arange(400), "t,omega1,omega2,omega3,omega4,p,q,r".split(",")
+    path.write_bytes(table_csv(names, time, np.full((400, 4), 1740.0), 0.1 * np.sin(np.outer(time, [3, 4, 5]))))
     return path
 
 
@@ -375,37 +427,3 @@ def test_a_name_that_is_not_utf8_is_estimated_and_shown(run, tmp_path):
     assert json.loads(written.read_bytes())["provenance"]["flight"].endswith("l\\udcffg.csv")
     code, out, _ = run("inspect", os.fsdecode(name))
     assert (code, "l\\udcffg.csv: flight CSV" in out) == (0, True)
-
-
-# Logs
-
-
-def test_the_columns_that_are_there_are_named_if_time_is_not(tmp_path):
-    path = write_log(tmp_path / "log.csv", "time,omega1,omega2,omega3,omega4,p,q,r")
-    words = r"there is no time; .* There are 'omega1', .*, 'time': rename one, or give a column map\.$"
-    with pytest.raises(InputError, match=words):
-        read_log(path)
-
-
-def test_all_impossible_rotor_speeds_count_as_not_measured_and_not_only_the_largest(tmp_path):
-    path = write_log(tmp_path / "log.csv")
-    lines = path.read_text().splitlines()
-    for row, speed in ((100, 104_720.0), (250, 33_000.0)):
-        cells = lines[row].split(",")
-        lines[row] = ",".join([*cells[:2], str(speed), *cells[3:]])
-    path.write_text("\n".join(lines))
-    found = read_recording(path)
-    assert found.notes == ("impossible values count as not measured, in omega2: 2 (first 104720 rad/s at 0.99 s)",)
-    np.testing.assert_array_equal(found.omega, 1740.0)
-    assert inspect_log(found).parts
-    # A motor that idles for most of the log, and then flies six times as fast, is possible.
-    rows = [[0.01 * k, *4 * [300.0 if k < 395 else 1800.0], math.sin(k), 0, 0] for k in range(400)]
-    path.write_bytes(table_csv("t,omega1,omega2,omega3,omega4,p,q,r".split(","), np.array(rows)))
-    assert read_recording(path).omega.max() == 1800.0
-
-
-def test_a_corrupt_field_of_an_esc_is_missing():
-    fields = {"esc[0].actuator_function": np.array([101.0, np.nan]), "esc[1].state": np.array([5.0])}
-    log = Messages("log", {"esc_status": {0: fields}}, "")
-    assert log.latest("esc_status", "esc[0].actuator_function") is None
-    assert log.latest("esc_status", "esc[1].state") == 5.0

@@ -27,6 +27,7 @@ from recorded_logs import FRD, VEHICLE, check, force, message, outcome, speeds
 
 from jaxos4.errors import InputError
 from jaxos4.logs import Sampling, read_log, read_recording
+from jaxos4.logs.messages import Messages
 
 # Commands
 
@@ -204,6 +205,13 @@ def test_without_pyulog_it_is_said_what_to_install(save, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(InputError, match=r"install jaxos4\[ulog\]\.$"):
         read_log(path)
+
+
+def test_a_corrupt_field_of_an_esc_is_missing():
+    fields = {"esc[0].actuator_function": np.array([101.0, np.nan]), "esc[1].state": np.array([5.0])}
+    log = Messages("log", {"esc_status": {0: fields}}, "")
+    assert log.latest("esc_status", "esc[0].actuator_function") is None
+    assert log.latest("esc_status", "esc[1].state") == 5.0
 
 
 # Real logs

@@ -100,11 +100,18 @@ def test_ten_impossible_samples_are_missing_and_the_rest_is_as_it_was(write, sav
         assert " (13 of 1250 values, more than 1 %); " in message
 
 
-def test_an_impossible_first_value_of_a_rotor_is_the_next_one(save):
-    rows = [f"{0.01 * k:.2f},{2e5 if k in (0, 1, 9) else 100 + k},1,1,1,0.1" for k in range(400)]
+def test_impossible_values_of_a_rotor_are_counted_and_replaced_by_the_value_before_or_the_next_one(save):
+    speeds = {0: 2e5, 1: 2e5, 9: 2e5, 250: 33_000.0}
+    rows = [f"{0.01 * k:.2f},{speeds.get(k, 100 + k)},1,1,1,0.1" for k in range(400)]
     found = read_recording(save("\n".join(["t,omega1,omega2,omega3,omega4,p", *rows])))
-    assert found.omega[[0, 1, 2, 8, 9, 10], 0].tolist() == [102, 102, 102, 108, 108, 110]
-    assert found.notes == ("impossible values count as not measured, in omega1: 3 (first 200000 rad/s at 0 s)",)
+    assert found.omega[[0, 1, 2, 8, 9, 10, 250], 0].tolist() == [102, 102, 102, 108, 108, 110, 349]
+    assert found.notes == ("impossible values count as not measured, in omega1: 4 (first 200000 rad/s at 0 s)",)
+
+
+def test_a_motor_that_idles_for_most_of_the_log_and_then_flies_six_times_as_fast_is_possible(save):
+    rows = [[0.01 * k, *4 * [300.0 if k < 395 else 1800.0], np.sin(k), 0, 0] for k in range(400)]
+    content = table_csv("t,omega1,omega2,omega3,omega4,p,q,r".split(","), np.array(rows))
+    assert read_recording(save(content)).omega.max() == 1800.0
 
 
 def ardupilot_of(t, gyro, accelerometer, rotors):

@@ -7,7 +7,6 @@ import math
 import re
 from xml.etree import ElementTree
 
-import h5py
 import matplotlib.colors
 import numpy as np
 import pytest
@@ -284,30 +283,6 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
     stands_alone(text)
     assert words(text).count("alert(1)") >= 6
     assert all(name in words(text) for name in ("{{ 1 }}", "$\\frac{<b>}$"))
-
-
-NOT_A_STUDY = {
-    "no folder": lambda path: path.parent.rmdir(),
-    "no file": lambda path: None,
-    "text": lambda path: path.write_text("not a netCDF file"),
-    "hdf5": lambda path: h5py.File(path, "w").create_dataset("truth", data=np.zeros(3)).file.close(),
-    "another netcdf": lambda path: xr.Dataset({"truth": ("flight", np.zeros(3))}).to_netcdf(path, engine="h5netcdf"),
-    "half": lambda path: synthetic_study(flights=9).drop_vars("bound").to_netcdf(path, engine="h5netcdf"),
-    "shapes": lambda path: synthetic_study(flights=9).isel(model=0).to_netcdf(path, engine="h5netcdf"),
-}
-
-
-@pytest.mark.parametrize("write", NOT_A_STUDY.values(), ids=NOT_A_STUDY)
-def test_what_is_not_a_study_is_refused_and_nothing_is_written(write, tmp_path, run):
-    folder = tmp_path / "study"
-    folder.mkdir()
-    write(folder / "results.nc")
-    before = list(tmp_path.rglob("*"))
-    _, out, err = result = run("report", str(folder))
-    refused(result, str(folder))
-    assert out == ""
-    assert "jaxos4 study" in err or "run the study again" in err
-    assert list(tmp_path.rglob("*")) == before
 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):

@@ -30,7 +30,10 @@ BAD = {
     "no header": (csv(header=ROWS[0]), ["row 1", "contains numbers instead of the header"]),
     "semicolons": (csv().replace(",", ";"), ["row 1", "separated by ';'", "commas"]),
     "tabs": (csv().replace(",", "\t"), ["row 1", "separated by tabs", "commas"]),
-    "no t": (csv(HEADER.replace("t,", "time,")), ["column t", "there is no time"]),
+    "no t": (
+        csv(HEADER.replace("t,", "time,")),
+        ["column t", "there is no time; ", "There are 'omega1', ", "'time': rename one, or give a column map."],
+    ),
     "empty t": (csv(rows=["," + row.split(",", 1)[1] for row in ROWS]), ["column t", "no time"]),
     "empty cell of t": (edited(4, "t", ""), ["row 4, column t", "is empty"]),
     "no rotors": (csv(HEADER.replace("omega", "w")), ["column omega1", "command1..4"]),
