@@ -151,6 +151,8 @@ def test_a_flight_comes_back_in_our_frame_and_units(name, save):
     np.testing.assert_allclose(flight.omega[:-4], speeds(middle), atol=of_speeds)  # after the last, speeds are held
     assert not flight.commanded
     assert any("is rotor 1" in note for note in notes) == (not name.startswith("Crazyflie"))
+    if name == "ArduPilot":
+        np.testing.assert_allclose(flight.voltage[:1150], 16 - 0.1 * np.asarray(flight.time)[:1150], atol=1e-4)
     for column in {STATE_NAMES.index(each) for each in ("q", "theta", "psi", "y", "vz") if each in states}:
         wrong = eqx.tree_at(lambda f: f.states, flight, flight.states.at[:, column].multiply(-1))
         with pytest.raises(AssertionError):
