@@ -11,9 +11,8 @@ import weakref
 
 import numpy as np
 import pytest
-from helpers import COMMAND, start
+from helpers import COMMAND, environment, start
 from recorded_logs import rates, speeds, table_csv
-from small_study import environment
 
 import jaxos4
 

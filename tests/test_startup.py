@@ -10,7 +10,7 @@ from typing import get_args
 
 import jax
 import pytest
-from helpers import COMMAND, EACH, how_we_compile, start
+from helpers import COMMAND, EACH, PROGRESS, how_we_compile, start
 
 import jaxos4
 from jaxos4._xla import add_flags
@@ -182,7 +182,7 @@ def test_the_second_command_finds_the_programs_of_the_first(tmp_path):
     def counted():
         home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
         process = start(*SIMULATE, code=COUNT + COMMAND, cwd=tmp_path, **home)
-        faults = [line for line in process.stderr.splitlines() if not re.fullmatch(r"jaxos4: .+, \d+ s", line)]
+        faults = [line for line in process.stderr.splitlines() if not re.fullmatch(PROGRESS, line)]
         assert (process.returncode, faults) == (0, []), process.stderr  # beside progress
         return tuple(map(int, process.stdout.splitlines()[-1].split()[1:]))
 

@@ -11,8 +11,8 @@ import time
 import jax
 import pytest
 import xarray as xr
-from helpers import refused
-from small_study import COMMAND, SPECIFICATION, cells, finish, results, run_study, specification, start
+from helpers import COMMAND, refused
+from small_study import SPECIFICATION, cells, finish, results, run_study, specification, start
 
 from jaxos4.study import load_study
 from jaxos4.study.dataset import open_store, read_store
