@@ -124,6 +124,7 @@ def test_the_commands_of_pages_run(story, run, tmp_path, request):
     for line in sorted(merged(here), key=lambda line: "simulate --closed-loop" not in line):
         if line.startswith("jaxos4 inspect mylog.bbl"):  # a test without real flights skips here
             shutil.copy(request.getfixturevalue("shared_flights") / "cinerat/cinerat_281.csv", tmp_path / "mylog.bbl")
+            mine.unlink()
         code, out, err = run(*shlex.split(line)[1:])
         assert code == next((code for option, code in EXIT_CODES.items() if option in line), 0), (line, err)
         said += " ".join(out.split())

@@ -85,7 +85,7 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
 
-def test_figures_as_pdf_are_beside_those_as_svg_if_wanted(study, tmp_path, run):
+def test_figures_as_pdf_are_beside_those_as_svg_if_wanted_and_do_not_outlive_them(study, tmp_path, run):
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     code, out, err = run("report", str(tmp_path), "--pdf")
     assert (code, err) == (0, "")
@@ -93,15 +93,10 @@ def test_figures_as_pdf_are_beside_those_as_svg_if_wanted(study, tmp_path, run):
     files = {path.name: path.read_bytes()[:5] for path in (tmp_path / "figures").iterdir()}
     assert files.keys() == {f"{name}.{kind}" for name in OF_SCENARIO for kind in ("svg", "pdf")}
     assert {head for name, head in files.items() if name.endswith(".pdf")} == {b"%PDF-"}
-    (tmp_path / "found.json").write_text("{}")
-    refused(run("report", str(tmp_path / "found.json"), "--pdf"), "--pdf:", "leave it out")
-
-
-def test_figures_of_an_earlier_run_do_not_stay_as_pdf(study, tmp_path):
-    write_report(study, tmp_path, pdf=True)
-    assert [*(tmp_path / "figures").glob("*.pdf")]
     write_report(study, tmp_path)
     assert not [*(tmp_path / "figures").glob("*.pdf")]
+    (tmp_path / "found.json").write_text("{}")
+    refused(run("report", str(tmp_path / "found.json"), "--pdf"), "--pdf:", "leave it out")
 
 
 def test_the_csv_has_every_number(study):
