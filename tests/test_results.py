@@ -138,6 +138,8 @@ def shown(path):
     write_flight_page(path.with_suffix(".html"), found)
 
 
+RESPONSE = identified_vehicle().to_dict()["response"]
+BACKWARD = {axis: found | {"frequency": found["frequency"][::-1]} for axis, found in RESPONSE.items()}
 DAMAGES = [
     (("predictions", "start", 1), 5, "`predictions`: starts must increase"),
     (("predictions", "start", 0), -1, "`predictions`: starts must increase"),
@@ -148,7 +150,7 @@ DAMAGES = [
     (("trajectories", "horizons", 24), 9e9, "`trajectories`: horizons must increase"),
     (("trajectories", "horizons", 3), 0.01, "`trajectories`: horizons must increase"),
     (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
-    (("response", "roll", "frequency", 0), 1e3, "`response.roll`: frequencies must be positive and increase"),
+    (("response",), BACKWARD, "`response.roll`: frequencies must be positive and increase"),
     (("response", "roll", "phase"), [1.0], "`response.roll`: `phase` has another shape"),
     (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),
     (("response", "yaw"), {}, "`response.yaw.frequency`: is not an array"),
