@@ -3,29 +3,24 @@
 The doors of logs are tested in `test_logs_readers`, that of a network's file also in `test_hybrid`.
 """
 
-import ast
-import io
 import json
 import os
 import sys
 import threading
 import time
-import tokenize
-import tomllib
 import tracemalloc
-import xml.etree.ElementTree as ElementTree
 
 import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from flight_csvs import csv
+from flight_csvs import csv, write_log
 from helpers import refused
 from hypothesis import given, settings, strategies as st
-from recorded_logs import ACCIDENTS, damaged, outcome, table_csv
+from recorded_logs import ACCIDENTS, damaged, outcome
 from small_study import AIRFRAME, SPECIFICATION
-from strange import in_one_line, survives_strange_values
-from synthetic_results import held, provenance, vehicle_result
+from strange import in_one_line, parsed, survives_strange_values
+from synthetic_results import predicting_result
 from synthetic_study import synthetic_study
 
 import jaxos4
@@ -38,19 +33,13 @@ from jaxos4.identification.problem import bracket_of
 from jaxos4.logs import read_log
 from jaxos4.models import MODELS
 from jaxos4.networks.file import load_network
-from jaxos4.recording import read_recording
-from jaxos4.recording.inspection import airframe_draft
 from jaxos4.study import load_study, read_results
 from jaxos4.study.dataset import read_store
 
 MINE = "mass = 0.6\ninertia = [7e-3, 7e-3, 1.2e-2]\narm = 0.2\nthrust_coefficient = 3e-5\ndrag_coefficient = 7e-7\n"
 MINE += "rotor_inertia = 6e-5\nmax_rotor_speed = inf\n"
 STUDY = SPECIFICATION.replace("title", 'airframes = ["mine"]\ntitle') + AIRFRAME
-LEVEL = {"strength": 1.0, "unit": "", "time_constant": 0.2, "sensor": 0.01, "correlation": 0.0}
-PREDICTS = {"disturbances": dict.fromkeys("pqr", LEVEL), "provenance": provenance(terms=["offset", "damping"])}
-PREDICTS["held"] = {f"alpha{i}": held(0.1) for i in (1, 2, 4, 5, 7)}
-OFFSETS = {f"{axis}_{kind}": 0.1 for kind in ("offset", "damping") for axis in ("roll", "pitch", "yaw")}
-RESULT = vehicle_result({f"alpha{i}": value for i, value in ((3, 6e4), (6, 5.9e4), (8, 3.5e4))} | OFFSETS, **PREDICTS)
+RESULT = predicting_result()
 NESTED = 250_000 * "["
 
 
@@ -345,60 +334,7 @@ def test_a_pipe_with_another_end_is_written_and_read_to_its_end(tmp_path):
     os.close(reader)
 
 
-# Texts in exported files and drafts
-
-HOSTILE = ['"""', "'''", "-->", "--->", "]]>", "<!--", "</mujoco>", "&", "&lt;", "<", '"', "\\", "\\u000a", "#", "--"]
-HOSTILE += ["coding: unicode_escape", "-*- coding: utf-7 -*-", "\nimport os", "\r", "\x0c", "\x85", "\u2028", "\x1b[2J"]
-HOSTILE += ["\udcff", "\ufffe", "{{ 1 }}", "{% raw %}", "é", "\u202e", "mass = 1", "{}", "%s", " ", "'", "b" * 40]
-NAMES = st.lists(st.sampled_from(HOSTILE), min_size=1, max_size=4).map("".join)
-
-
-def parsed(text, target):
-    """The names of a Python file outside of strings and comments, or the parts of an XML file that are no comments.
-
-    Of a TOML file, all that is in it.
-    """
-    if target == "drone-models":
-        return tomllib.loads(text)
-    if target != "rotorpy":
-        return {part for each in ElementTree.fromstring(text).iter() for part in (each.tag, *each.attrib.values())}
-    first, second = text.split("\n")[:2]
-    assert (first.isascii(), second) == (True, "")
-    ast.parse(text)
-    ast.parse(text.encode())  # as Python reads a file, with its encoding
-    tokens = tokenize.tokenize(io.BytesIO(text.encode()).readline)
-    return {token.string for token in tokens if token.type in (tokenize.NAME, tokenize.OP)}
-
-
-@pytest.mark.slow
-def test_hostile_names_are_in_comments_alone(tmp_path):
-    path = tmp_path / "found.json"
-    path.write_text(json.dumps(RESULT), encoding="utf-8")
-    found = read_result(path)
-    usual = {target: parsed(export_vehicle(found, target).text, target) for target in TARGETS}
-    log = read_recording(write_log(tmp_path / "flight.csv"))
-    draft = airframe_draft(log)[0]
-
-    @given(name=NAMES)
-    @settings(max_examples=200)
-    def law(name):
-        hostile = found._replace(source=name, result="no_skill", doubts=(name,), notes=(name, f"Note: {name}"))
-        for target in TARGETS:
-            written = export_vehicle(hostile, target)
-            assert parsed(written.text, target) == usual[target]
-            assert all(note.isprintable() for note in written.notes[2:])
-        named = airframe_draft(log._replace(name=name))[0]
-        assert named.splitlines()[1:] == draft.splitlines()[1:]
-        assert named.splitlines()[0].isprintable()
-
-    law()
-
-
-def write_log(path):
-    """A short log."""
-    time, names = 0.01 * np.arange(400), "t,omega1,omega2,omega3,omega4,p,q,r".split(",")
-    path.write_bytes(table_csv(names, time, np.full((400, 4), 1740.0), 0.1 * np.sin(np.outer(time, [3, 4, 5]))))
-    return path
+# Names of logs
 
 
 def test_a_name_with_a_line_break_writes_nothing_into_the_drafted_airframe(run, tmp_path):

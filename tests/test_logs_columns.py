@@ -8,7 +8,7 @@ import xarray as xr
 from column_logs import T, neurobem_csv
 from helpers import CRAZYFLIE, CRAZYFLIE_TOML, refused
 from recorded_logs import FRD, GRAVITY, RPM, check, force, position, quaternions, rates, speeds, table_csv, velocity
-from synthetic_results import held, provenance, vehicle_result
+from synthetic_results import predicting_result
 
 import jaxos4
 from jaxos4.errors import InputError
@@ -197,11 +197,7 @@ def test_the_commands_take_a_map_or_the_name_of_a_preset(save, run):
 
 def test_every_log_of_a_command_is_read_by_the_map(save, run):
     """Each of these lacks a column of the map, which is said before anything is fitted."""
-    parameters = {f"alpha{i}": value for i, value in ((3, 6e4), (6, 5.9e4), (8, 3.5e4))}
-    held_ones = {f"alpha{i}": held(0.1) for i in (1, 2, 4, 5, 7)}
-    level = {"strength": 1.0, "unit": "", "time_constant": 0.2, "sensor": 0.01, "correlation": 0.0}
-    about = {"provenance": provenance(terms=[]), "held": held_ones, "disturbances": dict.fromkeys("pqr", level)}
-    save(json.dumps(vehicle_result(parameters, **about)), "found.json")
+    save(json.dumps(predicting_result()), "found.json")
     save(odd_csv(), "flight.csv")
     save(neurobem_csv(), "bem.csv")
     save(CRAZYFLIE_TOML, "mine.toml")
