@@ -173,26 +173,28 @@ def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole,
     assert cells(copy) == cells(whole)
 
 
-@pytest.mark.slow
-def test_a_folder_whose_specification_is_damaged_is_refused(copy, run):
-    other = '{"version": "0.0.1", "device": "d", "study": {"of": "old"}}'
-    contents = dict.fromkeys(("", "\x00\x01", "[1, 2]", "[" * 100_000), "give another folder")
-    for content, fragment in (contents | {other: "begun by jaxos4 0.0.1"}).items():
-        (copy / "study.json").write_text(content)
-        for option in ((), ("--dry-run",)):
-            refused(run("study", "spec.toml", "--out", "out", *option), "out", fragment)
-        assert (copy / "study.json").read_text() == content
+OLD = '{"version": "0.0.1", "device": "d", "study": {"of": "old"}}'
 
 
-def test_a_folder_with_other_files_is_refused_and_unchanged(run, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "content", "out", "said"),
+    [
+        ("out/thesis.tex", "mine", "out", "thesis.tex"),
+        ("file", "mine", "file", "a file"),
+        ("file", "mine", ".", "holds file and no study"),
+        ("out/study.json", OLD, "out", "begun by jaxos4 0.0.1"),
+        *(("out/study.json", text, "out", "give another folder") for text in ("", "\x00\x01", "[1, 2]", "[" * 100_000)),
+    ],
+)
+def test_a_folder_without_a_study_of_this_version_is_refused_and_unchanged(name, content, out, said, run, tmp_path):
     specification(tmp_path)
-    (tmp_path / "out").mkdir()
-    for name in ("out/thesis.tex", "file"):
-        (tmp_path / name).write_text("mine")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(content)
+    before = [*tmp_path.rglob("*")]
     for option in ((), ("--dry-run",)):
-        for out, fragment in (("out", "thesis.tex"), ("file", "a file"), (".", "holds file and no study")):
-            refused(run("study", "spec.toml", "--out", out, *option), fragment)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+        refused(run("study", "spec.toml", "--out", out, *option), out, said)
+    assert (tmp_path / name).read_text() == content
+    assert [*tmp_path.rglob("*")] == before
 
 
 @pytest.mark.slow
