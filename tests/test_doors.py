@@ -1,6 +1,7 @@
-"""Nothing that comes from a file is trusted: each door ends in one line, and no text of a file becomes code or markup.
+"""Nothing that comes from a file is trusted: the reader of a damaged file ends in one line.
 
-The doors of logs are tested in `test_logs_readers`, that of a network's file also in `test_hybrid`.
+Readers of logs: `test_logs_readers`; of studies: `test_study_files`; of networks: `test_hybrid`. That no text of a file
+becomes code or markup: `test_export_descriptions`.
 """
 
 import json
@@ -10,10 +11,8 @@ import threading
 import time
 import tracemalloc
 
-import h5py
 import numpy as np
 import pytest
-import xarray as xr
 from flight_csvs import csv, write_log
 from helpers import refused
 from hypothesis import given, settings, strategies as st
@@ -21,7 +20,6 @@ from recorded_logs import ACCIDENTS, damaged, outcome
 from small_study import AIRFRAME, SPECIFICATION
 from strange import in_one_line, parsed, survives_strange_values
 from synthetic_results import predicting_result
-from synthetic_study import synthetic_study
 
 import jaxos4
 from jaxos4._files import read_toml, write_file
@@ -33,7 +31,7 @@ from jaxos4.identification.problem import bracket_of
 from jaxos4.logs import read_log
 from jaxos4.models import MODELS
 from jaxos4.networks.file import load_network
-from jaxos4.study import load_study, read_results
+from jaxos4.study import load_study
 from jaxos4.study.dataset import read_store
 
 MINE = "mass = 0.6\ninertia = [7e-3, 7e-3, 1.2e-2]\narm = 0.2\nthrust_coefficient = 3e-5\ndrag_coefficient = 7e-7\n"
@@ -185,116 +183,6 @@ def test_a_result_that_nobody_wrote_is_refused(save, reader, case):
         reader(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert str(caught.value).isprintable()
-
-
-# Folders of studies
-
-
-def small_dataset():
-    return synthetic_study(flights=4, scales=(1.0,), estimators=("ibss", "hybrid"), spoiled=False)
-
-
-def changed(change):
-    """Writes a study's Dataset after this change."""
-    return lambda path: change(small_dataset()).to_netcdf(path, engine="h5netcdf")
-
-
-def linked(link):
-    """Writes a study's Dataset that leads to another place. A pipe would never answer."""
-
-    def write(path):
-        small_dataset().to_netcdf(path, engine="h5netcdf")
-        os.mkfifo(path.with_name("pipe"))
-        with h5py.File(path, "r+") as file:
-            link(file)
-
-    return write
-
-
-def without_attributes(data):
-    data = data.copy()
-    for each in data.variables.values():
-        each.attrs = {}
-    return data
-
-
-def another_code(data):
-    return data.assign(result=(data["result"] + 100).assign_attrs(data["result"].attrs))
-
-
-def virtual_layout():
-    layout = h5py.VirtualLayout((4,), "f8")
-    layout[:] = h5py.VirtualSource("pipe", "x", (4,))
-    return layout
-
-
-def no_dataset(path):
-    xr.Dataset({"truth": ("flight", np.zeros(3))}).to_netcdf(path, engine="h5netcdf")
-
-
-NO_STUDY = {
-    "no folder": (lambda path: path.parent.rmdir(), "is not there"),
-    "no file": (lambda path: None, "holds no results.nc"),
-    "text": (lambda path: path.write_text("not a netCDF file"), "not a netCDF file that can be read"),
-    "HDF5": (lambda path: h5py.File(path, "w").create_dataset("truth", data=np.zeros(3)).file.close(), "not the"),
-    "another Dataset": (no_dataset, "not the results of a study"),
-    "no bound": (changed(lambda data: data.drop_vars("bound")), "no bound"),
-    "another shape": (changed(lambda data: data.isel(model=0)), "not the results of a study"),
-    "no coordinate": (changed(lambda data: data.drop_vars("excitation")), "no excitation"),
-    "another kind": (changed(lambda data: data.assign_coords(level=[-1, -1, -1, -1])), "level"),
-    "no codes": (changed(without_attributes), "codes"),
-    "another code": (changed(another_code), "code"),
-    "text of numbers": (changed(lambda data: data.assign(std=data["std"].astype(str))), "std is of another kind"),
-    "infinite level": (changed(lambda data: data.assign_coords(level=[0.5, 0.9, 0.95, np.inf])), "level"),
-    "control": (changed(lambda data: data.assign_coords(estimator=["ibss", "a\x07"])), "`estimator` is not one line"),
-    "failures": (changed(lambda data: data.assign_attrs(failures='[{"cell": 1}]')), "`failures`"),
-    "nested failures": (changed(lambda data: data.assign_attrs(failures=NESTED[:50_000])), "`failures`"),
-    "empty": (changed(lambda data: data.isel(flight=slice(0, 0))), "another kind or shape"),
-    "a pipe": (linked(lambda file: file.__setitem__("zz", h5py.ExternalLink("pipe", "/x"))), "a link to another"),
-    "a name": (linked(lambda file: file.__setitem__("zz", h5py.SoftLink("/zz"))), "a link to another place"),
-    "a device": (
-        linked(lambda file: file.create_dataset("zz", (4,), "f8", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])),
-        "its arrays are in another file",
-    ),
-    "another file": (
-        linked(lambda file: file.create_virtual_dataset("zz", virtual_layout())),
-        "its arrays are in another file",
-    ),
-}
-
-
-@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
-@pytest.mark.parametrize("case", NO_STUDY)
-def test_a_folder_that_no_study_wrote_is_refused_and_unchanged(run, tmp_path, case):
-    write, words = NO_STUDY[case]
-    (tmp_path / "study").mkdir()
-    write(tmp_path / "study" / "results.nc")
-    before = [*tmp_path.rglob("*")]
-    _, out, err = result = run("report", "study")
-    refused(result, "study", words)
-    assert out == ""
-    assert "jaxos4 study" in err or "run the study again" in err
-    assert [*tmp_path.rglob("*")] == before
-
-
-@pytest.mark.slow
-def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, capfd):
-    path = tmp_path / "results.nc"
-    synthetic_study(flights=4, scales=(1.0,), estimators=("ibss",), spoiled=False).to_netcdf(path, engine="h5netcdf")
-    content = path.read_bytes()
-
-    @given(accidents=ACCIDENTS)
-    @settings(max_examples=20)
-    def law(accidents):
-        path.write_bytes(damaged(content, accidents))
-        in_one_line(lambda _: read_results(tmp_path), path)
-
-    law()
-    bomb = xr.Dataset({"truth": (("flight", "parameter"), np.zeros((40_000, 1000), np.int8))})
-    bomb.to_netcdf(path, engine="h5netcdf", encoding={"truth": {"zlib": True, "complevel": 9}})
-    with pytest.raises(InputError, match="no |more than it holds"):
-        read_results(tmp_path)
-    assert capfd.readouterr() == ("", "")
 
 
 PIPES = {

@@ -173,30 +173,6 @@ def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole,
     assert cells(copy) == cells(whole)
 
 
-OLD = '{"version": "0.0.1", "device": "d", "study": {"of": "old"}}'
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "out", "said"),
-    [
-        ("out/thesis.tex", "mine", "out", "thesis.tex"),
-        ("file", "mine", "file", "a file"),
-        ("file", "mine", ".", "holds file and no study"),
-        ("out/study.json", OLD, "out", "begun by jaxos4 0.0.1"),
-        *(("out/study.json", text, "out", "give another folder") for text in ("", "\x00\x01", "[1, 2]", "[" * 100_000)),
-    ],
-)
-def test_a_folder_without_a_study_of_this_version_is_refused_and_unchanged(name, content, out, said, run, tmp_path):
-    specification(tmp_path)
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).write_text(content)
-    before = [*tmp_path.rglob("*")]
-    for option in ((), ("--dry-run",)):
-        refused(run("study", "spec.toml", "--out", out, *option), out, said)
-    assert (tmp_path / name).read_text() == content
-    assert [*tmp_path.rglob("*")] == before
-
-
 @pytest.mark.slow
 def test_half_written_files_of_a_killed_run_are_no_obstacle(copy, whole, run):
     for place in (".study.0123abcd.part.json", ".results.0123abcd.part.nc", "cells/.00000003.0123abcd.part.npz"):
