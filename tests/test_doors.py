@@ -1,6 +1,6 @@
 """Nothing that comes from a file is trusted: the reader of a damaged file ends in one line.
 
-Readers of logs: `test_logs_readers`; of studies: `test_study_files`; of networks: `test_hybrid`. That no text of a file
+Readers of logs: `test_logs_readers`; of studies: `test_study_specification`; of networks: `test_hybrid`. That no text of a file
 becomes code or markup: `test_export_descriptions`.
 """
 

@@ -159,7 +159,7 @@ def test_loops_become_fast_and_no_flag_of_the_user_is_replaced(variables, flags,
 
 
 def test_a_command_compiles_quickly_and_a_study_of_many_flights_is_fully_optimised(run, tmp_path, monkeypatch):
-    (tmp_path / "study.toml").write_text("")
+    (tmp_path / "study.toml").write_text("flights = 2")
     for arguments, quick in ((SIMULATE, True), (("study", "study.toml", "--out", "study", "--dry-run"), False)):
         monkeypatch.setenv("XLA_FLAGS", "")
         assert run(*arguments)[0] == 0
