@@ -312,7 +312,7 @@ def network_file(tmp_path_factory):
     lines = f"simulate --noise 1 --out {flight}", f"train {flight} --steps 1000 --out {network}"
     for line in lines:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("jaxos4.networks.NetworkEstimator", small)
+            patch.setattr(jaxos4, "NetworkEstimator", small)
             patch.setattr(sys, "argv", ["jaxos4", *line.split()])
             with pytest.raises(SystemExit) as stop:
                 main()
@@ -334,12 +334,19 @@ def test_a_trained_network_identifies_other_flights_of_its_inputs(run, network_f
 
 @pytest.mark.slow
 def test_the_architecture_of_a_network_can_be_chosen(run, network_file, monkeypatch):
-    small = functools.partial(NetworkEstimator, tilings=2, cells=4, batch=64, held_out=1000)
-    monkeypatch.setattr("jaxos4.networks.NetworkEstimator", small)
-    flight, options = str(network_file[1]), ["--architecture", "cmac", "--steps", "5", "--initial-state", "known"]
+    """What `train` asks for. A network with tables of weights: `test_network.py`; its file: `test_hybrid.py`."""
+    (network, flight), asked = map(str, network_file), []
+
+    class Trained(NetworkEstimator):
+        def fit(self, problem, bracket, *, key):
+            asked.append((self.architecture, self.steps, problem.initial_state is None))
+            return jaxos4.load_network(network)
+
+    monkeypatch.setattr(jaxos4, "NetworkEstimator", Trained)
+    options = ["--architecture", "cmac", "--steps", "5", "--initial-state", "known"]
     code, out, err = run("train", flight, *options, "--out", "flight.net")
     assert (code, "flight.net: cmac, score features of the rates" in out) == (0, True), err
-    assert jaxos4.load_network("flight.net").settings.architecture == "cmac"
+    assert asked == [("cmac", 5, False)]
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """Nothing that comes from a file is trusted: the reader of a damaged file ends in one line.
 
-Readers of logs: `test_logs_readers`; of studies: `test_study_specification`; of networks: `test_hybrid`. That no text of a file
-becomes code or markup: `test_export_descriptions`.
+Readers of logs: `test_logs_readers`; of studies: `test_study_specification`; of networks: `test_hybrid`. No text of a
+file becomes code or markup: `test_export_descriptions`.
 """
 
 import json
