@@ -1,7 +1,8 @@
 """The tutorials: scripts in cells, executed when the site is built, and shown with what they print and draw.
 
 A cell begins with `# %%`, or with `# %% [markdown]` if it is text: the percent format, which editors open as a
-notebook. Each page offers the script, and a notebook with the outputs.
+notebook. The last cell, `# %% [check]`, asserts that the answers are right; it is executed, but not shown. Each page
+offers the script, and a notebook with the outputs.
 """
 
 import ast
@@ -24,6 +25,7 @@ class Cell(NamedTuple):
 
     source: str
     is_text: bool = False
+    is_check: bool = False
     said: str = ""
     pictures: tuple[str, ...] = ()
 
@@ -33,17 +35,18 @@ def cells(script: str) -> list[Cell]:
     found = []
     for kind, source in re.findall(r"^# %%(.*)\n((?:(?!# %%).*\n?)*)", script, flags=re.MULTILINE):
         text = re.sub(r"^# ?", "", source, flags=re.MULTILINE) if "[markdown]" in kind else source
-        found.append(Cell(text.strip(), "[markdown]" in kind))
+        found.append(Cell(text.strip(), "[markdown]" in kind, "[check]" in kind))
     return found
 
 
 @functools.cache  # `mkdocs serve` builds again after each change
 def executed(script: str) -> tuple[list[Cell], dict]:
-    """The cells with their outputs, and the names that they define. Runs in an empty folder."""
+    """The cells that are shown, with their outputs, and the names that all define. Runs in an empty folder."""
     defined: dict = {"__name__": "tutorial"}
     plt.switch_backend("agg")
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), plt.rc_context({"svg.hashsalt": "jaxos4"}):
-        return [cell if cell.is_text else _executed(cell, defined) for cell in cells(script)], defined
+        ran = [cell if cell.is_text else _executed(cell, defined) for cell in cells(script)]
+    return [cell for cell in ran if not cell.is_check], defined
 
 
 def _executed(cell: Cell, defined: dict) -> Cell:

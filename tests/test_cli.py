@@ -11,7 +11,7 @@ import sys
 import pytest
 import typer
 from helpers import CRAZYFLIE_TOML, refused
-from pages import words
+from pages import without_matplotlib, words
 from synthetic_results import vehicle_result
 
 import jaxos4
@@ -50,8 +50,9 @@ def test_simulate_writes_the_standard_flight(run, tmp_path):
     assert (a == b, a == c) == (True, False)
 
 
-def test_estimate_recovers_the_truth_within_its_intervals(run):
+def test_estimate_recovers_the_truth_within_its_intervals(run, monkeypatch):
     simulate(run, "flight.csv", "--noise", "1")
+    without_matplotlib(monkeypatch)
     code, out, err, report = estimate(run, "--report", "e.html")
     assert code == 0, err
     page = words(pathlib.Path("e.html").read_text(encoding="utf-8"))
@@ -249,6 +250,15 @@ REFUSED = {
     f"{EXPORT} --out nowhere/vehicles --samples 2": ["nowhere/vehicles", "no such folder"],
     f"{EXPORT} --to gazebo": ["'gazebo' is not one of 'mujoco', 'rotorpy', 'sdf'"],
     "export none.json --to sdf": ["none.json", "give a path"],
+    "report .": ["jaxos4: .: holds no results.nc; give a folder that `jaxos4 study` wrote.\n"],
+    "report ..": ["jaxos4: ..: holds no results.nc; give a folder that `jaxos4 study` wrote.\n"],
+    "predict r.json f.csv --horizon 1e300": ["jaxos4: --horizon: must lie within +-1e+09, got 1e+300.\n"],
+    "predict r.json f.csv --spacing 1e300": ["jaxos4: --spacing: must lie within +-1e+09, got 1e+300.\n"],
+    "design --out i.csv --slowest 1e300": ["jaxos4: --slowest: must lie within +-1e+09, got 1e+300.\n"],
+    "simulate --out f.csv --duration 1e300": ["jaxos4: --duration: must lie within +-1e+09, got 1e+300.\n"],
+    "estimate f.csv --end -1e300": ["jaxos4: --end: must lie within +-1e+09, got -1e+300.\n"],
+    "train f.csv --out n.npz --noise 1 inf": ["jaxos4: --noise: must lie within +-1e+09, got inf.\n"],
+    "export r.json --to urdf --samples 10000000000": ["jaxos4: --samples: must lie within +-1e+09, got 1e+10.\n"],
 }
 
 
@@ -302,7 +312,7 @@ def network_file(tmp_path_factory):
     lines = f"simulate --noise 1 --out {flight}", f"train {flight} --steps 1000 --out {network}"
     for line in lines:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("jaxos4.networks.NetworkEstimator", small)
+            patch.setattr(jaxos4, "NetworkEstimator", small)
             patch.setattr(sys, "argv", ["jaxos4", *line.split()])
             with pytest.raises(SystemExit) as stop:
                 main()
@@ -324,12 +334,19 @@ def test_a_trained_network_identifies_other_flights_of_its_inputs(run, network_f
 
 @pytest.mark.slow
 def test_the_architecture_of_a_network_can_be_chosen(run, network_file, monkeypatch):
-    small = functools.partial(NetworkEstimator, tilings=2, cells=4, batch=64, held_out=1000)
-    monkeypatch.setattr("jaxos4.networks.NetworkEstimator", small)
-    flight, options = str(network_file[1]), ["--architecture", "cmac", "--steps", "5", "--initial-state", "known"]
+    """What `train` asks for. A network with tables of weights: `test_network.py`; its file: `test_hybrid.py`."""
+    (network, flight), asked = map(str, network_file), []
+
+    class Trained(NetworkEstimator):
+        def fit(self, problem, bracket, *, key):
+            asked.append((self.architecture, self.steps, problem.initial_state is None))
+            return jaxos4.load_network(network)
+
+    monkeypatch.setattr(jaxos4, "NetworkEstimator", Trained)
+    options = ["--architecture", "cmac", "--steps", "5", "--initial-state", "known"]
     code, out, err = run("train", flight, *options, "--out", "flight.net")
     assert (code, "flight.net: cmac, score features of the rates" in out) == (0, True), err
-    assert jaxos4.load_network("flight.net").settings.architecture == "cmac"
+    assert asked == [("cmac", 5, False)]
 
 
 @pytest.mark.slow

@@ -30,7 +30,6 @@ import jaxos4
 from experiments.pictures.run import floors_picture
 from jaxos4._registry import Registry
 from jaxos4.airframe import airframe_table
-from jaxos4.closed_loop import fly_standard
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.noise import NOISES
 from jaxos4.study import load_study
@@ -179,16 +178,6 @@ def test_the_documented_estimator_and_search_run():
     assert issubclass(searched["Descent"], jaxos4.AbstractEstimator)
 
 
-@pytest.mark.slow
-def test_the_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    flown = fly_standard(jaxos4.ClosedLoop(CRAZYFLIE, gust=2.0, logged="commands"), duration=15.0, seed=0)
-    jaxos4.write_flight(flown, "sim.csv", CRAZYFLIE)
-    (code,) = blocks(ROOT / "README.md", "python")
-    exec(code, {})  # noqa: S102
-    assert re.search(r"\nidentified \(0\.0\d+, 0\.0\d+\)\n$", capsys.readouterr().out)
-
-
 def test_the_documented_term_brakes_the_yaw():
     model = run_blocks("term.md")["model"]
     flight = standard_flight()
@@ -254,8 +243,8 @@ def test_another_package_adds_an_estimator_a_term_and_a_log_format(tmp_path):
         f"estimate flight.csv --estimator gauss-newton {known}": (0, "gauss-newton, published model"),
         "study study.toml --out study --dry-run": (0, "gauss-newton"),
     }
-    settings = {"JAX_NUM_CPU_DEVICES": "1", **how_we_compile()}  # the first line fixes the devices of the process
-    process = start(*expected, code="import sys; sys.path.append('.')\n" + FAKE + EACH, cwd=tmp_path, **settings)
+    code = "import sys; sys.path.append('.')\n" + FAKE + EACH
+    process = start(*expected, code=code, cwd=tmp_path, **how_we_compile())
     assert process.returncode == 0, process.stderr
     (used, rates, notes, looks_at, last, names, by_default), *answers = map(json.loads, process.stdout.splitlines())
     assert (used, looks_at, last, by_default) == ([], "rates", "gauss-newton", False)

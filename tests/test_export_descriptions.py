@@ -1,13 +1,18 @@
-"""Exported descriptions in XML (SDF, URDF, MuJoCo): what they say of the mass, the inertia and the rotors."""
+"""Exported descriptions: mass, inertia and rotors in XML (SDF, URDF, MuJoCo), and names that are no code or markup."""
 
 import json
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from flight_csvs import write_log
+from hypothesis import given, settings, strategies as st
+from strange import parsed
 from synthetic_results import vehicle_result
 
-from jaxos4.export import export_vehicle, read_result
+from jaxos4.export import TARGETS, export_vehicle, read_result
+from jaxos4.recording import read_recording
+from jaxos4.recording.inspection import airframe_draft
 
 
 def described(save, target):
@@ -79,3 +84,36 @@ def inertial(link):
     assert min(mass, *moments) > 0
     assert 2 * moments.max() <= moments.sum() * (1 + 1e-12)
     return mass, (pose + center)[:3], tensor
+
+
+# Texts in exported files and drafts
+
+HOSTILE = ['"""', "'''", "-->", "--->", "]]>", "<!--", "</mujoco>", "&", "&lt;", "<", '"', "\\", "\\u000a", "#", "--"]
+HOSTILE += ["coding: unicode_escape", "-*- coding: utf-7 -*-", "\nimport os", "\r", "\x0c", "\x85", "\u2028", "\x1b[2J"]
+HOSTILE += ["\udcff", "\ufffe", "{{ 1 }}", "{% raw %}", "é", "\u202e", "mass = 1", "{}", "%s", " ", "'", "b" * 40]
+NAMES = st.lists(st.sampled_from(HOSTILE), min_size=1, max_size=4).map("".join)
+
+
+@pytest.mark.slow
+def test_hostile_names_are_in_comments_alone(tmp_path):
+    path = tmp_path / "found.json"
+    path.write_text(json.dumps(vehicle_result()), encoding="utf-8")
+    found = read_result(path)
+    usual = {target: parsed(export_vehicle(found, target).text, target) for target in TARGETS}
+
+    @given(name=NAMES)
+    @settings(max_examples=200)
+    def law(name):
+        hostile = found._replace(source=name, result="no_skill", doubts=(name,), notes=(name, f"Note: {name}"))
+        for target in TARGETS:
+            written = export_vehicle(hostile, target)
+            assert parsed(written.text, target) == usual[target]
+            assert all(note.isprintable() for note in written.notes[2:])
+
+    law()
+    log = read_recording(write_log(tmp_path / "flight.csv"))
+    usual = airframe_draft(log)[0].splitlines()
+    for name in HOSTILE:
+        first, *others = airframe_draft(log._replace(name=name))[0].splitlines()
+        assert first.isprintable()
+        assert others == usual[1:]

@@ -7,9 +7,11 @@ import jax
 import numpy as np
 import pytest
 from helpers import DT, same
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
 from lanes import LANES
+from recorded_logs import ACCIDENTS, damaged
 from small_network import BRACKET, CMAC, OMEGA, PUBLISHED, SMALL, flights, identify, names, problem_of, trained
+from strange import in_one_line
 
 import jaxos4
 
@@ -79,22 +81,11 @@ def network_file(tmp_path_factory):
 
 @pytest.mark.slow
 @settings(max_examples=30)
-@given(st.data())
-def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(network_file, data):
-    content, path = bytearray(network_file.read_bytes()), network_file.with_name("altered.net")
-    place = st.integers(0, len(content) - 1)
-    if data.draw(st.booleans()):
-        content = content[: data.draw(place)]
-    else:
-        for _ in range(data.draw(st.integers(1, 4))):
-            content[data.draw(place)] = data.draw(st.integers(0, 255))
-    path.write_bytes(content)
-    message = ""
-    try:
-        jaxos4.load_network(path)
-    except jaxos4.InputError as error:
-        message = str(error)
-    assert "\n" not in message
+@given(accidents=ACCIDENTS)
+def test_a_damaged_file_is_refused_in_one_line_or_harmless(network_file, accidents):
+    path = network_file.with_name("damaged.net")
+    path.write_bytes(damaged(network_file.read_bytes(), accidents))
+    in_one_line(jaxos4.load_network, path)
 
 
 def test_a_file_from_before_there_were_architectures_opens(tmp_path, network_file):

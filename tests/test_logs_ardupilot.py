@@ -10,11 +10,6 @@ from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log, read_recording
 
 
-def test_the_voltage_is_read(save):
-    flight, _ = read_log(save(everything()))
-    np.testing.assert_allclose(flight.voltage[:1150], 16 - 0.1 * np.asarray(flight.time)[:1150], atol=1e-4)
-
-
 def test_the_library_of_ardupilot_reads_the_same(save, capfd):
     reader = pytest.importorskip("pymavlink.DFReader", reason="compares with the library of ArduPilot")
     path = save(everything())
@@ -56,23 +51,6 @@ def test_outputs_are_put_in_the_order_of_the_motors(measured, save):
     flight, _ = read_log(save(dataflash([imu(T), angles(T), motors], functions | limits)), CRAZYFLIE)
     wanted = speeds(np.asarray(flight.time)[:-1] + 0.00125) if measured else 2500 * commands(T[:-1])
     np.testing.assert_allclose(flight.omega[:-1], wanted, atol=1.3)
-
-
-def test_motors_at_10_hz_are_refused_with_the_setting_that_helps(save, run):
-    save(dataflash([imu(T), angles(T), outputs(T[::40])], {"LOG_BITMASK": 176126.0}), "flight.bin")
-    code, out, _ = run("inspect", "flight.bin")
-    assert code == 0
-    text = " ".join(out.split())
-    assert "flight.bin: ArduPilot DataFlash log" in text
-    assert "the motors were logged at 10 Hz (RCOU), too rarely to identify a vehicle" in text
-    assert "SERVO_BLH_BDMASK = 15" in text
-    assert f"set LOG_BITMASK to {176126 | 1 | 1 << 18} (with fast attitude and fast IMU), and fly again" in text
-
-
-def test_measured_speeds_that_are_rare_are_not_used_if_commands_are_fast(save):
-    flight, notes = read_log(save(dataflash([imu(T), angles(T), escs(T[::40]), outputs(T)])), CRAZYFLIE)
-    assert flight.commanded
-    assert any("measured speeds (ESC) were logged at 10 Hz only: commands are used" in note for note in notes)
 
 
 def test_what_follows_damage_up_to_the_next_message_is_ignored(save):

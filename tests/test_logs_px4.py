@@ -27,6 +27,7 @@ from recorded_logs import FRD, VEHICLE, check, force, message, outcome, speeds
 
 from jaxos4.errors import InputError
 from jaxos4.logs import Sampling, read_log, read_recording
+from jaxos4.logs.messages import Messages
 
 # Commands
 
@@ -78,17 +79,11 @@ def test_one_flight_gives_the_same_speeds_in_whatever_unit_its_commands_are_logg
     assert sum("THR_MDL_FAC is 0" in note for note in notes) == (curve == 0)
 
 
-def test_measured_speeds_that_are_slow_give_way_to_commands_and_unknown_motors_are_none(save):
-    t = grid(0.01, 3.2, offset=-0.1)
+def test_of_slow_motors_the_faster_are_read_and_unknown_motors_are_none(save):
     slow = escs(grid(0.25, 3.4, offset=-0.2))
-    path = save(log(combined(grid(0.005)), slow, motors(t, [[0.4] * 4] * t.size)))
-    found = read_recording(path, CRAZYFLIE)
-    assert found.commanded
-    assert any("logged at 4 Hz only: commands are used" in note for note in found.notes)
-    assert found.facts.motors == Sampling("actuator_motors", pytest.approx(100.0))
-    path = save(log(combined(grid(0.005)), slow, motors(grid(0.5, 3.4, offset=-0.2), [[0.4] * 4] * 7)))
-    assert not read_log(path)[0].commanded  # of slow ones, the faster
-    topics, split = as_pwm(t, 0.0)
+    slower = motors(grid(0.5, 3.4, offset=-0.2), [[0.4] * 4] * 7)
+    assert not read_log(save(log(combined(grid(0.005)), slow, slower)))[0].commanded
+    topics, split = as_pwm(grid(0.005, 3.2, offset=-0.1), 0.0)
     split |= {"PWM_AUX_FUNC7": 0, "PWM_MAIN_FUNC1": 104}  # three motors on one driver, one on another
     with pytest.raises(InputError, match="no rotor speeds or commands"):
         read_log(save(log(combined(grid(0.005)), *topics, **split)), CRAZYFLIE)
@@ -204,6 +199,13 @@ def test_without_pyulog_it_is_said_what_to_install(save, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(InputError, match=r"install jaxos4\[ulog\]\.$"):
         read_log(path)
+
+
+def test_a_corrupt_field_of_an_esc_is_missing():
+    fields = {"esc[0].actuator_function": np.array([101.0, np.nan]), "esc[1].state": np.array([5.0])}
+    log = Messages("log", {"esc_status": {0: fields}}, "")
+    assert log.latest("esc_status", "esc[0].actuator_function") is None
+    assert log.latest("esc_status", "esc[1].state") == 5.0
 
 
 # Real logs

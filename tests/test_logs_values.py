@@ -1,5 +1,6 @@
 """What the values of a log must be: units against each other, impossible samples, rates of logging."""
 
+import ardupilot_logs as dataflash
 import blackbox_logs as blackbox
 import crazyflie_logs as crazyflie
 import numpy as np
@@ -100,18 +101,23 @@ def test_ten_impossible_samples_are_missing_and_the_rest_is_as_it_was(write, sav
         assert " (13 of 1250 values, more than 1 %); " in message
 
 
-def test_an_impossible_first_value_of_a_rotor_is_the_next_one(save):
-    rows = [f"{0.01 * k:.2f},{2e5 if k in (0, 1, 9) else 100 + k},1,1,1,0.1" for k in range(400)]
+def test_impossible_values_of_a_rotor_are_counted_and_replaced_by_the_value_before_or_the_next_one(save):
+    speeds = {0: 2e5, 1: 2e5, 9: 2e5, 250: 33_000.0}
+    rows = [f"{0.01 * k:.2f},{speeds.get(k, 100 + k)},1,1,1,0.1" for k in range(400)]
     found = read_recording(save("\n".join(["t,omega1,omega2,omega3,omega4,p", *rows])))
-    assert found.omega[[0, 1, 2, 8, 9, 10], 0].tolist() == [102, 102, 102, 108, 108, 110]
-    assert found.notes == ("impossible values count as not measured, in omega1: 3 (first 200000 rad/s at 0 s)",)
+    assert found.omega[[0, 1, 2, 8, 9, 10, 250], 0].tolist() == [102, 102, 102, 108, 108, 110, 349]
+    assert found.notes == ("impossible values count as not measured, in omega1: 4 (first 200000 rad/s at 0 s)",)
+
+
+def test_a_motor_that_idles_for_most_of_the_log_and_then_flies_six_times_as_fast_is_possible(save):
+    rows = [[0.01 * k, *4 * [300.0 if k < 395 else 1800.0], np.sin(k), 0, 0] for k in range(400)]
+    content = table_csv("t,omega1,omega2,omega3,omega4,p,q,r".split(","), np.array(rows))
+    assert read_recording(save(content)).omega.max() == 1800.0
 
 
 def ardupilot_of(t, gyro, accelerometer, rotors):
     imu = ("IMU", "Bffffff", "I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ", t, (0 * t, gyro(t) @ FRD, accelerometer(t) @ FRD))
-    late = [t + 5e-4 * i for i in range(4)]  # a message for each motor, at times of its own
-    rows = [np.column_stack([np.full(t.size, i), rotors(late[i])[:, i] / RPM]) for i in range(4)]
-    return recorded_logs.dataflash([imu, ("ESC", "Bf", "Instance,RPM", np.concatenate(late), (np.concatenate(rows),))])
+    return recorded_logs.dataflash([imu, dataflash.escs(t, speeds=rotors)])
 
 
 @pytest.mark.parametrize("write", [*IMPOSSIBLE, ardupilot_of])
@@ -210,18 +216,27 @@ def slow_crazyflie(step):
     return recorded_logs.crazyflie(events)
 
 
+def slow_ardupilot(step):
+    t = dataflash.T
+    messages = [dataflash.imu(t), dataflash.angles(t), dataflash.outputs(t[:: round(step / 0.0025)])]
+    return recorded_logs.dataflash(messages, {"LOG_BITMASK": 176126.0})
+
+
+MOTORS_OF = {slow_ulog: "actuator_motors", slow_csv: "command1", slow_crazyflie: "motor.m1", slow_ardupilot: "RCOU"}
 REMEDIES = {
-    slow_ulog: ("actuator_motors", "set SDLOG_PROFILE to 147 (which includes 16, 'high rate')"),
-    slow_csv: ("command1", "log motors and gyro at 100 Hz or more"),
-    slow_crazyflie: ("motor.m1", "raise the frequency of these variables in the deck's config.txt"),
+    slow_ulog: "set SDLOG_PROFILE to 147 (which includes 16, 'high rate')",
+    slow_csv: "log motors and gyro at 100 Hz or more",
+    slow_crazyflie: "raise the frequency of these variables in the deck's config.txt",
+    slow_ardupilot: "by ESC telemetry of bidirectional DShot (SERVO_BLH_BDMASK = 15), because RCOU is always at 10 Hz, "
+    f"set LOG_BITMASK to {176126 | 1 | 1 << 18} (with fast attitude and fast IMU), and fly again",
 }
 
 
 @pytest.mark.parametrize("kind", REMEDIES)
 def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, tmp_path):
     (tmp_path / "vehicle.toml").write_text(VEHICLE)
-    name, remedy = save(kind(0.1)).name, REMEDIES[kind][1]
-    words = f"the motors were logged at 10 Hz ({REMEDIES[kind][0]}), too rarely to identify a vehicle: "
+    name, remedy = save(kind(0.1)).name, REMEDIES[kind]
+    words = f"the motors were logged at 10 Hz ({MOTORS_OF[kind]}), too rarely to identify a vehicle: "
     code, out, err = run("inspect", name, "--airframe", "vehicle.toml", "--out", "found.json")
     assert (code, err) == (0, "")
     first = out.splitlines()[1]
@@ -233,5 +248,24 @@ def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, 
     refused(result, f"jaxos4: {name}: {words}", remedy)
     assert read_log(save(kind(0.1)), CRAZYFLIE)[1][-1].startswith(words)
     fast = read_recording(save(kind(0.02)), CRAZYFLIE).facts
-    assert fast.motors == Sampling(REMEDIES[kind][0], pytest.approx(50.0, rel=0.01))
+    assert fast.motors == Sampling(MOTORS_OF[kind], pytest.approx(50.0, rel=0.01))
     assert fast.too_slow == ""
+
+
+def rare_ulog():
+    t = ulog.grid(0.01, 3.2, offset=-0.1)
+    return ulog.log(ulog.combined(ulog.grid(0.005)), ulog.escs(t[::25]), ulog.motors(t, [[0.4] * 4] * t.size))
+
+
+def rare_ardupilot():
+    t = dataflash.T
+    messages = [dataflash.imu(t), dataflash.angles(t), dataflash.escs(t[::100]), dataflash.outputs(t[::4])]
+    return recorded_logs.dataflash(messages)
+
+
+@pytest.mark.parametrize(("kind", "motors"), [(rare_ulog, "actuator_motors"), (rare_ardupilot, "RCOU")])
+def test_measured_speeds_that_are_rare_are_not_used_if_commands_are_fast(kind, motors, save):
+    found = read_recording(save(kind()), CRAZYFLIE)
+    assert found.commanded
+    assert any("logged at 4 Hz only: commands are used" in note for note in found.notes)
+    assert found.facts.motors == Sampling(motors, pytest.approx(100.0))

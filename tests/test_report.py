@@ -7,7 +7,6 @@ import math
 import re
 from xml.etree import ElementTree
 
-import h5py
 import matplotlib.colors
 import numpy as np
 import pytest
@@ -86,7 +85,7 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
 
-def test_figures_as_pdf_are_beside_those_as_svg_if_wanted(study, tmp_path, run):
+def test_figures_as_pdf_are_beside_those_as_svg_if_wanted_and_do_not_outlive_them(study, tmp_path, run):
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     code, out, err = run("report", str(tmp_path), "--pdf")
     assert (code, err) == (0, "")
@@ -94,15 +93,10 @@ def test_figures_as_pdf_are_beside_those_as_svg_if_wanted(study, tmp_path, run):
     files = {path.name: path.read_bytes()[:5] for path in (tmp_path / "figures").iterdir()}
     assert files.keys() == {f"{name}.{kind}" for name in OF_SCENARIO for kind in ("svg", "pdf")}
     assert {head for name, head in files.items() if name.endswith(".pdf")} == {b"%PDF-"}
-    (tmp_path / "found.json").write_text("{}")
-    refused(run("report", str(tmp_path / "found.json"), "--pdf"), "--pdf:", "leave it out")
-
-
-def test_figures_of_an_earlier_run_do_not_stay_as_pdf(study, tmp_path):
-    write_report(study, tmp_path, pdf=True)
-    assert [*(tmp_path / "figures").glob("*.pdf")]
     write_report(study, tmp_path)
     assert not [*(tmp_path / "figures").glob("*.pdf")]
+    (tmp_path / "found.json").write_text("{}")
+    refused(run("report", str(tmp_path / "found.json"), "--pdf"), "--pdf:", "leave it out")
 
 
 def test_the_csv_has_every_number(study):
@@ -284,30 +278,6 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
     stands_alone(text)
     assert words(text).count("alert(1)") >= 6
     assert all(name in words(text) for name in ("{{ 1 }}", "$\\frac{<b>}$"))
-
-
-NOT_A_STUDY = {
-    "no folder": lambda path: path.parent.rmdir(),
-    "no file": lambda path: None,
-    "text": lambda path: path.write_text("not a netCDF file"),
-    "hdf5": lambda path: h5py.File(path, "w").create_dataset("truth", data=np.zeros(3)).file.close(),
-    "another netcdf": lambda path: xr.Dataset({"truth": ("flight", np.zeros(3))}).to_netcdf(path, engine="h5netcdf"),
-    "half": lambda path: synthetic_study(flights=9).drop_vars("bound").to_netcdf(path, engine="h5netcdf"),
-    "shapes": lambda path: synthetic_study(flights=9).isel(model=0).to_netcdf(path, engine="h5netcdf"),
-}
-
-
-@pytest.mark.parametrize("write", NOT_A_STUDY.values(), ids=NOT_A_STUDY)
-def test_what_is_not_a_study_is_refused_and_nothing_is_written(write, tmp_path, run):
-    folder = tmp_path / "study"
-    folder.mkdir()
-    write(folder / "results.nc")
-    before = list(tmp_path.rglob("*"))
-    _, out, err = result = run("report", str(folder))
-    refused(result, str(folder))
-    assert out == ""
-    assert "jaxos4 study" in err or "run the study again" in err
-    assert list(tmp_path.rglob("*")) == before
 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):

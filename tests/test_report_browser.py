@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from pages import CARDS, CUT, DRAWN, TEXTS, WIDE, WIDTHS, overlapping
+from pages import CARDS, CUT, DRAWN, TEXTS, WIDE, WIDTHS, overlapping, stands_alone, without_matplotlib
 from sign_flights import flown
 from synthetic_identification import (
     SAMPLE_TIMES,
@@ -52,37 +52,55 @@ DESIGNS = {
 }
 
 
+LONG = "A_flight_with_a_long_name_of_2026-11-24.csv"
+
+
+def two_logs():
+    log, time = np.repeat([0, 1], 100), 0.02 * np.arange(200)
+    traces = synthetic_traces(time, log, np.ones((200, 3)))
+    return identified_vehicle(predictions=None, traces=traces, provenance={"flights": ["first.csv", "other.csv"]})
+
+
 @pytest.fixture(scope="module")
-def addresses(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("report")
-    study = synthetic_study(flights=12, estimators=tuple(ESTIMATORS), scales=(0.1, 1.0))
-    files = {"study": write_report(study, folder)[0]}
-    (folder / "one").mkdir()
-    files["one flight"] = write_report(study.isel(flight=[0], estimator=slice(4)), folder / "one")[0]
-    for name, found in {
+def files(tmp_path_factory):
+    """A page of each kind, made without matplotlib."""
+    folder, flight = tmp_path_factory.mktemp("report"), flown(CRAZYFLIE, 0)
+    found = {
         "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
         "without predictions": identified_vehicle(predictions=None),
         "os4": identified_flight(**behind_an_estimate()),
-    }.items():
-        files[name] = folder / f"{name}.html"
-        write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")
-    files["two logs"] = folder / "two.html"
-    log, time = np.repeat([0, 1], 100), 0.02 * np.arange(200)
-    traces = synthetic_traces(time, log, np.ones((200, 3)))
-    of_two = {"predictions": None, "traces": traces, "provenance": {"flights": ["first.csv", "other.csv"]}}
-    write_flight_page(files["two logs"], identified_vehicle(**of_two))
-    files["log"] = folder / "log.html"
-    flight = flown(CRAZYFLIE, 0)
-    write_log_page(files["log"], flight, CRAZYFLIE)
-    files["late"] = folder / "late.html"
-    write_log_page(files["late"], flight._replace(time=1234.3 + flight.time), CRAZYFLIE)
+        "two logs": two_logs(),
+    }
     long = [identified_vehicle(provenance={"flights": [f"A_flight_with_a_long_name_{i}.csv"]}) for i in range(4)]
-    files["comparison"] = folder / "comparison.html"
-    write_comparison(files["comparison"], compare_results(long))
-    for name, given in DESIGNS.items():
-        files[name] = folder / f"{name}.svg"
-        write_design(synthetic_design(*given), 0.01, files[name])
+    study = synthetic_study(flights=12, estimators=tuple(ESTIMATORS), scales=(0.1, 1.0))
+    (folder / "one").mkdir()
+    names = [*found, "log", "late", "comparison"]
+    files = {name: folder / f"{name}.html" for name in names} | {name: folder / f"{name}.svg" for name in DESIGNS}
+    with pytest.MonkeyPatch.context() as patch:
+        without_matplotlib(patch)
+        files["study"] = write_report(study, folder)[0]
+        files["one flight"] = write_report(study.isel(flight=[0], estimator=slice(4)), folder / "one")[0]
+        for name, each in found.items():
+            write_flight_page(files[name], each, title=LONG)
+        write_log_page(files["log"], flight, CRAZYFLIE)
+        write_log_page(files["late"], flight._replace(time=1234.3 + flight.time), CRAZYFLIE)
+        write_comparison(files["comparison"], compare_results(long))
+        for name, given in DESIGNS.items():
+            write_design(synthetic_design(*given), 0.01, files[name])
+    return files
+
+
+@pytest.fixture(scope="module")
+def addresses(files):
     return {name: path.as_uri() for name, path in files.items()}
+
+
+def test_pages_and_their_figures_are_made_without_matplotlib(files):
+    for name, path in files.items():
+        text = path.read_text(encoding="utf-8")
+        assert "<svg" in text, name
+        if name not in DESIGNS:
+            stands_alone(text)
 
 
 @pytest.fixture(scope="module")

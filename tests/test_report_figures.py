@@ -1,4 +1,4 @@
-"""Figures as SVG: the numbers that they show, nothing outside of the axes, and no plotting library on the way."""
+"""Figures as SVG: the numbers that they show, and nothing outside of the axes."""
 
 import itertools
 import re
@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, how_we_compile, start
+from helpers import CRAZYFLIE
 from pages import assert_inside
 from sign_flights import flown
 from synthetic_identification import SAMPLE_TIMES, behind_an_estimate, identified_flight, identified_vehicle
@@ -158,46 +158,3 @@ def test_no_mark_of_a_page_is_outside_of_its_axes_and_each_series_has_a_name():
         assert figure.legend() or len(colors) <= 4, figure.stem
         ElementTree.fromstring(as_file(figure))
         assert as_file(figure) == as_file(figure)
-
-
-# An import of matplotlib fails in these programs.
-PAGES = """
-import pathlib, sys
-sys.modules["matplotlib"] = None
-from synthetic_identification import CRAZYFLIE, behind_an_estimate, identified_flight, identified_vehicle
-from synthetic_study import synthetic_study
-from sign_flights import flown
-from jaxos4 import compare_results
-from jaxos4.report import write_comparison, write_flight_page, write_log_page, write_report
-write_flight_page("vehicle.html", identified_vehicle())
-write_flight_page("os4.html", identified_flight(**behind_an_estimate()))
-write_comparison("compared.html", compare_results([identified_vehicle()] * 2))
-write_log_page("log.html", flown(CRAZYFLIE, 0, seconds=6.0), CRAZYFLIE)
-write_report(synthetic_study(flights=4), pathlib.Path())
-"""
-ESTIMATE = """
-import sys
-sys.modules["matplotlib"] = None
-import jaxos4
-from jaxos4.cli import main
-model = jaxos4.PublishedOS4(jaxos4.OS4)
-flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(jaxos4.OS4, duration=2.0), dt=0.01)
-jaxos4.write_flight(flight, "flight.csv")
-sys.argv[1:] = "estimate flight.csv --estimator equation-error --report estimate.html".split()
-main()
-"""
-
-
-@pytest.mark.parametrize(
-    ("code", "pages"),
-    [
-        (PAGES, ("vehicle", "os4", "compared", "log", "report")),
-        pytest.param(ESTIMATE, ("estimate",), marks=pytest.mark.slow),
-    ],
-    ids=["library", "estimate"],
-)
-def test_pages_are_drawn_without_matplotlib(tmp_path, code, pages):
-    process = start(code=code, cwd=tmp_path, **how_we_compile())
-    assert process.returncode == 0, process.stderr
-    for name in pages:
-        assert '<svg viewBox="0 0' in (tmp_path / f"{name}.html").read_text(encoding="utf-8")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 
 import equinox as eqx
@@ -79,6 +80,9 @@ def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path)
     assert out.startswith("found.html: ")
     assert (tmp_path / "found.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
     refused(run("report", "found.json", "--out", "found.json"), "would overwrite an input")
+    (tmp_path / "none.json").write_text("[]")
+    refused(run("report", "none.json"), "none.json: not a result")
+    assert not (tmp_path / "none.html").exists()
     written(identified_flight(), tmp_path / "os4.json")
     assert run("report", "os4.json", "--out", "other.html")[0] == 0
     assert "<title>flight.csv</title>" in (tmp_path / "other.html").read_text(encoding="utf-8")
@@ -143,6 +147,8 @@ def shown(path):
     write_flight_page(path.with_suffix(".html"), found)
 
 
+RESPONSE = identified_vehicle().to_dict()["response"]
+BACKWARD = {axis: found | {"frequency": found["frequency"][::-1]} for axis, found in RESPONSE.items()}
 DAMAGES = [
     (("predictions", "start", 1), 5, "`predictions`: starts must increase"),
     (("predictions", "start", 0), -1, "`predictions`: starts must increase"),
@@ -153,6 +159,7 @@ DAMAGES = [
     (("trajectories", "horizons", 24), 9e9, "`trajectories`: horizons must increase"),
     (("trajectories", "horizons", 3), 0.01, "`trajectories`: horizons must increase"),
     (("response", "roll", "gain", 3), 0.0, "`response.roll`"),
+    (("response",), BACKWARD, "`response.roll`: frequencies must be positive and increase"),
     (("response", "roll", "phase"), [1.0], "`response.roll`: `phase` has another shape"),
     (("response", "yaw", "frequency", 0), 0.5, "`response`: its axes must have the same frequencies"),
     (("response", "yaw"), {}, "`response.yaw`: object missing required field `frequency`"),
@@ -179,15 +186,16 @@ DAMAGES = [
 @pytest.mark.parametrize(
     ("place", "value", "said"), DAMAGES, ids=lambda x: ".".join(map(str, x)) if isinstance(x, tuple) else ""
 )
-def test_what_no_result_has_is_named(run, tmp_path, place, value, said):
+def test_what_no_result_has_is_named(tmp_path, place, value, said):
     table = identified_vehicle(**FULL).to_dict()
     holder = table
     for key in place[:-1]:
         holder = holder[key]
     holder[place[-1]] = value
     (tmp_path / "found.json").write_text(json.dumps(table))
-    refused(run("report", "found.json"), "found.json: ", said)
-    assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
+    with pytest.raises(InputError, match=f"found.json: .*{re.escape(said)}") as caught:
+        jaxos4.read_result(tmp_path / "found.json")
+    assert str(caught.value).isprintable()
 
 
 # In Python
@@ -207,7 +215,9 @@ def test_a_result_shows_itself(tmp_path):
     assert place[1] < 5
     assert "alpha3" not in found.summary()
     assert "alpha3" in found.summary(verbose=True)
-    assert any(line.startswith("Ix") and line.endswith("if arms and mass are right") for line in wide(found))
+    wide = found.summary(width=120).splitlines()
+    assert max(map(len, wide)) <= 120
+    assert any(line.startswith("Ix") and line.endswith("if arms and mass are right") for line in wide)
     shown = found._repr_html_()
     assert "Ix: identified. Iz: refused (not identified)." in shown
     assert "1.733e-05" in shown
@@ -221,12 +231,6 @@ def test_verdicts_have_colours_on_a_terminal_alone():
         console = Console(width=80, file=io.StringIO(), **options)
         print_identification(console, identified_vehicle())
         assert console.file.getvalue().startswith(begin)
-
-
-def wide(found):
-    lines = found.summary(width=120).splitlines()
-    assert max(map(len, lines)) <= 120
-    return lines
 
 
 def test_a_result_as_tables():

@@ -11,8 +11,8 @@ import time
 import jax
 import pytest
 import xarray as xr
-from helpers import refused
-from small_study import COMMAND, SPECIFICATION, cells, finish, results, run_study, specification, start
+from helpers import COMMAND, refused
+from small_study import SPECIFICATION, cells, finish, results, run_study, specification, start
 
 from jaxos4.study import load_study
 from jaxos4.study.dataset import open_store, read_store
@@ -171,28 +171,6 @@ def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole,
     cell.unlink()
     assert run("study", "spec.toml", "--out", "out")[0] == 0
     assert cells(copy) == cells(whole)
-
-
-@pytest.mark.slow
-def test_a_folder_whose_specification_is_damaged_is_refused(copy, run):
-    other = '{"version": "0.0.1", "device": "d", "study": {"of": "old"}}'
-    contents = dict.fromkeys(("", "\x00\x01", "[1, 2]", "[" * 100_000), "give another folder")
-    for content, fragment in (contents | {other: "begun by jaxos4 0.0.1"}).items():
-        (copy / "study.json").write_text(content)
-        for option in ((), ("--dry-run",)):
-            refused(run("study", "spec.toml", "--out", "out", *option), "out", fragment)
-        assert (copy / "study.json").read_text() == content
-
-
-def test_a_folder_with_other_files_is_refused_and_unchanged(run, tmp_path):
-    specification(tmp_path)
-    (tmp_path / "out").mkdir()
-    for name in ("out/thesis.tex", "file"):
-        (tmp_path / name).write_text("mine")
-    for option in ((), ("--dry-run",)):
-        for out, fragment in (("out", "thesis.tex"), ("file", "a file"), (".", "holds file and no study")):
-            refused(run("study", "spec.toml", "--out", out, *option), fragment)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
 
 
 @pytest.mark.slow

@@ -1,17 +1,20 @@
-"""The specification of a study: what it may say, and how a wrong one is refused."""
+"""The files of a study: what is wrong with a specification, with a folder to write to, and with one to report."""
 
-import json
-import tempfile
-from pathlib import Path
+import os
 
+import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import refused
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from recorded_logs import ACCIDENTS, damaged
 from small_study import AIRFRAME, specification
+from strange import in_one_line
+from synthetic_study import synthetic_study
 
-import jaxos4
-from jaxos4.study import Study, load_study
+from jaxos4.errors import InputError
+from jaxos4.study import read_results
 
 MINE = 'airframes = ["mine"]\n' + AIRFRAME
 # Refused with a message that names the key.
@@ -66,48 +69,135 @@ def test_a_wrong_specification_is_one_line(run, tmp_path, text, words):
     assert not (tmp_path / "out").exists()
 
 
-_NAMES = st.sampled_from("ibss published os4 chirp rk4 white all float32 mine \x00 é".split() + [""])
-_NUMBERS = st.one_of(
-    st.integers(-2, 3), st.integers(-(2**70), 2**70), st.floats(), st.sampled_from([0.01, 0.5, 5.0, 1e-320, 1e308])
+# Folders
+
+
+OLD = '{"version": "0.0.1", "device": "d", "study": {"of": "old"}}'
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "out", "said"),
+    [
+        ("out/thesis.tex", "mine", "out", "thesis.tex"),
+        ("file", "mine", "file", "a file"),
+        ("file", "mine", ".", "holds file and no study"),
+        ("out/study.json", OLD, "out", "begun by jaxos4 0.0.1"),
+        *(("out/study.json", text, "out", "give another folder") for text in ("", "\x00\x01", "[1, 2]", "[" * 100_000)),
+    ],
 )
-_SCALARS = st.one_of(_NAMES, _NUMBERS, st.booleans())
-_KEYS = st.one_of(st.sampled_from([*Study.__struct_fields__, "steps", "mass", "inertia", "mine"]), st.text(max_size=3))
-_VALUES = st.recursive(
-    _SCALARS, lambda of: st.one_of(st.lists(of, max_size=4), st.dictionaries(_KEYS, of, max_size=4)), max_leaves=8
-)
+def test_a_folder_without_a_study_of_this_version_is_refused_and_unchanged(name, content, out, said, run, tmp_path):
+    specification(tmp_path)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(content)
+    before = [*tmp_path.rglob("*")]
+    for option in ((), ("--dry-run",)):
+        refused(run("study", "spec.toml", "--out", out, *option), out, said)
+    assert (tmp_path / name).read_text() == content
+    assert [*tmp_path.rglob("*")] == before
 
 
-# One key with numbers, often with an extreme one: half of these tables are a study, of the others hardly any.
-_EXTREME = st.one_of(st.floats(), st.sampled_from([0.01, 5.0, 1e-320, 1e308, np.inf, np.nan]))
-_LISTS = dict.fromkeys(("durations", "scales", "widths"), st.lists(_EXTREME, min_size=1, max_size=2))
-_LIKELY = st.one_of(*(st.fixed_dictionaries({key: values}) for key, values in ({"dt": _EXTREME} | _LISTS).items()))
+def small_dataset():
+    return synthetic_study(flights=4, scales=(1.0,), estimators=("ibss", "hybrid"), spoiled=False)
 
 
-def toml(value) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(key)} = {toml(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    return str(value).lower()
+def changed(change):
+    """Writes a study's Dataset after this change."""
+    return lambda path: change(small_dataset()).to_netcdf(path, engine="h5netcdf")
+
+
+def linked(link):
+    """Writes a study's Dataset that leads to another place. A pipe would never answer."""
+
+    def write(path):
+        small_dataset().to_netcdf(path, engine="h5netcdf")
+        os.mkfifo(path.with_name("pipe"))
+        with h5py.File(path, "r+") as file:
+            link(file)
+
+    return write
+
+
+def without_attributes(data):
+    data = data.copy()
+    for each in data.variables.values():
+        each.attrs = {}
+    return data
+
+
+def another_code(data):
+    return data.assign(result=(data["result"] + 100).assign_attrs(data["result"].attrs))
+
+
+def virtual_layout():
+    layout = h5py.VirtualLayout((4,), "f8")
+    layout[:] = h5py.VirtualSource("pipe", "x", (4,))
+    return layout
+
+
+def no_dataset(path):
+    xr.Dataset({"truth": ("flight", np.zeros(3))}).to_netcdf(path, engine="h5netcdf")
+
+
+NO_STUDY = {
+    "no folder": (lambda path: path.parent.rmdir(), "is not there"),
+    "no file": (lambda path: None, "holds no results.nc"),
+    "text": (lambda path: path.write_text("not a netCDF file"), "not a netCDF file that can be read"),
+    "HDF5": (lambda path: h5py.File(path, "w").create_dataset("truth", data=np.zeros(3)).file.close(), "not the"),
+    "another Dataset": (no_dataset, "not the results of a study"),
+    "no bound": (changed(lambda data: data.drop_vars("bound")), "no bound"),
+    "another shape": (changed(lambda data: data.isel(model=0)), "not the results of a study"),
+    "no coordinate": (changed(lambda data: data.drop_vars("excitation")), "no excitation"),
+    "another kind": (changed(lambda data: data.assign_coords(level=[-1, -1, -1, -1])), "level"),
+    "no codes": (changed(without_attributes), "codes"),
+    "another code": (changed(another_code), "code"),
+    "text of numbers": (changed(lambda data: data.assign(std=data["std"].astype(str))), "std is of another kind"),
+    "infinite level": (changed(lambda data: data.assign_coords(level=[0.5, 0.9, 0.95, np.inf])), "level"),
+    "control": (changed(lambda data: data.assign_coords(estimator=["ibss", "a\x07"])), "`estimator` is not one line"),
+    "failures": (changed(lambda data: data.assign_attrs(failures='[{"cell": 1}]')), "`failures`"),
+    "nested failures": (changed(lambda data: data.assign_attrs(failures="[" * 50_000)), "`failures`"),
+    "empty": (changed(lambda data: data.isel(flight=slice(0, 0))), "another kind or shape"),
+    "a pipe": (linked(lambda file: file.__setitem__("zz", h5py.ExternalLink("pipe", "/x"))), "a link to another"),
+    "a name": (linked(lambda file: file.__setitem__("zz", h5py.SoftLink("/zz"))), "a link to another place"),
+    "a device": (
+        linked(lambda file: file.create_dataset("zz", (4,), "f8", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])),
+        "its arrays are in another file",
+    ),
+    "another file": (
+        linked(lambda file: file.create_virtual_dataset("zz", virtual_layout())),
+        "its arrays are in another file",
+    ),
+}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
+@pytest.mark.parametrize("case", NO_STUDY)
+def test_a_folder_that_no_study_wrote_is_refused_and_unchanged(run, tmp_path, case):
+    write, words = NO_STUDY[case]
+    (tmp_path / "study").mkdir()
+    write(tmp_path / "study" / "results.nc")
+    before = [*tmp_path.rglob("*")]
+    _, out, err = result = run("report", "study")
+    refused(result, "study", words)
+    assert out == ""
+    assert "jaxos4 study" in err or "run the study again" in err
+    assert [*tmp_path.rglob("*")] == before
 
 
 @pytest.mark.slow
-@settings(max_examples=400)
-@given(st.one_of(st.dictionaries(_KEYS, _VALUES, max_size=5), _LIKELY))
-def test_any_specification_is_a_study_or_an_input_error_of_one_line(table):
-    """The numbers of a study are finite, and its flights can be flown."""
-    with tempfile.TemporaryDirectory() as folder:
-        text = "".join(f"{json.dumps(key, ensure_ascii=False)} = {toml(value)}\n" for key, value in table.items())
-        path = specification(Path(folder), text)
-        try:
-            study = load_study(path)
-        except jaxos4.InputError as error:
-            line = str(error)
-        else:
-            line = f"{path}: {study.cell(study.count - 1)}"
-            assert np.isfinite([study.dt, *study.durations, *study.scales, *study.widths]).all()
-            assert all(2 <= duration / study.dt <= 1e6 for duration in study.durations)
-        assert line.startswith(f"{path}: ")
-        assert "\n" not in line
+def test_a_damaged_dataset_is_refused_without_a_word_of_the_library(tmp_path, capfd):
+    path = tmp_path / "results.nc"
+    synthetic_study(flights=4, scales=(1.0,), estimators=("ibss",), spoiled=False).to_netcdf(path, engine="h5netcdf")
+    content = path.read_bytes()
+
+    @given(accidents=ACCIDENTS)
+    @settings(max_examples=20)
+    def law(accidents):
+        path.write_bytes(damaged(content, accidents))
+        in_one_line(lambda _: read_results(tmp_path), path)
+
+    law()
+    bomb = xr.Dataset({"truth": (("flight", "parameter"), np.zeros((40_000, 1000), np.int8))})
+    bomb.to_netcdf(path, engine="h5netcdf", encoding={"truth": {"zlib": True, "complevel": 9}})
+    with pytest.raises(InputError, match="no |more than it holds"):
+        read_results(tmp_path)
+    assert capfd.readouterr() == ("", "")

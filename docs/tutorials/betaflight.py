@@ -94,3 +94,10 @@ print(found.summary())
 
 # %%
 found.plot.inertias()
+
+# %% [check]
+for name, true in (("Ix", 2.4e-3), ("Iy", 2.8e-3)):
+    value = found.rigid_body.constants[name]
+    assert found.verdicts[name].status == "identified"
+    assert abs(value.estimate - true) < 3 * value.std
+assert wrong.verdicts["Iz"].status == "contradicted"

@@ -132,3 +132,11 @@ wrong = jaxos4.recording.read_recording(
 )
 for finding in jaxos4.recording.self_checks(wrong, airframe):
     print(f"contradicts {', '.join(finding.quantities)}: {finding}")
+
+# %% [check]
+for name, true in (("Ix", 1.66e-5), ("Iy", 1.70e-5)):
+    value = found.rigid_body.constants[name]
+    assert found.verdicts[name].status == "identified"
+    assert abs(value.estimate - true) < 3 * value.std
+assert jaxos4.recording.self_checks(recording, airframe) == ()
+assert "units of g" in str(jaxos4.recording.self_checks(wrong, airframe)[0])

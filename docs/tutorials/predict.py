@@ -107,3 +107,9 @@ print(body[: body.index("\n")])
 # %% [markdown]
 # `exported.text` is the whole file. [Into your simulator](../into_your_simulator.md) flies it,
 # and lists the other formats.
+
+# %% [check]
+assert (quality.error < quality.constant).all()
+from xml.etree import ElementTree
+
+assert ElementTree.fromstring(exported.text).tag == "mujoco"

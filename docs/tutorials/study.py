@@ -103,3 +103,7 @@ for (name, each), marker in zip(ratio.items(), "os^x"):
 axes.axhline(1, color="gray", linewidth=0.8)
 axes.set(ylabel="RMSE / bound", ylim=0)
 axes.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1))
+
+# %% [check]
+for name in ("IBSS", "hybrid"):
+    assert 0.7 < ratio[name].min() <= ratio[name].max() < 1.3

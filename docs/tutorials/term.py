@@ -88,3 +88,10 @@ print(f"yaw_friction {value:.3f} +- {1.96 * std:.3f}, truth 0.5 1/rad")
 # A log of a real vehicle needs no more than the name: `jaxos4.VehicleSettings(terms=("offset",
 # "damping", "friction"))`. For `--terms friction` on the command line, put the term into [a
 # package of your own](../extend/index.md#from-a-package-of-your-own).
+
+# %% [check]
+for name, true in (("alpha8", truth[7]), ("yaw_friction", truth[8])):
+    value, std = within[name]
+    assert abs(value - true) < 3 * std
+value, std = without["alpha8"]
+assert value < truth[7] - 10 * std

@@ -38,7 +38,7 @@ def ekf(t, core=0, shift=0.0):
     return ("XKF1", "Bffffff", "C,VN,VE,VD,PN,PE,PD", t, values)
 
 
-def escs(t, order=(0, 1, 2, 3)):
+def escs(t, order=(0, 1, 2, 3), speeds=speeds):
     """One message for each motor, at times of its own."""
     each = [np.column_stack([np.full(t.size, o), speeds(t + 5e-4 * i)[:, i] / RPM]) for i, o in enumerate(order)]
     times = np.concatenate([t + 5e-4 * i for i in range(4)])

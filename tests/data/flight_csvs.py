@@ -1,5 +1,8 @@
 """Flight CSV files, good and bad."""
 
+import numpy as np
+from recorded_logs import table_csv
+
 from jaxos4.logs import read_recording
 
 HEADER = "t,omega1,omega2,omega3,omega4,p,q,psi"
@@ -9,6 +12,13 @@ ROWS = [f"{0.01 * k:.2f},100,101,102,103,{0.1 * k:.1f},-0.2,0.3" for k in range(
 def read_flight_and_notes(path, airframe=None):
     found = read_recording(path, airframe)
     return found.flight, found.notes
+
+
+def write_log(path):
+    """A short log."""
+    time, names = 0.01 * np.arange(400), "t,omega1,omega2,omega3,omega4,p,q,r".split(",")
+    path.write_bytes(table_csv(names, time, np.full((400, 4), 1740.0), 0.1 * np.sin(np.outer(time, [3, 4, 5]))))
+    return path
 
 
 def csv(header=HEADER, rows=ROWS):
@@ -30,7 +40,10 @@ BAD = {
     "no header": (csv(header=ROWS[0]), ["row 1", "contains numbers instead of the header"]),
     "semicolons": (csv().replace(",", ";"), ["row 1", "separated by ';'", "commas"]),
     "tabs": (csv().replace(",", "\t"), ["row 1", "separated by tabs", "commas"]),
-    "no t": (csv(HEADER.replace("t,", "time,")), ["column t", "there is no time"]),
+    "no t": (
+        csv(HEADER.replace("t,", "time,")),
+        ["column t", "there is no time; ", "There are 'omega1', ", "'time': rename one, or give a column map."],
+    ),
     "empty t": (csv(rows=["," + row.split(",", 1)[1] for row in ROWS]), ["column t", "no time"]),
     "empty cell of t": (edited(4, "t", ""), ["row 4, column t", "is empty"]),
     "no rotors": (csv(HEADER.replace("omega", "w")), ["column omega1", "command1..4"]),

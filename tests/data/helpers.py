@@ -279,6 +279,7 @@ def documented_class(page: str) -> str:
 
 
 COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
+PROGRESS = r"jaxos4: .+, \d+ s"  # a line on stderr of a command that takes long
 # Runs each line of its arguments. Prints its code, what it printed, and the packages that are loaded after it.
 EACH = """
 import contextlib, io, json, sys
@@ -295,19 +296,24 @@ for line in sys.argv[1:]:
 """
 
 
-def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Runs Python code in another process, without the tests' cache of compiled programs and flags of XLA."""
+def environment(**changes: str) -> dict[str, str]:
+    """The environment of another process: without the tests' cache of compiled programs and flags of XLA."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "JAXOS4_", "XLA_"))}
-    variables = inherited | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]), "JAX_PLATFORMS": "cpu"}
+    ours = {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]), "JAX_PLATFORMS": "cpu"}
+    return inherited | ours | changes
+
+
+def start(*arguments: str, code: str = COMMAND, cwd=None, **changes: str) -> subprocess.CompletedProcess[str]:
+    """Runs Python code in another process."""
     process = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(process, env=variables | environment, cwd=cwd, capture_output=True, text=True, timeout=300)
+    return subprocess.run(process, env=environment(**changes), cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
-def how_we_compile():
-    """For the environment of another process: this process's cache and level of optimisation."""
+def how_we_compile(devices: int = 1) -> dict[str, str]:
+    """For the environment of another process: this process's cache, flags and level of optimisation."""
     settings = ("jax_compilation_cache_dir", "jax_disable_most_optimizations")
-    ours = {name.upper(): str(jax.config.values[name]) for name in settings}
-    return ours | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
+    ours = {name.upper(): str(jax.config.values[name]) for name in settings} | {"XLA_FLAGS": os.environ["XLA_FLAGS"]}
+    return ours | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05", "JAX_NUM_CPU_DEVICES": str(devices)}
 
 
 def usable_stretches(flight, airframe=None):

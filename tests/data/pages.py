@@ -3,6 +3,7 @@
 import html
 import io
 import re
+import sys
 
 import numpy as np
 from rich.console import Console
@@ -35,6 +36,13 @@ def stands_alone(text):
     ids = re.findall(r'\sid="([^"]*)"', outside)
     assert len(ids) == len(set(ids)) > 4
     assert text.count("<script") == text.count("</script") == 1
+
+
+def without_matplotlib(patch):
+    """Lets every import of matplotlib fail, and of the modules that need it, as if none had been imported before."""
+    loaded = [name for name in sys.modules if name.startswith("matplotlib.")]
+    for name in ("matplotlib", "jaxos4.report.plots", "jaxos4.report.matplotlib_figures", *loaded):
+        patch.setitem(sys.modules, name, None)
 
 
 def assert_inside(panel):

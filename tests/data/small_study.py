@@ -1,12 +1,12 @@
 """A study of a few seconds, run in this process or by the command line in another process."""
 
-import os
 import pathlib
+import re
 import subprocess
 import sys
 
 import xarray as xr
-from helpers import how_we_compile
+from helpers import COMMAND, PROGRESS, environment, how_we_compile
 
 from jaxos4.study import carry_out, load_study
 
@@ -44,7 +44,6 @@ thrust_coefficient = 3e-5
 drag_coefficient = 7e-7
 rotor_inertia = 6e-5
 """
-COMMAND = "from jaxos4.cli import main; main()"
 
 
 def specification(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
@@ -61,18 +60,11 @@ def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
     return out
 
 
-def environment(devices: int = 1) -> dict[str, str]:
-    """The environment of another process: its number of devices, and how it compiles."""
-    path = os.pathsep.join([str(pathlib.Path(__file__).resolve().parents[2]), *sys.path[1:]])
-    ours = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
-    return os.environ | how_we_compile() | ours
-
-
 def start(*arguments: str | pathlib.Path, code: str = COMMAND, devices: int = 1) -> subprocess.Popen[str]:
     """Starts another Python process with the command line, or with other code."""
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
-        env=environment(devices),
+        env=environment(**how_we_compile(devices)),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -80,9 +72,10 @@ def start(*arguments: str | pathlib.Path, code: str = COMMAND, devices: int = 1)
 
 
 def finish(process: subprocess.Popen[str]) -> str:
-    """Returns the output of a process; it must succeed without any error output."""
+    """Returns the output of a process; it must succeed, and its error output is nothing but progress."""
     out, err = process.communicate(timeout=300)
-    assert (process.returncode, err) == (0, ""), err
+    faults = [line for line in err.splitlines() if not re.fullmatch(PROGRESS, line)]
+    assert (process.returncode, faults) == (0, []), err
     return out
 
 

@@ -1,6 +1,11 @@
 """Strange values for the files of users, and the law of each door: an error is one line."""
 
+import ast
+import io
 import json
+import tokenize
+import tomllib
+import xml.etree.ElementTree as ElementTree
 
 from hypothesis import given, settings, strategies as st
 
@@ -47,3 +52,20 @@ def nodes(tree):
     for key, each in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():
         yield tree, key
         yield from nodes(each)
+
+
+def parsed(text, target):
+    """The names of a Python file outside of strings and comments, or the parts of an XML file that are no comments.
+
+    Of a TOML file, all that is in it.
+    """
+    if target == "drone-models":
+        return tomllib.loads(text)
+    if target != "rotorpy":
+        return {part for each in ElementTree.fromstring(text).iter() for part in (each.tag, *each.attrib.values())}
+    first, second = text.split("\n")[:2]
+    assert (first.isascii(), second) == (True, "")
+    ast.parse(text)
+    ast.parse(text.encode())  # as Python reads a file, with its encoding
+    tokens = tokenize.tokenize(io.BytesIO(text.encode()).readline)
+    return {token.string for token in tokens if token.type in (tokenize.NAME, tokenize.OP)}

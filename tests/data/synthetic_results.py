@@ -46,3 +46,13 @@ def vehicle_result(values=VALUES, **changes):
         **fixed,
         **changes,
     }
+
+
+def predicting_result():
+    """A vehicle with all that predictions need: fixed parameters, offsets, damping, disturbances of the rates."""
+    level = {"strength": 1.0, "unit": "", "time_constant": 0.2, "sensor": 0.01, "correlation": 0.0}
+    values = {"alpha3": 6e4, "alpha6": 5.9e4, "alpha8": 3.5e4}
+    values |= {f"{axis}_{kind}": 0.1 for kind in ("offset", "damping") for axis in ("roll", "pitch", "yaw")}
+    fixed = {f"alpha{i}": held(0.1) for i in (1, 2, 4, 5, 7)}
+    about = provenance(terms=["offset", "damping"])
+    return vehicle_result(values, disturbances=dict.fromkeys("pqr", level), provenance=about, held=fixed)
