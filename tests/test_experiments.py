@@ -1,4 +1,7 @@
-"""Each experiment runs in a small configuration, writes its results, and draws them."""
+"""Experiments of each kind run in a small configuration, write their results, and draw them.
+
+Statistics of estimators: `test_errors.py`, `test_estimators.py`, `test_hybrid.py`.
+"""
 
 import json
 import pathlib
@@ -127,14 +130,6 @@ def test_published_corrected(run):
 
 
 @pytest.mark.slow
-def test_inverse_crime(run):
-    out, bias = run("inverse_crime", fit_methods=["euler", "rk4"], dts=[0.01]), load("inverse_crime", "plot").bias
-    euler, rk4 = (bias(read_results(out / f"{fit} 0.01 s")).squeeze() for fit in ("euler", "rk4"))
-    assert float(euler.sel({"method": "rk4"})) > 8 * float(euler.sel({"method": "euler"}))
-    assert float(rk4.sel({"method": "rk4"})) < float(euler.sel({"method": "rk4"})) / 8
-
-
-@pytest.mark.slow
 def test_bracket_and_seeds(run):
     data = read_results(run("bracket_and_seeds", seeds=[0]) / "seed 0").squeeze()
     rollouts, accuracy = metrics.mean_rollouts(data), metrics.accuracy(data)
@@ -150,34 +145,10 @@ def test_bracket_and_seeds(run):
 
 
 @pytest.mark.slow
-def test_efficiency(tmp_path):
-    case = "published, rates"
-    (row,) = result_of(tmp_path, "efficiency", flights=48, seed=0, scale=1.0, cases=[case])["cases"]
-    assert row["results"] == {"successful": 48}
-    # Within four Monte-Carlo standard errors of the bound, on each of the eight parameters.
-    assert near(row["efficiency"], 1, 4 * row["monte_carlo_error"])
-    assert near(row["bias"], 0, 4 / np.sqrt(48))
-    assert near(row["covered"], 0.95, 4 * np.sqrt(0.95 * 0.05 / 48))
-
-
-@pytest.mark.slow
 def test_speed(tmp_path):
     report = result_of(tmp_path, "speed", batch=64, repeats=2)
     assert report["provenance"]["precision"] == "float64"
     assert all(row["steps_per_second"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
-
-
-@pytest.mark.slow
-def test_networks(tmp_path):
-    trained = {"networks": ["score, mlp", "score, cmac"], "channels": "rates", "separate": False}
-    report = result_of(tmp_path, "networks", flights=128, seed=7, steps=100, many=128, noises=[1.0], **trained)
-    rows = {row["estimator"]: row for row in report["rows"]}
-    assert report["one_call"]["flights"] == 128
-    hybrids = [f"hybrid from {label}" for label in trained["networks"]]
-    assert list(rows) == ["score, mlp", hybrids[0], "ibss", "score, cmac", hybrids[1]]
-    # Each of eight parameters within five Monte-Carlo errors of the bound.
-    assert all(near(rows[n]["efficiency"], 1, 5 * rows[n]["monte_carlo_error"]) for n in (*hybrids, "ibss"))
-    assert all(rows[n]["rollouts"] < rows["ibss"]["rollouts"] and rows[n]["hit_rate"] > 0.9 for n in hybrids)
 
 
 @pytest.mark.slow
@@ -198,51 +169,6 @@ def test_precision(tmp_path):
         assert double["results"] == single["results"] == {"successful": 64}
         assert near(single["covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 64))
     assert all(near(rows[name, "float32"]["efficiency"], 1, 5 * np.sqrt(1 / 128)) for name in ("kalman", "ibss"))
-
-
-@pytest.mark.slow
-def test_baselines(tmp_path):
-    cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
-    rows = result_of(tmp_path, "baselines", flights=48, seed=5, channels="rates", **cases)["rows"]
-    exact, noisy = rows[:2], rows[2:]
-    assert all(row["answers"] == 48 for row in rows)
-    assert all(max(row["efficiency"]) < 1e-6 for row in exact)
-    # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
-    assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
-    assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]
-
-
-@pytest.mark.slow
-def test_coverage(tmp_path):
-    cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
-    rows = result_of(tmp_path, "coverage", flights=128, seed=11, scales=[1.0], steps=100, **cases)["rows"]
-    assert [row["estimator"] for row in rows] == cases["estimators"]
-    for row in rows:
-        assert row["results"] == {"successful": 128}
-        assert near(row["std"], 1, 0.05)  # the intervals are not too wide
-        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
-
-
-@pytest.mark.slow
-def test_defaults(tmp_path):
-    settings = ["equation error, memory 0", "equation error, memory 1 (default)", "ant colony, q 0.1"]
-    rows = result_of(tmp_path, "defaults", flights=8, seed=7, settings=settings)["rows"]
-    assert [(row["setting"], row["scale"]) for row in rows] == [
-        (settings[0], 1.0),
-        *((settings[1], scale) for scale in (0.1, 1.0, 10.0)),
-        (settings[2], 1.0),
-    ]
-    assert max(rows[2]["efficiency"]) < max(rows[0]["efficiency"]) / 3
-    assert rows[4]["results"] == {"successful": 8}
-    assert 0 <= rows[4]["gap"] < 0.02  # its cost above that of output error
-
-
-@pytest.mark.slow
-def test_robust_intervals():
-    """Those by the residuals hold the truth under coloured noise; those by the bound of white noise do not."""
-    load("coverage", "robust").main(flights=16, seed=13)
-    white, robust = (float(row[-1]) for row in RECORDER.tables[-1].rows)
-    assert white < 70 < 80 < robust
 
 
 @pytest.mark.slow
