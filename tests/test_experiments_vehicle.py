@@ -1,4 +1,4 @@
-"""The experiments with vehicles, in small configurations."""
+"""Experiments with vehicles run once for each kind, in a small configuration; and their parts."""
 
 import numpy as np
 import pytest
@@ -48,15 +48,6 @@ def test_closed_loop(monkeypatch, tmp_path):
         assert (row["bias"] > 0.2, row["covered"]) == (True, 0)
 
 
-def test_effects(tmp_path):
-    """The effects of real flights are flown, identified and drawn."""
-    report = result_of(tmp_path, "closed_loop", "effects", flights=1, duration=10.0, effects=["clock"])
-    plot(tmp_path, "closed_loop", "plot_effects")
-    for case in report["cases"]:
-        assert [row["result"] for row in case["flights"]] == ["successful"]
-        assert abs(case["summary"]["thrust"]["mean"]) < 0.05
-
-
 def test_a_soft_flight_has_no_steps_and_the_mix_of_effects_stays_what_it_was():
     effects = load("closed_loop", "effects")
     hard, soft = (effects.flights_of(kind, 1, 8.0, 22, gust=0.0)[0] for kind in ("gusts", "soft"))
@@ -82,16 +73,6 @@ def test_verdicts(capsys, tmp_path):
     assert "spoiled flights" in capsys.readouterr().out
 
 
-def test_the_response_at_the_true_parameters(capsys, tmp_path):
-    cases = {"gusts": [2.5], "effects": ["motors"], "sample_times": ["8 ms"]}
-    report = result_of(tmp_path, "verdicts", "response", flights=2, duration=16.0, **cases)
-    for row in report["rows"]:
-        assert [*row["responses"]] == ["4 ms", "8 ms", "16 ms", "32 ms"]
-        for ratio, error in (row["responses"]["8 ms"][axis] for axis in ("roll", "pitch")):
-            assert abs(np.log(ratio)) < 3.5 * error < 0.5
-    assert "motors, 8 ms" in capsys.readouterr().out
-
-
 def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
     random = np.random.default_rng(0)
     states = random.normal(0, 0.2, (500, 12))
@@ -108,15 +89,6 @@ def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
     np.testing.assert_allclose(np.linalg.norm(tilted, axis=1), np.linalg.norm(flight.specific_force, axis=1))
     assert len(spoiled["short"].time) == 500
     assert len(np.unique(spoiled["rare motors"].omega[:, 0])) == 100
-
-
-def test_sample_times(tmp_path):
-    """Every sample time has the same answer, within its interval."""
-    report = result_of(tmp_path, "sample_times", flights=2, sample_times=[0.004, 0.016], duration=16.0)
-    for case in report["cases"]:
-        assert {row["result"] for row in case["flights"]} == {"successful"}
-        assert all(abs(case["summary"][name]["mean"]) < 0.08 for name in ("Ix", "Iy"))
-        assert case["summary"]["Ix"]["covered"] == 1
 
 
 def test_rotorpy(tmp_path):
@@ -150,12 +122,6 @@ def test_the_order_of_a_disturbance_decides_on_the_thrust():
     assert second.likelihood > first.likelihood + 100
     assert abs(second.gain - 0.9) < 3 * second.std
     assert abs(first.gain - 0.9) > 2 * abs(second.gain - 0.9)
-
-
-def test_commands_that_are_too_rare_are_named(shared_flights, tmp_path):
-    (row,) = result_of(tmp_path, "public_flights", "radio", flights=shared_flights, every=[40]).values()
-    assert row["result"] != "successful"
-    assert any("damping" in doubt["cause"] and "too rarely" in doubt["cause"] for doubt in row["doubts"])
 
 
 def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
