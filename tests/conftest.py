@@ -35,6 +35,7 @@ TOGETHER = (
     ("vehicle",),
     ("experiments_vehicle", "experiments_truth", "experiments_peers"),
     ("errors", "estimators", "recursive", "diagnostics", "identifiability"),
+    ("network", "hybrid", "accelerators"),
     ("design",),
     ("closed_loop", "closed_loop_effects"),
 )
