@@ -33,7 +33,7 @@ PROCESSES = 8  # at most: a worker holds up to 2 GB
 # longest.
 TOGETHER = (
     ("vehicle",),
-    ("experiments_vehicle", "experiments_truth", "experiments_peers"),
+    ("experiments_vehicle", "experiments_truth", "experiments_peers", "judge"),
     ("errors", "estimators", "recursive", "diagnostics", "identifiability"),
     ("network", "hybrid", "accelerators"),
     ("design",),

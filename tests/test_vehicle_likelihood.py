@@ -115,23 +115,28 @@ def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():
     assert chosen_place([vague, *near[1:]]) == 1
 
 
+def identified(**settings):
+    return jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS, **settings))
+
+
 @pytest.fixture(scope="module")
 def chosen():
-    """The identification of the flight at all sample times, each with a profile; and the programs that it compiled."""
+    """The identification at all sample times, each with a profile; its programs; and two at sample times of these."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(uncertainty, "WELL_KNOWN", 0.0)
         patch.setattr(answers, "NOTED", 1.002)
         # Samples of commands at all sample times hold answers of the controller, so that all are compared.
         patch.setattr(vehicle, "UNANSWERED", 0.0)
         with compiled_programs() as programs:
-            found = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS))
-        yield found, programs
+            rule = identified()
+        given = {place: identified(sample_time=rule.sample_times[place].sample_time) for place in (0, 2)}
+    return rule, programs, given
 
 
 @pytest.mark.slow
 def test_four_sample_times_and_the_profile_need_one_program(chosen):
     """The length of a flight is data. The table of sample times shows the intervals of the answer."""
-    found, programs = chosen
+    found, programs, _ = chosen
     np.testing.assert_allclose([each.sample_time for each in found.sample_times], [0.004, 0.008, 0.016, 0.032])
     searches = [name for name in programs if name is not None and "call" in name.lower()]
     assert len(searches) == 1, programs
@@ -148,9 +153,8 @@ def test_four_sample_times_and_the_profile_need_one_program(chosen):
 @pytest.mark.parametrize("place", [0, 2])
 def test_a_sample_time_that_is_given_has_the_answer_of_the_rule(chosen, place):
     """The same samples, numbers and checks."""
-    rule, _ = chosen
-    sample_time = rule.sample_times[place].sample_time
-    given = jaxos4.identify(flown(), CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS, sample_time=sample_time))
+    rule, _, found = chosen
+    sample_time, given = rule.sample_times[place].sample_time, found[place]
     assert given.provenance.sample_time == pytest.approx(sample_time)
     assert len(given.sample_times) == len(rule.sample_times) - place
     for one, other in zip(given.sample_times[1:], rule.sample_times[place + 1 :], strict=True):
