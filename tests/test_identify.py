@@ -234,7 +234,7 @@ def test_two_logs_share_the_vehicle(run, tmp_path, vehicle, monkeypatch, called)
     ((recordings, subject, options, found),) = called
     assert [recording.name for recording in recordings] == ["flight1.csv", "flight2.csv"]
     assert same(subject, jaxos4.load_airframe("airframe.toml"))
-    assert options == {"settings": jaxos4.VehicleSettings(terms=TERMS, sample_time=0.01)}
+    assert options == {"settings": jaxos4.VehicleSettings(terms=list(TERMS), sample_time=0.01)}
     assert_same_as_written(found, tmp_path / "found.json")
     assert found.predictions.horizons.tolist() == found.skill.horizons
     kept, own = np.isin(found.predictions.start, found.trajectories.start), found.trajectories
