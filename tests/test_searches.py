@@ -16,18 +16,14 @@ from jaxos4.estimators.levenberg_marquardt import LevenbergMarquardt
 IBSS = jaxos4.IBSS
 
 
-def descent(**settings):
-    """The solver of the documentation."""
-    exec(documented_class("likelihood.md"), defined := {"__name__": "descent"})  # noqa: S102
-    return defined["Descent"](**settings)
-
-
-# Each with the settings of a search that is stopped, and the rollouts of a shot in two unknowns beside itself.
+exec(documented_class("likelihood.md"), DOCUMENTED := {"__name__": "descent"})  # noqa: S102
+DESCENT = DOCUMENTED["Descent"]
+# Each with the settings of a search that is stopped.
 SOLVERS = {
     "IBSS": (IBSS, {"max_sweeps": 2}),
     "LevenbergMarquardt": (LevenbergMarquardt, {"max_steps": 2}),
     "AntColony": (jaxos4.AntColony, {"max_sweeps": 3}),
-    "of the documentation": (descent, {"steps": 2}),
+    "of the documentation": (DESCENT, {"steps": 2}),
 }
 every_solver = pytest.mark.parametrize("name", SOLVERS)
 
@@ -109,16 +105,27 @@ def test_the_best_answer_of_several_starts_counts(name):
     assert int(both.rollouts) > int(low.rollouts)
 
 
-def test_slopes_that_are_wrong_end_no_search_as_a_success():
-    """Beside the minimum, IBSS goes round what is not a number. Where every slope is wrong, it says so."""
-    low, high = MINIMUM[0] + 0.05, MINIMUM[0] + 0.2
+def bent(x):
+    """`quadratic` with a curvature, so that the first shots miss the minimum."""
+    return quadratic(x) + 3 * (x[0] - MINIMUM[0]) ** 2 * np.array([1, -1, 2])
+
+
+@pytest.mark.parametrize(("widest", "result"), [(0.1, "successful"), (0.25, "max_sweeps")])
+def test_slopes_that_are_wrong_end_no_search_as_a_success(widest, result):
+    """Beside the minimum, IBSS goes round what is not a number, or says that it did not."""
+    shots = []
 
     def hole(x, gradient):
-        return jnp.where((x[0] > low) & (x[0] < high), jnp.nan, gradient)
+        return jnp.where((x[0] > MINIMUM[0] + 0.01) & (x[0] < MINIMUM[0] + widest), jnp.nan, gradient)
 
-    found = IBSS()(squares(quadratic, center=(1.0, 0.0), change=hole))
-    assert names(found) == "successful"
-    assert (np.abs(found.parameters - MINIMUM) <= 0.05 * found.std).all()
+    found = IBSS()(squares(bent, center=(1.0, 0.0), change=hole, hear=lambda x: shots.append(float(x[0]))))
+    jax.effects_barrier()
+    assert any(0.01 < shot - MINIMUM[0] < widest for shot in shots)
+    assert names(found) == result
+    assert result != "successful" or (np.abs(found.parameters - MINIMUM) <= 0.05 * found.std).all()
+
+
+def test_a_slope_of_the_wrong_sign_ends_no_search_as_a_success():
     turned = squares(quadratic, center=(1.0, 0.0), change=lambda x, gradient: -gradient, stride=np.ones(2))
     assert names(IBSS()(turned)) != "successful"
 
@@ -172,7 +179,7 @@ def test_a_shot_simulates_each_sample_of_a_flight_once():
 def test_the_search_of_the_documentation_finds_the_answer_of_ours(kind):
     problem = standard_problem(channels="rates", states=noisy_states(3)[2], free=True).hold({"alpha2": 0.0})
     best = (jaxos4.OutputError if kind == "shooting" else jaxos4.FilterError)()(problem)
-    found = descent()(problem if kind == "shooting" else jaxos4.InnovationsProblem(problem))
+    found = DESCENT()(problem if kind == "shooting" else jaxos4.InnovationsProblem(problem))
     assert names(found) == "successful"
     assert (np.abs(found.parameters[:8] - best.parameters) <= 0.05 * best.std).all()
 
