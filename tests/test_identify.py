@@ -14,6 +14,7 @@ from sign_flights import flown, turned
 
 import jaxos4
 from jaxos4.estimators import ESTIMATORS
+from jaxos4.export.spread import ESTIMATE
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
 
@@ -244,12 +245,12 @@ def test_two_logs_share_the_vehicle(run, tmp_path, vehicle, monkeypatch, called)
     np.testing.assert_allclose(np.diff(own.horizons), own.horizons[0])
     assert own.horizons[-1] == pytest.approx(0.5, abs=own.horizons[0])
     # Vehicles are drawn from it as from the file, as wide as the moments of inertia are uncertain.
-    spread, key = jaxos4.export.read_result(found).spread, jax.random.key(1)
+    varying, key = jaxos4.export.read_result(found).varying, jax.random.key(1)
     known = {name: row.std for name, row in found.rigid_body.constants.items()}
-    wide = {name: spread.std[spread.names.index(name)] for name in known}
+    wide = {name: varying[name]["std"] for name in known}
     assert wide.keys() >= {"Ix", "Iy"}
     assert all(wide[name] > known[name] or wide[name] == pytest.approx(known[name]) for name in known)
-    plain = known.keys() - spread.widened.keys()
+    plain = {name for name in known if varying[name]["origin"] == ESTIMATE}
     assert {name: wide[name] for name in plain} == pytest.approx({name: known[name] for name in plain})
     drawn, again = found.sample(3, key=key), jaxos4.export.sample_vehicles(tmp_path / "found.json", 3, key=key)
     assert all(np.allclose(drawn[name], again[name], rtol=1e-9, atol=0) for name in drawn)
