@@ -29,14 +29,26 @@ jax.config.update("jax_disable_most_optimizations", True)
 # the checks would take four times as long as the decoding.
 UNCHECKED = ("__init__", "blackbox_frames")
 PROCESSES = 8  # at most: a worker holds up to 2 GB
+# Files that share programs and answers: one worker runs them, one after the other. The first begin first, as they take
+# longest.
+TOGETHER = (
+    ("vehicle",),
+    ("experiments_vehicle", "experiments_truth", "experiments_peers", "judge"),
+    ("errors", "estimators", "recursive", "diagnostics", "identifiability"),
+    ("network", "hybrid", "accelerators"),
+    ("design",),
+    ("closed_loop", "closed_loop_effects"),
+)
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Checks shapes and types of all annotated functions and modules, except in the daily loop: they cost 60 %."""
-    if config.option.markexpr != "not slow":
+    """Checks shapes and types of all annotated functions and modules, but not in the daily loop of a developer."""
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return  # this process only hands tests to workers
+    if config.option.markexpr != "not slow" or os.environ.get("CI"):
         package = pathlib.Path(__file__).resolve().parents[1] / "jaxos4"
         modules = [path.relative_to(package.parent) for path in package.rglob("*.py") if path.stem not in UNCHECKED]
         jaxtyping.install_import_hook([".".join(each.with_suffix("").parts) for each in modules], "typechecker.check")
@@ -49,11 +61,17 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return 0 if config.option.file_or_dir else min(os.cpu_count() or 1, PROCESSES)
 
 
+def group_of(nodeid: str) -> tuple[int, str]:
+    """The files that one worker runs together with that of a test; they sort as they start."""
+    name = pathlib.PurePath(nodeid.split("::")[0]).stem.removeprefix("test_")
+    return next(((place, files[0]) for place, files in enumerate(TOGETHER) if name in files), (len(TOGETHER), name))
+
+
 @pytest.hookimpl(tryfirst=True)  # before slow tests are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests start first, so that the workers end together."""
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    """Groups with slow tests start first, so that the workers end together."""
+    slow = {group_of(item.nodeid) for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (group_of(item.nodeid) not in slow, group_of(item.nodeid)))
 
 
 def pytest_collection_finish() -> None:
@@ -65,18 +83,22 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log):
-    """One worker runs all tests of a file, so that its fixtures and compiled programs are made once."""
+    """One worker runs all tests of a group, so that fixtures, answers and compiled programs are made once."""
     from xdist.scheduler import LoadFileScheduling
 
+    class LoadGroupsOfFiles(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return str(group_of(nodeid))
+
     config.option.loadscopereorder = False
-    return LoadFileScheduling(config, log) if config.getvalue("dist") == "load" else None  # the default of `-n`
+    return LoadGroupsOfFiles(config, log) if config.getvalue("dist") == "load" else None  # the default of `-n`
 
 
-@pytest.fixture(scope="module", autouse=True)
-def programs_end_with_their_file() -> Iterator[None]:
-    """Compiled programs hold memory maps, of which a process may have 65,530."""
-    yield
-    jax.clear_caches()
+@pytest.hookimpl(trylast=True)  # after the fixtures of a file
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Compiled programs hold memory maps, of which a process may have 65,530: they end with their group of files."""
+    if nextitem is None or group_of(item.nodeid) != group_of(nextitem.nodeid):
+        jax.clear_caches()
 
 
 def computing() -> Iterator[None]:

@@ -1,12 +1,14 @@
 """Each experiment runs in a small configuration, writes its results, and draws them."""
 
 import json
+import os
 import pathlib
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from helpers import how_we_compile
 from small_experiments import plot, result_of
 
 from experiments import figures, shared
@@ -190,7 +192,10 @@ def test_precision(tmp_path):
     most |= {"filter-error": 2.0}
     command = [sys.executable, "-m", "experiments", "precision.run", "--flights", "64", "--out", str(out)]
     options = [each for name in most for each in ("--estimators", name)]
-    subprocess.run([*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent)
+    quick = how_we_compile() | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "True"}  # ten programs: they compile for longest
+    subprocess.run(
+        [*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent, env=os.environ | quick
+    )
     report = json.loads(out.read_text())
     rows = {(row["estimator"], row["precision"]): row for row in report["rows"]}
     assert len(rows) == 2 * len(most)

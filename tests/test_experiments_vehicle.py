@@ -76,7 +76,7 @@ def test_a_soft_flight_has_no_steps_and_the_mix_of_effects_stays_what_it_was():
 def test_verdicts(capsys, tmp_path):
     """Good and spoiled flights are judged, and counted."""
     cases = {"gusts": None, "force clipped 0.8": True}
-    report = result_of(tmp_path, "verdicts", flights=1, duration=16.0, cases=list(cases))
+    report = result_of(tmp_path, "verdicts", flights=1, spoiled=1, duration=16.0, cases=list(cases))
     rows = {row["case"]: row for row in report["rows"]}
     assert {name: row["named"] for name, row in rows.items()} == cases
     good, clipped = (rows[name]["Ix"] for name in cases)

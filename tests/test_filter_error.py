@@ -1,6 +1,6 @@
-"""Filter error: its filters and its likelihood against NumPy, and its search on flights without disturbances.
+"""Filter error: its filters and its likelihood against NumPy, gaps, recordings and failures.
 
-Flights in closed loop, for which it is made: `test_vehicle.py`.
+Flights in closed loop, for which it is made: `test_vehicle.py`. Flights without a disturbance: `test_estimators.py`.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from disturbances import joint_cost, transition
 from helpers import DT, noisy_states, standard_flight, standard_problem
-from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, names
+from lanes import LANES, names
 
 import jaxos4
 from jaxos4.estimators import FilterError
@@ -146,25 +146,6 @@ def test_the_likelihood_does_not_depend_on_the_segments_and_no_trajectory_runs_a
     found = likelihood(problem, MODEL.alpha.at[1].set(-50.0), NOISE)
     assert bool(found.feasible.all())
     assert all(np.isfinite(leaf).all() for leaf in found)
-
-
-# Simulated flights without a disturbance.
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
-def test_it_finds_the_truth_at_nearly_the_bound():
-    """White noise and nothing else. The noise is estimated too, and a weak disturbance can never be ruled out.
-
-    So the standard deviations lie above the bound, which knows that there is none: by little for torques, and by up to
-    40 % for parameters that act slowly.
-    """
-    found = identify(FilterError(), *lanes(noisy_states(LANES, seed=50)))
-    assert set(names(found)) == {"successful"}
-    ratio = np.median(found.std, axis=0) / bound()
-    assert (ratio > 0.95).all(), ratio
-    assert (ratio < np.array([1.2, 1.4, 1.1, 1.2, 1.4, 1.1, 1.2, 1.1])).all(), ratio
-    assert_chi_square(errors(found), np.linalg.inv(found.covariance))
 
 
 # Gaps, recordings, failures.

@@ -17,14 +17,14 @@ import jaxos4
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", ["good", "misses", "outside", "mismatch"])
+@pytest.mark.parametrize("seed", ["good", "cmac", "misses", "outside", "mismatch"])
 def test_the_hybrid_finds_what_ibss_finds(seed):
     """Misses: the network was trained in another bracket. Outside: one truth lies outside of the network's bracket.
 
     Mismatch: it was not trained for so much noise, and answers nothing.
     """
     noise = 20.0 if seed == "mismatch" else 1.0
-    network, (alpha, states) = trained(), flights(LANES, seed=18, noise=noise)
+    network, (alpha, states) = trained(**(CMAC if seed == "cmac" else {})), flights(LANES, seed=18, noise=noise)
     if seed == "misses":
         aside = jaxos4.Bracket.around(BRACKET.center + 0.5 * BRACKET.half_width, 0.3 * BRACKET.half_width)
         network = jaxos4.NetworkEstimator(**(SMALL | {"steps": 100})).fit(problem_of(), aside, key=jax.random.key(0))
@@ -38,9 +38,10 @@ def test_the_hybrid_finds_what_ibss_finds(seed):
     assert seed == "mismatch" or set(names(alone)) == {"successful"}
     assert np.abs((hybrid.parameters - alone.parameters) / alone.std).max() < 0.1
     hit = ((alpha >= hybrid.seed.lower) & (alpha <= hybrid.seed.upper)).all(axis=1)
-    if seed == "good":
+    if seed in ("good", "cmac"):
         assert hybrid.rollouts.mean() < 0.5 * alone.rollouts.mean()
         assert hit.mean() > 0.95
+        np.testing.assert_allclose(hybrid.std, alone.std, rtol=0.05)
     if seed == "misses":
         assert hit.mean() < 0.5
     if seed == "mismatch":

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, refused
+from helpers import CRAZYFLIE, refused, same
 from px4_logs import everything
 from sign_flights import flown, turned
 
 import jaxos4
 from jaxos4.estimators import ESTIMATORS
+from jaxos4.export.spread import ESTIMATE
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
 
@@ -156,14 +157,31 @@ def assert_same_as_written(found, path):
     assert len(own["covariance"]) == len(own["parameters"])
 
 
-def test_a_flight_has_the_numbers_of_the_command(run, tmp_path, flight):
+@pytest.fixture
+def called(monkeypatch):
+    """The calls of `jaxos4.identify` by commands: flights, subject, options, and what was returned."""
+    calls, identify = [], jaxos4.identify
+
+    def spy(flights, subject, **options):
+        found = identify(flights, subject, **options)
+        options.pop("progress")
+        calls.append((flights, subject, {name: given for name, given in options.items() if given}, found))
+        return found
+
+    monkeypatch.setattr(jaxos4, "identify", spy)
+    return calls
+
+
+def test_the_command_calls_the_library_and_writes_its_numbers(run, tmp_path, flight, called):
     jaxos4.write_flight(flight, tmp_path / "flight.csv")
     code, _, err = run("estimate", "flight.csv", "--channels", "rates", "--out", "found.json")
     assert code == 0, err
-    stages, settings = [], jaxos4.FlightSettings(channels="rates")
-    found = jaxos4.identify(flight, jaxos4.PublishedOS4(), settings=settings, progress=stages.append)
+    (((recording,), subject, options, found),) = called
+    assert same(subject, jaxos4.PublishedOS4())
+    assert options == {"settings": jaxos4.FlightSettings(channels="rates")}
+    for name in ("omega", "states"):
+        np.testing.assert_array_equal(getattr(recording.flight, name), getattr(flight, name))
     assert found.successful
-    assert stages
     assert_same_as_written(found, tmp_path / "found.json")
     row = found.parameters["alpha3"]
     assert row.estimate is not None
@@ -176,10 +194,13 @@ def test_identify_takes_paths(tmp_path):
     flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=1.0, dt=0.01), dt=0.01)
     flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
     jaxos4.write_flight(flight, tmp_path / "flight.csv")
+    stages = []
+    options = {"estimator": "equation-error", "validate": tmp_path / "flight.csv", "progress": stages.append}
     found = [
-        jaxos4.identify(source, model, estimator="equation-error", validate=tmp_path / "flight.csv")
+        jaxos4.identify(source, model, **options)
         for source in (tmp_path / "flight.csv", str(tmp_path / "flight.csv"), [tmp_path / "flight.csv"])
     ]
+    assert stages
     assert len({json.dumps(each.to_dict()["parameters"]) for each in found}) == 1
     assert found[0].provenance.flight == str(tmp_path / "flight.csv")
     assert found[0].validation.flight == str(tmp_path / "flight.csv")
@@ -188,7 +209,7 @@ def test_identify_takes_paths(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_path, vehicle, monkeypatch):
+def test_two_logs_share_the_vehicle(run, tmp_path, vehicle, monkeypatch, called):
     monkeypatch.chdir(vehicle)
     files = ("--out", str(tmp_path / "found.json"), "--report", str(tmp_path / "found.html"))
     logs = ("flight1.csv", "flight2.csv", "--airframe", "airframe.toml", "--terms", ",".join(TERMS))
@@ -211,25 +232,25 @@ def test_two_logs_share_the_vehicle_by_the_command_and_by_the_library(run, tmp_p
     # The log says that it is of a real vehicle, and the page says that this decided.
     chosen = "flight1.csv has commands, not rotor speeds: taken as a real vehicle's (--model flight)"
     assert report["provenance"]["notes"][0] == chosen
-    constants = jaxos4.load_airframe("airframe.toml")
-    recordings = [read_recording(f"flight{i}.csv", constants) for i in (1, 2)]
-    settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=0.01)
-    found = jaxos4.identify(recordings, constants, settings=settings)
+    ((recordings, subject, options, found),) = called
+    assert [recording.name for recording in recordings] == ["flight1.csv", "flight2.csv"]
+    assert same(subject, jaxos4.load_airframe("airframe.toml"))
+    assert options == {"settings": jaxos4.VehicleSettings(terms=list(TERMS), sample_time=0.01)}
     assert_same_as_written(found, tmp_path / "found.json")
     assert found.predictions.horizons.tolist() == found.skill.horizons
-    same, own = np.isin(found.predictions.start, found.trajectories.start), found.trajectories
-    assert 20 <= own.start.size == same.sum() <= 40
+    kept, own = np.isin(found.predictions.start, found.trajectories.start), found.trajectories
+    assert 20 <= own.start.size == kept.sum() <= 40
     (near,) = np.flatnonzero(np.isclose(own.horizons, found.predictions.horizons[0]))
-    np.testing.assert_array_equal(own.predicted[:, near], found.predictions.predicted[same, 0])
+    np.testing.assert_array_equal(own.predicted[:, near], found.predictions.predicted[kept, 0])
     np.testing.assert_allclose(np.diff(own.horizons), own.horizons[0])
     assert own.horizons[-1] == pytest.approx(0.5, abs=own.horizons[0])
     # Vehicles are drawn from it as from the file, as wide as the moments of inertia are uncertain.
-    spread, key = jaxos4.export.read_result(found).spread, jax.random.key(1)
+    varying, key = jaxos4.export.read_result(found).varying, jax.random.key(1)
     known = {name: row.std for name, row in found.rigid_body.constants.items()}
-    wide = {name: spread.std[spread.names.index(name)] for name in known}
+    wide = {name: varying[name]["std"] for name in known}
     assert wide.keys() >= {"Ix", "Iy"}
     assert all(wide[name] > known[name] or wide[name] == pytest.approx(known[name]) for name in known)
-    plain = known.keys() - spread.widened.keys()
+    plain = {name for name in known if varying[name]["origin"] == ESTIMATE}
     assert {name: wide[name] for name in plain} == pytest.approx({name: known[name] for name in plain})
     drawn, again = found.sample(3, key=key), jaxos4.export.sample_vehicles(tmp_path / "found.json", 3, key=key)
     assert all(np.allclose(drawn[name], again[name], rtol=1e-9, atol=0) for name in drawn)

@@ -1,57 +1,187 @@
-"""Bi-section shooting and the ant colony: settings, starts, counts, kernels. Their errors: `test_errors.py`."""
+"""Solvers, on likelihoods in which nothing flies: minima, starts, limits, counts. On flights: `test_estimators.py`."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 from helpers import documented_class, noisy_states, random_starts, same, standard_flight, standard_problem
-from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
+from lanes import HALF, names
+from likelihoods import MINIMUM, SLOPES, quadratic, squares, two_minima, valley
 
 import jaxos4
 from jaxos4.estimators.levenberg_marquardt import LevenbergMarquardt
-from jaxos4.estimators.solver import solve
 
-PUBLISHED = jaxos4.PublishedOS4
-
-
-def test_where_a_start_is_nan_the_search_begins_at_the_center():
-    arguments = lanes(noisy_states(LANES))
-    center = (arguments[-1] + arguments[-2]) / 2
-    found = [identify(jaxos4.IBSS(), *arguments, start) for start in (center, center.at[7, 2].set(jnp.nan))]
-    assert same(*found)
-    assert set(names(found[0])) == {"successful"}
-    elsewhere = identify(jaxos4.IBSS(), *arguments, center.at[7, 2].add(0.5 * HALF[2]))
-    assert not np.array_equal(elsewhere.parameters[7], found[0].parameters[7])
+IBSS = jaxos4.IBSS
 
 
-SOLVERS = [jaxos4.IBSS(), LevenbergMarquardt(), jaxos4.AntColony()]
+exec(documented_class("likelihood.md"), DOCUMENTED := {"__name__": "descent"})  # noqa: S102
+DESCENT = DOCUMENTED["Descent"]
+# Each with the settings of a search that is stopped.
+SOLVERS = {
+    "IBSS": (IBSS, {"max_sweeps": 2}),
+    "LevenbergMarquardt": (LevenbergMarquardt, {"max_steps": 2}),
+    "AntColony": (jaxos4.AntColony, {"max_sweeps": 3}),
+    "of the documentation": (DESCENT, {"steps": 2}),
+}
+every_solver = pytest.mark.parametrize("name", SOLVERS)
+
+
+def solver_of(name):
+    return SOLVERS[name][0]()
+
+
+@every_solver
+@pytest.mark.parametrize("residuals", [quadratic, valley])
+def test_a_search_ends_at_the_minimum_that_another_minimiser_finds(name, residuals):
+    best = scipy.optimize.least_squares(lambda x: np.asarray(residuals(jnp.asarray(x))), np.zeros(2), xtol=1e-12)
+    found = solver_of(name)(squares(residuals))
+    assert names(found) == "successful"
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(best.jac.T @ best.jac), rtol=0.05)
+    assert (np.abs(found.parameters - best.x) <= 0.05 * found.std).all()
+    assert abs(float(found.cost) - best.cost) < 0.005
+
+
+@every_solver
+def test_a_search_that_is_stopped_says_so(name):
+    make, settings = SOLVERS[name]
+    found = make(**settings)(squares(valley))
+    assert names(found) == "max_sweeps"
+    assert int(found.sweeps) == next(iter(settings.values()))
+    assert np.isfinite(found.parameters).all()
+
+
+@every_solver
+def test_where_a_start_is_nan_the_search_begins_at_the_center(name):
+    problem, solver, starts = squares(valley, (0.2, 0.1)), solver_of(name), [[0.2, 0.1], [0.2, np.nan], [-0.9, 0.1]]
+    at_center, half, elsewhere = (solver(problem, start=jnp.array(start)) for start in starts)
+    assert same(at_center, half)
+    assert not same(at_center, elsewhere)
+
+
+@every_solver
+def test_a_start_beyond_the_reach_is_moved_to_its_limit(name):
+    shots = []
+    problem, solver = squares(quadratic, half_width=0.1, hear=lambda x: shots.append(x)), solver_of(name)
+    lower, upper = (np.asarray(limit) for limit in problem.unknowns.limits(solver.reach))
+    found = solver(problem, start=jnp.array([9.0, 0.0]))
+    jax.effects_barrier()
+    assert [upper[0], 0.0] in [shot.tolist() for shot in shots]
+    assert ((np.array(shots) >= lower - 1e-12) & (np.array(shots) <= upper + 1e-12)).all()
+    assert names(found) != "nonfinite_trajectory"
+
+
+@every_solver
+def test_a_minimum_beyond_the_reach_is_reported(name):
+    found = solver_of(name)(squares(quadratic, center=MINIMUM + [1.0, 0.0], half_width=0.2))
+    assert names(found) == "at_bound"
+
+
+@every_solver
+def test_a_held_unknown_needs_neither_a_start_nor_a_bracket(name):
+    """A start elsewhere does not move it, and its bracket may be empty."""
+    problem, solver = squares(quadratic).hold({"x": 0.25}), solver_of(name)
+    empty = jaxos4.Bracket.around(problem.unknowns.center, jnp.array([0.0, 1.0]))
+    least = np.linalg.lstsq(SLOPES[:, 1:], SLOPES @ MINIMUM - SLOPES[:, 0] * 0.25)[0]
+    for found in (solver(problem), solver(problem, start=jnp.array([0.9, 0.9])), solver(problem, empty)):
+        assert names(found) == "successful"
+        assert float(found.parameters[0]) == 0.25
+        assert abs(float(found.parameters[1] - least[0])) <= 0.05 * float(found.std[1])
+        np.testing.assert_array_equal(found.covariance[0], 0.0)
+        np.testing.assert_allclose(found.covariance[1, 1], 1 / np.square(SLOPES[:, 1]).sum(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in SOLVERS if name != "AntColony"])
+def test_the_best_answer_of_several_starts_counts(name):
+    """The second unknown is no parameter: each start has its value."""
+    starts = jnp.array([[0.1, 1.1], [0.1, -1.1]])
+    low, high, both = (
+        solver_of(name)(squares(two_minima, half_width=0.5, parameter_count=1, starts=some))
+        for some in (starts[:1], starts[1:], starts)
+    )
+    assert float(high.parameters[1]) < 0 < float(low.parameters[1])
+    np.testing.assert_allclose(both.parameters, low.parameters, atol=1e-6)
+    assert int(both.rollouts) > int(low.rollouts)
+
+
+def bent(x):
+    """`quadratic` with a curvature, so that the first shots miss the minimum."""
+    return quadratic(x) + 3 * (x[0] - MINIMUM[0]) ** 2 * np.array([1, -1, 2])
+
+
+@pytest.mark.parametrize(("widest", "result"), [(0.1, "successful"), (0.25, "max_sweeps")])
+def test_slopes_that_are_wrong_end_no_search_as_a_success(widest, result):
+    """Beside the minimum, IBSS goes round what is not a number, or says that it did not."""
+    shots = []
+
+    def hole(x, gradient):
+        return jnp.where((x[0] > MINIMUM[0] + 0.01) & (x[0] < MINIMUM[0] + widest), jnp.nan, gradient)
+
+    found = IBSS()(squares(bent, center=(1.0, 0.0), change=hole, hear=lambda x: shots.append(float(x[0]))))
+    jax.effects_barrier()
+    assert any(0.01 < shot - MINIMUM[0] < widest for shot in shots)
+    assert names(found) == result
+    assert result != "successful" or (np.abs(found.parameters - MINIMUM) <= 0.05 * found.std).all()
+
+
+def test_a_slope_of_the_wrong_sign_ends_no_search_as_a_success():
+    turned = squares(quadratic, center=(1.0, 0.0), change=lambda x, gradient: -gradient, stride=np.ones(2))
+    assert names(IBSS()(turned)) != "successful"
+
+
+# How much was simulated.
+
+
+@every_solver
+def test_rollouts_are_the_shots_and_their_derivatives(name):
+    """IBSS counts derivatives only; a colony simulates without them, but at the answer."""
+    shots = []
+    found = solver_of(name)(squares(valley, hear=lambda x: shots.append(x)))
+    jax.effects_barrier()
+    count = len(shots)
+    expected = {"IBSS": 2 * count, "AntColony": count + 2}.get(name, 3 * count)
+    assert int(found.rollouts) == expected
+
+
+@pytest.mark.parametrize("halvings", [2, 3])
+def test_a_sweep_of_ibss_narrows_each_bracket_and_ends_early_where_the_minimum_is(halvings):
+    found = IBSS(halvings=halvings)(squares(valley))
+    shots, sweeps = int(found.rollouts) // 2, int(found.sweeps)
+    assert sweeps > 3
+    assert 2 * sweeps <= shots <= 1 + sweeps * (1 + halvings)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
-def test_a_start_beyond_the_reach_is_moved_to_its_limit(solver):
-    problem = standard_problem(channels="rates", states=noisy_states(1)[0])
-    lower, upper = problem.unknowns.limits(solver.reach)
-    far = problem.unknowns.center.at[2].set(2 * upper[2])
-    found = solve(solver, problem, far)
-    assert ((found.parameters >= lower) & (found.parameters <= upper)).all()
-    assert names(found) != "nonfinite_trajectory"
+def test_a_shot_simulates_each_sample_of_a_flight_once():
+    """Whatever the number of its tangents."""
+    torques = []
+
+    class Counting(jaxos4.PublishedOS4):
+        def angular_acceleration(self, rates, forcing, parameters):
+            jax.debug.callback(lambda torque: torques.append(float(torque)), forcing.roll)
+            return super().angular_acceleration(rates, forcing, parameters)
+
+    flight = standard_flight(duration=0.5)
+    problem = jaxos4.ShootingProblem(Counting(), flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
+    jax.block_until_ready(jax.jit(problem.local_model)(problem.initial_guess.starts[0]).cost)
+    jax.effects_barrier()
+    rolls = np.asarray(problem.forcing(problem.model.alpha).roll)
+    assert np.sort(torques).tolist() == np.sort(rolls[: len(torques)]).tolist()
+    assert len(torques) in (50, 51)
+
+
+# On flights.
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shooting", "innovations"])
-def test_the_search_of_the_documentation_ends_at_the_minimum_or_says_that_it_did_not(kind):
-    exec(documented_class("likelihood.md"), defined := {"__name__": "descent"})  # noqa: S102
+def test_the_search_of_the_documentation_finds_the_answer_of_ours(kind):
     problem = standard_problem(channels="rates", states=noisy_states(3)[2], free=True).hold({"alpha2": 0.0})
     best = (jaxos4.OutputError if kind == "shooting" else jaxos4.FilterError)()(problem)
-    problem = problem if kind == "shooting" else jaxos4.InnovationsProblem(problem)
-    found = defined["Descent"]()(problem)
+    found = DESCENT()(problem if kind == "shooting" else jaxos4.InnovationsProblem(problem))
     assert names(found) == "successful"
-    off = np.abs(found.parameters[:8] - best.parameters)
-    assert (off <= 0.05 * best.std).all()
-    if kind == "shooting":
-        assert names(defined["Descent"](steps=1)(problem)) == "max_sweeps"
+    assert (np.abs(found.parameters[:8] - best.parameters) <= 0.05 * best.std).all()
 
 
 @pytest.mark.slow
@@ -75,116 +205,3 @@ def test_output_error_takes_no_more_steps_for_a_long_flight():
     error = (found.parameters - problem.model.alpha) / found.std
     assert (np.abs(error) < 5).all()
     assert (found.cost <= whole.cost + 0.01).all()
-
-
-def test_too_few_sweeps_are_reported():
-    estimates = identify(jaxos4.IBSS(max_sweeps=1, tolerance=1e-8), *lanes(noisy_states(LANES)))
-    assert set(names(estimates)) == {"max_sweeps"}
-    assert np.isfinite(estimates.parameters).all()
-    assert (np.asarray(estimates.sweeps) == 3).all()  # one for each share of the flight
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
-def test_ibss_reaches_the_maximum_of_the_likelihood():
-    """That of output error, which is that of another minimiser: `test_estimators.py`."""
-    problem, *arguments = lanes(noisy_states(LANES, seed=5))
-    best = identify(jaxos4.OutputError(tolerance=1e-9), problem, *arguments).parameters
-    # What the default tolerance allows is far below the noise.
-    for settings, most in (({"tolerance": 1e-5}, 1e-4), ({}, 0.05)):
-        estimates = identify(jaxos4.IBSS(**settings), problem, *arguments)
-        assert set(names(estimates)) == {"successful"}
-        assert np.abs((estimates.parameters - best) / bound()).max() < most
-
-
-def broken(problem, lowest, highest, factor):
-    """The slope of alpha3 is multiplied by `factor` between two values."""
-
-    class Broken(jaxos4.ShootingProblem):
-        def stages(self, shares=()):
-            stages = super().stages(shares)
-
-            def local_model(number, before, unknowns):
-                model, alpha = stages.local_model(number, before, unknowns), unknowns[0, 2]
-                change = jnp.where((alpha > lowest) & (alpha < highest), factor, 1.0)
-                return model._replace(gradient=model.gradient.at[:, 2].multiply(change))
-
-            return stages._replace(local_model=local_model)
-
-    return Broken(problem.model, problem.flight, sigma=problem.sigma, channels="rates", unknowns=problem.unknowns)
-
-
-def test_slopes_that_are_wrong_end_no_search_as_a_success():
-    """Beside the minimum, the search goes round what is not a number. Where every slope is wrong, it says so."""
-    problem = standard_problem(channels="rates", states=noisy_states(1)[0], free=True)
-    problem = problem.within(jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF))
-    best = jaxos4.IBSS()(problem)
-    value, std = float(best.parameters[2]), float(best.std[2])
-    found = jaxos4.IBSS()(broken(problem, value + 2 * std, value + 6 * std, np.nan))
-    assert names(found) == "successful"
-    assert (np.abs(found.parameters - best.parameters) <= 0.05 * best.std).all()
-    strides = eqx.tree_at(lambda p: p.unknowns.stride, problem, problem.unknowns.stride.at[0].set(1.0))
-    assert names(jaxos4.IBSS()(broken(strides, -np.inf, np.inf, -1.0))) != "successful"
-
-
-def counting(torques):
-    """A model that tells the torque of each simulated step. The first torque of a flight starts a shot."""
-
-    class Counting(PUBLISHED):
-        def angular_acceleration(self, rates, forcing, parameters):
-            jax.debug.callback(lambda torque: torques.append(float(torque)), forcing.roll)
-            return super().angular_acceleration(rates, forcing, parameters)
-
-    return Counting()
-
-
-def shots_of(problem, torques):
-    """How many shots these torques were."""
-    jax.effects_barrier()
-    rolls = np.asarray(problem.forcing(problem.model.alpha).roll)
-    assert (rolls == rolls[0]).sum() == 1
-    return torques.count(float(rolls[0]))
-
-
-def problem_of(model, start, duration):
-    flight = eqx.tree_at(lambda f: f.states, standard_flight(duration=duration), noisy_states(1, duration=duration)[0])
-    return jaxos4.ShootingProblem(
-        model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", initial_state=start
-    ).within(jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF))
-
-
-@pytest.mark.slow
-def test_rollouts_are_counted_right():
-    """On however many samples."""
-    free, slow = None, {"halvings": 3}
-    for start, unknowns, most, settings in ((np.zeros(12), 8, 2, {}), (free, 11, 3, slow)):
-        problem = problem_of(counting(torques := []), start, 0.5)
-        estimate = jaxos4.IBSS(**settings)(problem)
-        shots, sweeps = shots_of(problem, torques), int(estimate.sweeps)
-        assert int(estimate.rollouts) == unknowns * shots  # each shot carries one tangent for every unknown
-        assert sweeps > 3
-        # A sweep narrows each bracket; it ends early where the minimum is.
-        assert 2 * sweeps <= shots <= 3 + sweeps * (1 + most)
-
-
-@pytest.mark.slow
-def test_the_colony_reaches_the_optimum_of_ibss_with_many_more_rollouts():
-    colony = noisy(jaxos4.AntColony, count=FEW)
-    ibss = jax.tree.map(lambda leaf: leaf[:FEW], noisy(jaxos4.IBSS))
-    assert set(names(colony)) == {"successful"}
-    # A cost of 0.005 is an error of 0.1 standard deviations.
-    assert (np.abs(colony.cost - ibss.cost) < 5 * jaxos4.AntColony().tolerance).all()
-    assert (np.abs(colony.parameters - ibss.parameters) < 0.1 * bound()).all()
-    np.testing.assert_allclose(colony.std, ibss.std, rtol=0.01)
-    assert (np.asarray(colony.rollouts) > 5 * np.asarray(ibss.rollouts)).all()
-
-
-@pytest.mark.slow
-def test_each_simulated_point_of_a_colony_is_counted():
-    """A search that is stopped says so."""
-    problem = problem_of(counting(torques := []), np.zeros(12), 5.0)
-    estimate = jaxos4.AntColony(ants=9, max_sweeps=3)(problem)
-    shots = 50 + 3 * 9 + 1  # and one at the answer, with eight tangents
-    assert shots_of(problem, torques) == shots
-    assert int(estimate.rollouts) == shots + 8
-    assert (int(estimate.sweeps), str(names(estimate))) == (3, "max_sweeps")

@@ -1,4 +1,4 @@
-"""`Unknowns`, brackets and results: held parameters keep their values; the others are estimated as if known."""
+"""`Unknowns`, brackets and results. Fixed parameters in searches: `test_searches.py`, `test_estimators.py`."""
 
 import equinox as eqx
 import jax
@@ -8,59 +8,15 @@ import pytest
 from helpers import noisy_states, standard_problem
 
 import jaxos4
-from jaxos4 import estimators
 from jaxos4.results import NAMES
 from jaxos4.shooting import InnovationsProblem
 
 HELD = {"alpha2": 0.0079, "alpha7": 0.01}
 PLACES = [1, 6]
-ESTIMATORS = {name: kind() for name, kind in estimators.ESTIMATORS.items() if not kind.needs_network}
-# Their covariance is the inverse of an information.
-LIKELIHOODS = ("ibss", "output-error", "filter-error", "kalman", "ant-colony")
 
 
 def noisy_problem():
     return standard_problem(jaxos4.CorrectedOS4, channels="rates", states=noisy_states(1, jaxos4.CorrectedOS4)[0])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ESTIMATORS)
-def test_a_held_parameter_keeps_its_value_and_has_no_variance(name):
-    found = ESTIMATORS[name](noisy_problem().hold(HELD))
-    np.testing.assert_array_equal(found.parameters[np.array(PLACES)], list(HELD.values()))
-    covariance = np.asarray(found.covariance)
-    assert (covariance[PLACES] == 0).all()
-    assert (covariance[:, PLACES] == 0).all()
-    others = np.delete(np.arange(8), PLACES)
-    assert (np.diagonal(covariance)[others] > 0).all()
-    if name in LIKELIHOODS:
-        # Fewer unknowns are known better; the bound is computed at another answer.
-        free = ESTIMATORS[name](noisy_problem())
-        assert (np.asarray(found.std)[others] <= 1.1 * np.asarray(free.std)[others]).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["ibss", "output-error", "kalman", "equation-error"])
-def test_the_others_are_estimated_without_error_if_the_held_values_are_true(name):
-    model = jaxos4.CorrectedOS4()
-    problem = standard_problem(jaxos4.CorrectedOS4, "rates").hold({"alpha2": model.alpha[1], "alpha7": 0.0})
-    found = ESTIMATORS[name](problem, jaxos4.Bracket.around(model.alpha + 0.5 * model.half_width, model.half_width))
-    # A Gaussian prior moves the answer by its share of the information.
-    tolerance = 0.05 * np.asarray(found.std) + 1e-12 if name == "kalman" else 1e-5 * np.asarray(model.half_width)
-    assert (np.abs(found.parameters - model.alpha) <= tolerance).all()
-
-
-@pytest.mark.slow
-def test_a_held_parameter_needs_neither_a_start_nor_a_bracket():
-    """A start elsewhere does not move it, and its bracket may be empty."""
-    problem = noisy_problem().hold(HELD)
-    found, start = jaxos4.IBSS()(problem), problem.unknowns.center + 0.9 * problem.unknowns.half_width
-    half_width = problem.unknowns.half_width.at[np.array(PLACES)].set(0.0)
-    empty = jaxos4.IBSS()(problem, jaxos4.Bracket.around(problem.unknowns.center, half_width))
-    for other in (jaxos4.IBSS()(problem, start=start), empty):
-        assert other.result == jaxos4.RESULTS.successful
-        np.testing.assert_array_equal(other.parameters[np.array(PLACES)], list(HELD.values()))
-        assert (np.abs(other.parameters - found.parameters) <= 0.01 * found.std).all()
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Verdicts of a flight of an OS4: what was asked are its alphas, and not the rigid body that they may contradict."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from helpers import standard_flight
 import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.excitation import doublet, multisine
-from jaxos4.flight import RATES
+from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification.issues_of_values import issues_of_alphas
 from jaxos4.identification.physical import physical_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, RigidBody
@@ -53,6 +54,28 @@ def test_alphas_of_no_rigid_body_contradict_the_rigid_body_alone(number):
     assert ": successful," in lines[-2]
 
 
+@functools.cache
+def good(channels):
+    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(standard_flight(), key=jax.random.key(0))
+    return jaxos4.identify(flight, jaxos4.PublishedOS4(), settings=jaxos4.FlightSettings(channels=channels))
+
+
+@pytest.mark.parametrize("channels", ["all", pytest.param("rates", marks=pytest.mark.slow)])
+def test_a_good_flight_identifies_what_it_shows(channels):
+    found = good(channels)
+    assert found.successful
+    assert {found.verdicts[name].status for name in ("rigid body", "alpha1", "alpha3", "alpha6", "alpha8")} == {
+        IDENTIFIED
+    }
+
+
+def test_a_rotor_inertia_below_noise_is_no_physical_value():
+    found = good("all")
+    assert "J_R" in found.rigid_body.constants
+    assert [each.name for each in physical_quantities(found)][:4] == ["Ix", "Iy", "Iz", "alpha1"]
+    assert "J_R below noise" in found.summary(width=300)
+
+
 FAULTY = {
     "rates halved": lambda flight: changed(flight, scale=0.5),
     "time twice as fast": lambda flight: {"time": np.asarray(flight.time) / 2},
@@ -76,6 +99,23 @@ def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels)
     first, *_ = found.summary(width=200).splitlines()
     assert first.startswith("alpha1, ")
     assert first.endswith(", rigid body: refused (contradicted).")
+    assert set(found.to_dict()["verdicts"]) == {*found.parameters, "rigid body"}
+    if fault == "rates halved":
+        assert "the attitude turns 2 times as much as the gyro says" in found.verdicts["alpha3"].reasons[0]
+
+
+def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
+    states = changed(standard_flight(), scale=0.5)["states"]
+    states[:, ANGLES] = np.nan
+    settings = jaxos4.FlightSettings(channels="rates")
+    found = jaxos4.identify(
+        dataclasses.replace(standard_flight(), states=states), jaxos4.PublishedOS4(), settings=settings
+    )
+    assert found.result == "implausible"
+    assert "alpha1 = -1.47 is not between -1 and 1" in found.verdicts["alpha1"].reasons[0]
+    said = " ".join(found.verdicts["rigid body"].reasons)
+    assert all(words in said for words in ("J_R = ", "is negative", "not those of one rigid body"))
+    assert found.verdicts["alpha3"].trusted
 
 
 def alpha_table(**alphas):
@@ -107,14 +147,6 @@ def test_an_alpha_is_contradicted_only_outside_its_bracket(alphas, rotor, said):
     for issue, (cause, moves) in zip(issues, said.items(), strict=True):
         assert cause in issue.cause
         assert set(issue.moves) == moves
-
-
-def test_a_rotor_inertia_below_noise_is_no_physical_value():
-    flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(standard_flight(), key=jax.random.key(0))
-    found = jaxos4.identify(flight, jaxos4.PublishedOS4())
-    assert "J_R" in found.rigid_body.constants
-    assert [each.name for each in physical_quantities(found)][:4] == ["Ix", "Iy", "Iz", "alpha1"]
-    assert "J_R below noise" in found.summary(width=300)
 
 
 @pytest.mark.slow
