@@ -1,5 +1,7 @@
 """A verdict for each quantity: an issue counts by how far it would move it. Those of an OS4: `test_verdicts_os4.py`."""
 
+import dataclasses
+
 import equinox as eqx
 import msgspec
 import numpy as np
