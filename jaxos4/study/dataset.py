@@ -29,35 +29,43 @@ from .cell import LEVELS, OUTCOMES, fly, setup_of
 from .metrics import SCENARIO
 from .specification import AXES, Study
 
-# For each variable of a flight: its further dimensions, type, unit and description.
-VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
-    "truth": (("parameter",), "f8", "unit", "true parameter"),
-    "estimate": (("parameter",), "f8", "unit", "estimated parameter; missing where `result` says that there is none"),
-    "std": (("parameter",), "f8", "unit", "standard deviation that the estimator gives"),
-    "half_width": (("parameter", "level"), "f8", "unit", "half the interval that claims to hold the truth at `level`"),
-    "bound": (("parameter",), "f8", "unit", "Cramer-Rao standard deviation, white noise, of the channels `seen`"),
-    "result": ((), "i1", "1", "how the estimate ended"),
-    "rollouts": ((), "i4", "1", "simulated flights that the estimate took"),
-    "cost": ((), "f8", "1", "1/2 |W (y - x)|^2 at the estimate, of the channels `seen`"),
-    "hit": ((), "i1", "1", "whether the hybrid's seed bracket held the truth; -1 for other estimators"),
+# All arrays of a study's Dataset: dimensions, type as of NumPy (`U`: texts), unit, and description. First its axes.
+COORDINATES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "model": (("model",), "U", "1", "equations that are fitted, and flown"),
+    "airframe": (("airframe",), "U", "1", "airframe that is flown"),
+    "excitation": (("excitation",), "U", "1", "rotor speeds that are flown"),
+    "duration": (("duration",), "f8", "s", "length of a flight"),
+    "method": (("method",), "U", "1", "how true flights are simulated"),
+    "noise": (("noise",), "U", "1", "kind of sensor noise"),
+    "scale": (("scale",), "f8", "1", "noise in multiples of the standard sensors'"),
+    "width": (("width",), "f8", "1", "bracket in multiples of the default half-width"),
+    "channels": (("channels",), "U", "1", "what was measured"),
+    "estimator": (("estimator",), "U", "1", "estimator"),
+    "flight": (("flight",), "i8", "1", "number of the flight: the same draws in all scenarios"),
+    "parameter": (("parameter",), "U", "1", "parameter"),
+    "level": (("level",), "f8", "1", "share of intervals that should hold the truth"),
 }
-_AXES = {
-    "model": "equations that are fitted, and flown",
-    "airframe": "airframe that is flown",
-    "excitation": "rotor speeds that are flown",
-    "duration": "length of a flight",
-    "method": "how true flights are simulated",
-    "noise": "kind of sensor noise",
-    "scale": "noise in multiples of the standard sensors'",
-    "width": "bracket in multiples of the default half-width",
-    "channels": "what was measured",
-    "estimator": "estimator",
-    "flight": "number of the flight: the same draws in all scenarios",
-    "parameter": "parameter",
-    "level": "share of intervals that should hold the truth",
+_FLIGHTS, _WIDE = (*SCENARIO, "flight"), ("model", "airframe", "width", "parameter")
+_VALUES = (*_FLIGHTS, "parameter")
+# What the file of a cell has. The truth is the same for all estimators.
+RESULTS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "truth": ((*SCENARIO[:-1], "flight", "parameter"), "f8", "unit", "true parameter"),
+    "estimate": (_VALUES, "f8", "unit", "estimated parameter; missing where `result` says that there is none"),
+    "std": (_VALUES, "f8", "unit", "standard deviation that the estimator gives"),
+    "half_width": ((*_VALUES, "level"), "f8", "unit", "half the interval that claims to hold the truth at `level`"),
+    "bound": (_VALUES, "f8", "unit", "Cramer-Rao standard deviation, white noise, of the channels `seen`"),
+    "result": (_FLIGHTS, "i1", "1", "how the estimate ended"),
+    "rollouts": (_FLIGHTS, "i4", "1", "simulated flights that the estimate took"),
+    "cost": (_FLIGHTS, "f8", "1", "1/2 |W (y - x)|^2 at the estimate, of the channels `seen`"),
+    "hit": (_FLIGHTS, "i1", "1", "whether the hybrid's seed bracket held the truth; -1 for other estimators"),
 }
-WIDE = ("model", "airframe", "width", "parameter")
-"""The dimensions of the brackets."""
+SCHEMA = COORDINATES | RESULTS
+SCHEMA |= {
+    "unit": (("parameter",), "U", "1", "unit of the parameter"),
+    "center": (_WIDE, "f8", "unit", "middle of the bracket"),
+    "bracket_half_width": (_WIDE, "f8", "unit", "half the width of the bracket"),
+    "seen": (("channels", "estimator"), "U", "1", "channels that the estimator looks at"),
+}
 
 RESULTS_FILE = "results.nc"
 _SPECIFICATION, _LOCK = "study.json", "lock"
@@ -174,8 +182,8 @@ def assemble(store: Store) -> xr.Dataset:
     study, coordinates, failures = store.study, _coordinates(store.study), []
     blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {
-        name: np.full([len(coordinates[dim][1]) for dim in dims(name)], blank.get(name, np.nan), kind)
-        for name, (_, kind, _, _) in VARIABLES.items()
+        name: np.full([len(coordinates[dim][1]) for dim in dims], blank.get(name, np.nan), kind)
+        for name, (dims, kind, *_) in RESULTS.items()
     }
     for cell in map(study.cell, range(study.count)):
         if (results := store.read(cell.number)) is None:
@@ -192,31 +200,30 @@ def assemble(store: Store) -> xr.Dataset:
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
         with reading(store.cell_file(cell.number), "not a cell of this study", _RUN_AGAIN):
-            for name, (_, kind, *_) in VARIABLES.items():
+            for name, (_, kind, *_) in RESULTS.items():
                 found = results[name].astype(kind, casting="same_kind")
                 arrays[name][shared if name == "truth" else own] = found
             if not np.isin(results["result"], np.arange(len(OUTCOMES))).all():
                 raise ValueError("unknown result")
-    variables = {name: (dims(name), arrays[name], _named(*about[2:])) for name, about in VARIABLES.items()}
+    variables = {name: _described(name, values) for name, values in (arrays | _brackets(study)).items()}
     command = {"command": "jaxos4 study specification.toml --out .", "failures": json.dumps(failures)}
-    dataset = xr.Dataset(variables | _brackets(study), coordinates, provenance(study, store.device) | command)
+    dataset = xr.Dataset(variables, coordinates, provenance(study, store.device) | command)
     flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
     dataset["result"].attrs |= flags
     return dataset
-
-
-def dims(name: str) -> tuple[str, ...]:
-    """The dimensions of a variable; the truth is the same for all estimators."""
-    return (*(SCENARIO[:-1] if name == "truth" else SCENARIO), "flight", *VARIABLES[name][0])
 
 
 def _coordinates(study: Study) -> dict[str, tuple]:
     model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
     values = [list(getattr(study, axis)) for axis in AXES]
     values += [np.arange(study.flights), list(model.parameter_names), list(LEVELS)]
-    described = zip(_AXES.items(), values, strict=True)
-    coordinates = {dim: (dim, some, _named("s" if dim == "duration" else "1", name)) for (dim, name), some in described}
-    return coordinates | {"unit": ("parameter", list(model.parameter_units), _named("1", "unit of the parameter"))}
+    known = dict(zip(COORDINATES, values, strict=True)) | {"unit": list(model.parameter_units)}
+    return {name: _described(name, some) for name, some in known.items()}
+
+
+def _described(name: str, values: Any) -> tuple[tuple[str, ...], Any, dict[str, str]]:
+    dims, _, units, about = SCHEMA[name]
+    return dims, values, {"long_name": about, "units": units}
 
 
 def provenance(study: Study, device: str) -> dict[str, str | int]:
@@ -232,7 +239,7 @@ def provenance(study: Study, device: str) -> dict[str, str | int]:
     }
 
 
-def _brackets(study: Study) -> dict[str, tuple]:
+def _brackets(study: Study) -> dict[str, Any]:
     """The brackets of all searches and networks, by model, airframe and width, and the channels that are seen."""
     first = study.cell(0).scenario
     brackets = [
@@ -242,12 +249,4 @@ def _brackets(study: Study) -> dict[str, tuple]:
     shape = [len(study.models), len(study.airframes), len(study.widths), -1]
     center, half = (np.stack([getattr(b, name) for b in brackets]).reshape(shape) for name in ("center", "half_width"))
     seen = [[first._replace(channels=c, estimator=e).seen for e in study.estimators] for c in study.channels]
-    return {
-        "center": (WIDE, center, _named("unit", "middle of the bracket")),
-        "bracket_half_width": (WIDE, half, _named("unit", "half the width of the bracket")),
-        "seen": (("channels", "estimator"), seen, _named("1", "channels that the estimator looks at")),
-    }
-
-
-def _named(units: str, long_name: str) -> dict[str, Any]:
-    return {"long_name": long_name, "units": units}
+    return {"center": center, "bracket_half_width": half, "seen": seen}

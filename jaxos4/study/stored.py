@@ -5,19 +5,16 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from .._files import BROKEN, check_plain, reading
 from ..errors import InputError, shortened
-from .dataset import RESULTS_FILE, VARIABLES, WIDE, dims
+from .dataset import COORDINATES, RESULTS_FILE, SCHEMA
 from .metrics import SCENARIO
-from .specification import Scenario
 
-_AXES = get_type_hints(Scenario) | {"flight": int, "parameter": str, "level": float}
-_KINDS: dict[type, str] = {str: "UO", float: "fiu", int: "iu"}
 # HDF5 can loop for ever or crash on a damaged file, so another process reads all of it first.
 _PROBE = """
 import signal, sys, h5py
@@ -76,17 +73,14 @@ def _probe(path: Path) -> None:
 
 def _fault(dataset: xr.Dataset) -> str:
     """Why a Dataset is not that of a study; empty if it is one."""
-    needed = {name: (dims(name), _KINDS[float if kind[0] == "f" else int]) for name, (_, kind, *_) in VARIABLES.items()}
-    needed |= dict.fromkeys(("center", "bracket_half_width"), (WIDE, _KINDS[float]))
-    needed |= {"seen": (("channels", "estimator"), _KINDS[str]), "unit": (("parameter",), _KINDS[str])}
-    needed |= {axis: ((axis,), _KINDS[kind]) for axis, kind in _AXES.items()}
-    if missing := ", ".join(sorted(needed.keys() - dataset.variables.keys())):
+    if missing := ", ".join(sorted(SCHEMA.keys() - dataset.variables.keys())):
         return f"no {missing}"
-    for name, (names, kinds) in needed.items():
+    kinds = {"U": "UO", "f": "fiu", "i": "iu"}  # whole numbers can be numbers, and texts objects
+    for name, (dims, kind, *_) in SCHEMA.items():
         found = dataset[name]
-        if found.dims != names or found.dtype.kind not in kinds or not found.size:
+        if found.dims != dims or found.dtype.kind not in kinds[kind[0]] or not found.size:
             return f"{name} is of another kind or shape"
-        if name in _AXES and (
+        if name in COORDINATES and (
             len(set(found.values.tolist())) < found.size or found.isin([np.nan, np.inf, -np.inf]).any()
         ):
             return f"{name} has equal values, or one that is not finite"
@@ -101,7 +95,7 @@ def _fault(dataset: xr.Dataset) -> str:
 
 def _check_texts(path: Path, dataset: xr.Dataset) -> None:
     """Refuse texts of many lines, and cells that failed without saying which."""
-    texts: dict[str, Any] = {name: dataset[name].values.ravel().tolist() for name in (*_AXES, "seen", "unit")}
+    texts: dict[str, Any] = {name: dataset[name].values.ravel().tolist() for name in (*COORDINATES, "seen", "unit")}
     check_plain(path, texts | {name: str(each).splitlines() for name, each in dataset.attrs.items()}, _REMEDY)
     try:
         failures = json.loads(dataset.attrs.get("failures", "[]"))
