@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 import statistics
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -61,6 +61,9 @@ class GatedPerceptron(eqx.Module):
         return self.last(self.hidden(x) * self.gate(x))
 
 
+_EXTENT = 3.0  # cells cover inputs of this size, to either side: twice what a flight without noise has
+
+
 class CMAC(eqx.Module):
     """The cerebellar model articulation controller: a table of weights, of which an input selects a few.
 
@@ -71,12 +74,8 @@ class CMAC(eqx.Module):
     Albus tiles all inputs together and hashes the cells. In nine dimensions two flights rarely share a cell; pairs can
     represent the products in which parameters act on a flight.
 
-    - `extent`: cells cover inputs from minus this to this: twice what a flight without noise has.
-
     Reference: Albus (1975), A new approach to manipulator control, J. Dyn. Sys., Meas., Control 97(3), 220-227.
     """
-
-    extent: ClassVar[float] = 3.0
 
     table: Float[Array, "pairs tilings cells cells out"]
 
@@ -88,7 +87,7 @@ class CMAC(eqx.Module):
         """The output for inputs `x`."""
         pairs, tilings, cells = self.table.shape[:3]
         first, second = np.array(list(itertools.combinations(range(x.size), 2))).T
-        place, number = (x / self.extent + 1) / 2 * (cells - 1), np.arange(tilings)
+        place, number = (x / _EXTENT + 1) / 2 * (cells - 1), np.arange(tilings)
 
         def cell(inputs: Int[np.ndarray, " pairs"], shift: Int[np.ndarray, " tilings"]) -> Int[Array, "pairs tilings"]:
             shifted = place[inputs, None] + (shift % tilings / tilings).astype(x.dtype)
@@ -106,16 +105,12 @@ ARCHITECTURES = {
 """The corrections of the linear map by name: the class, and the settings that are its arguments."""
 
 
+_SPREAD_WIDTH, _SPREAD_DEPTH = 32, 2  # of the perceptron that predicts the spread of the error
+_MAX_LOG_SPREAD = 7.0  # to either side
+
+
 class Regressor(eqx.Module):
-    """The trained part of a network: a linear map `skip`, its `correction`, and the error's spread.
-
-    - `spread_width`, `spread_depth`: of the perceptron that predicts the logarithm of the error's spread.
-    - `largest_logarithm`: its limit, to either side.
-    """
-
-    spread_width: ClassVar[int] = 32
-    spread_depth: ClassVar[int] = 2
-    largest_logarithm: ClassVar[float] = 7.0
+    """The trained part of a network: a linear map `skip`, its `correction`, and the logarithm of the error's spread."""
 
     skip: Float[Array, "unknowns features"]
     correction: GatedPerceptron | CMAC
@@ -125,7 +120,7 @@ class Regressor(eqx.Module):
         self.skip, sizes = skip, (skip.shape[1] + 1, skip.shape[0])
         first, second = jax.random.split(key)
         self.correction = ARCHITECTURES[architecture][0](*sizes, **shape, key=first)
-        self.spread = eqx.nn.MLP(*sizes, self.spread_width, self.spread_depth, _SILU, dtype=float, key=second)
+        self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=second)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> tuple[Array, Array]:
         """Unknowns of one flight in bracket coordinates, from its features and its noise scale.
@@ -135,7 +130,7 @@ class Regressor(eqx.Module):
         compressed = compress(features / scaling.width)
         inputs = jnp.concatenate([compressed, (jnp.log(scale) / scaling.span)[None]])
         u = self.skip @ compressed + scaling.gain * self.correction(inputs)
-        return u, jnp.clip(self.spread(inputs), -self.largest_logarithm, self.largest_logarithm)
+        return u, jnp.clip(self.spread(inputs), -_MAX_LOG_SPREAD, _MAX_LOG_SPREAD)
 
 
 def first_regressor(

@@ -20,7 +20,7 @@ from ..results import RESULTS
 from ..shooting import ShootingProblem, Unknowns, in_blocks
 from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
 from .features import FEATURES, Coordinates, Features
-from .training import Schedule, calibrate, train, untrained
+from .training import calibrate, train, untrained
 
 # What must be equal in training and in use: kinds, with the words that name them, and numbers.
 _KINDS: dict[str, Callable[[ShootingProblem], Any]] = {
@@ -37,6 +37,10 @@ _QUANTITIES: dict[str, Callable[[ShootingProblem], Any]] = {
     "sample time": lambda problem: problem.flight.dt,
     "series of rotor speeds": lambda problem: problem.flight.omega,
 }
+
+
+MAX_FEATURES = 6000  # the first linear map is a matrix of features times features, which must fit in memory
+MAX_STEPS = 1_000_000  # of training
 
 
 class NetworkEstimator(eqx.Module):
@@ -57,16 +61,8 @@ class NetworkEstimator(eqx.Module):
     - `patience`: training stops early after this many checks, of 250 steps each, without a better validation loss.
     - `held_out`: simulated flights for the calibration of the intervals, each with new noise at nine noise scales.
 
-    Limits of these settings, for all networks:
-
-    - `most_features`: the first linear map is a matrix of features times features, which must fit in memory.
-    - `most_steps`: of training.
-
     **Raises:** `ValueError` for a setting out of range.
     """
-
-    most_features: ClassVar[int] = 6000
-    most_steps: ClassVar[int] = 1_000_000
 
     features: str = eqx.field(static=True, default="score")
     channels: str = eqx.field(static=True, default="rates")
@@ -86,8 +82,8 @@ class NetworkEstimator(eqx.Module):
         for name, choices in (("features", FEATURES), ("channels", CHANNELS), ("architecture", ARCHITECTURES)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
-        if self.steps > self.most_steps:
-            raise ValueError(f"`steps` must be at most {self.most_steps}, got {self.steps}.")
+        if self.steps > MAX_STEPS:
+            raise ValueError(f"`steps` must be at most {MAX_STEPS}, got {self.steps}.")
         setting("learning_rate", positive=True)(self.learning_rate)
         if self.architecture == "cmac" and self.features != "score":
             raise ValueError(f'`architecture` "cmac" needs `features` "score", got {self.features!r}.')
@@ -111,9 +107,10 @@ class NetworkEstimator(eqx.Module):
         """
         self._check(problem, bracket)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, as_float(self.noise[1]))
-        schedule = Schedule(self.noise, self.steps, self.batch, self.learning_rate, self.patience)
         scaling, regressor = untrained(features, self.noise, self.architecture, self.shape, key)
-        regressor, history = train(regressor, scaling, features, schedule, key)
+        names = "noise", "steps", "batch", "learning_rate", "patience"
+        how = {name: getattr(self, name) for name in names}
+        regressor, history = train(regressor, scaling, features, key, **how)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
@@ -126,8 +123,8 @@ class NetworkEstimator(eqx.Module):
             if not 0 < upper - lower < np.inf:
                 raise ValueError(f"`bracket` of {name} must have a positive, finite width, got [{lower}, {upper}].")
         numbers = problem.flight.time.shape[0] * CHANNELS[self.channels]
-        if self.features == "raw" and numbers > self.most_features:
-            what = f"of this flight are {numbers} numbers, more than {self.most_features}"
+        if self.features == "raw" and numbers > MAX_FEATURES:
+            what = f"of this flight are {numbers} numbers, more than {MAX_FEATURES}"
             raise ValueError(f'`features` "raw" {what}: use "score".')
 
 
@@ -136,21 +133,20 @@ def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: 
     return Features.of(features, problem, Coordinates.of(problem, bracket, noise))
 
 
+MAX_INFLATION = 2.0  # if missing samples enlarge a standard deviation by more, the problem is another one
+SAME = 1e-6  # relative tolerance of equal numbers, because files round them
+
+
 class TrainedNetwork(AbstractEstimator):
     """A network that identifies flights of the inputs that it was trained for. Made by `NetworkEstimator.fit`.
 
     Its intervals are calibrated on simulated flights that training did not use (split-conformal prediction): they hold
     the truth in the share of their level, over flights that do not diverge, uniform in the bracket of training.
-
-    - `largest_inflation`: if missing samples enlarge a standard deviation by more, the problem is another one.
-    - `same`: relative tolerance of equal numbers, because files round them.
     """
 
     looks_at: ClassVar[str] = "rates"
     prior: ClassVar[float] = UNIFORM_PRIOR
     needs_network: ClassVar[bool] = True
-    largest_inflation: ClassVar[float] = 2.0
-    same: ClassVar[float] = 1e-6
 
     settings: NetworkEstimator
     features: Features
@@ -229,12 +225,12 @@ class TrainedNetwork(AbstractEstimator):
 
         def differ(quantity: Callable[[ShootingProblem], Any]) -> Bool[Array, ""]:
             pairs = zip(*(map(as_float, jax.tree.leaves(quantity(p))) for p in (problem, own)), strict=True)
-            same = [((a == b) | (jnp.abs(a - b) <= self.same * jnp.abs(b).max())).all() for a, b in pairs]
+            same = [((a == b) | (jnp.abs(a - b) <= SAME * jnp.abs(b).max())).all() for a, b in pairs]
             return ~jnp.asarray(same, bool).all()
 
         width = coordinates.width[len(own.model.parameter_names) :]
         first_state, off = (problem.split(x)[:, :size].ravel() for x in problem.first_state())
-        allowed = 1.5 * width + off if width.size else self.same * (1 + jnp.abs(coordinates.first_state))
+        allowed = 1.5 * width + off if width.size else SAME * (1 + jnp.abs(coordinates.first_state))
         start = ~(jnp.abs(first_state - coordinates.first_state) <= allowed).all()
         return {what: differ(quantity) for what, quantity in _QUANTITIES.items()} | {"start": start}
 
@@ -264,7 +260,7 @@ class TrainedNetwork(AbstractEstimator):
 
         differences = self._differences(problem)
         other = jnp.stack(list(differences.values())).any()
-        other |= (inflation > self.largest_inflation).any() | (scale > self.settings.noise[1] * (1 + self.same))
+        other |= (inflation > MAX_INFLATION).any() | (scale > self.settings.noise[1] * (1 + SAME))
         result = RESULTS.where(outside.any(), RESULTS.at_bound, RESULTS.successful)
         result = RESULTS.where(unidentifiable.any(), RESULTS.unidentifiable, result)
         feasible = finite & shot.feasible & jnp.isfinite(parameters).all()

@@ -1,7 +1,7 @@
 """The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,22 +24,12 @@ DIVERGED = 1e15  # a loss beyond this ends training; the worst answer inside a b
 FLYABLE = 0.01  # the smallest share of simulated flights that must not diverge
 
 
-class Schedule(NamedTuple):
-    """What the user of a `NetworkEstimator` sets of a training; explained there."""
-
-    noise: tuple[float, float]
-    steps: int
-    batch: int
-    learning_rate: float
-    patience: int
-
-    @property
-    def rates(self) -> Float[np.ndarray, " steps"]:
-        """The learning rate of each step: a linear rise, then half a cosine."""
-        step, warm_up = np.arange(self.steps), min(WARM_UP, self.steps // 2)
-        wave = (1 + np.cos(np.pi * (step - warm_up) / (self.steps - warm_up))) / 2
-        share = np.where(step < warm_up, step / max(warm_up, 1), LAST_RATE + (1 - LAST_RATE) * wave)
-        return (self.learning_rate * share).astype(np.float32)
+def _rates(steps: int, largest: float) -> Float[np.ndarray, " steps"]:
+    """The learning rate of each step: a linear rise to the largest, then half a cosine."""
+    step, warm_up = np.arange(steps), min(WARM_UP, steps // 2)
+    wave = (1 + np.cos(np.pi * (step - warm_up) / (steps - warm_up))) / 2
+    share = np.where(step < warm_up, step / max(warm_up, 1), LAST_RATE + (1 - LAST_RATE) * wave)
+    return (largest * share).astype(np.float32)
 
 
 def untrained(
@@ -88,15 +78,26 @@ def _untrained(
 
 
 def train(
-    regressor: Regressor, scaling: Scaling, features: Features, schedule: Schedule, key: Key
+    regressor: Regressor,
+    scaling: Scaling,
+    features: Features,
+    key: Key,
+    *,
+    noise: tuple[float, float],
+    steps: int,
+    batch: int,
+    learning_rate: float,
+    patience: int,
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count. Each step has new noise.
+
+    The settings are those of a `NetworkEstimator`.
 
     **Returns:** the regressor at the check with the best validation loss, and the losses at every check.
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
-    scales, batch, steps = np.asarray(schedule.noise, float), schedule.batch, schedule.steps
+    scales = np.asarray(noise, float)
     held_out = draw_chunks(features, VALIDATION, key=key, purpose=Purpose.VALIDATION)
     held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
     flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
@@ -105,7 +106,7 @@ def train(
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
-    state, rates = _first_state(regressor), schedule.rates
+    state, rates = _first_state(regressor), _rates(steps, learning_rate)
     flown = batch * CHECK // USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
     for number, first in enumerate(range(0, steps, CHECK)):
@@ -128,7 +129,7 @@ def train(
         without_improvement += 1
         if current < lowest - IMPROVEMENT * abs(current):
             best, lowest, without_improvement = regressor, current, 0
-        if without_improvement >= schedule.patience:
+        if without_improvement >= patience:
             break
     whole = jax.tree.map(lambda x: as_float(np.asarray(x)) if eqx.is_inexact_array_like(x) else x, best)
     return whole, np.asarray(history)
