@@ -46,9 +46,7 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *ar
     def together(lanes: int, many: Any, shared: Any) -> Any:
         return of_batch(lanes, many, eqx.combine(shared, settings))
 
-    @jax.custom_jvp
-    def differentiable(arrays: Any) -> Any:
-        return one(arrays)
+    differentiable = jax.custom_jvp(one)
 
     @differentiable.defjvp
     def derivative(primals: Any, tangents: Any) -> Any:

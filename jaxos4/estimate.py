@@ -226,24 +226,22 @@ class AbstractEstimator(eqx.Module):
         """
 
 
-class AbstractRecursion(AbstractEstimator):
-    """An estimator that goes through a flight sample by sample."""
+def recursively(
+    identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem, bracket: Bracket | None
+) -> Estimate:
+    """`in_one_program`, if an algorithm can go through the flight sample by sample.
 
-    @abc.abstractmethod
-    def identify(self, problem: ShootingProblem) -> Estimate:
-        """Identifies one flight, or a block of flights, in the problem's own bracket."""
-
-    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. Raises `ValueError` for a wrong bracket, windows, or rotor or sensor terms."""
-        if problem.windows > 1:
-            remedy = f"got {problem.windows}: use an estimator that shoots"
-            raise ValueError(f"`problem.windows` must be 1 for this estimator, {remedy}.")
-        if problem.model.forcing_parameters or not problem.model.observes_states:
-            raise ValueError(
-                "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
-                "use an estimator that shoots."
-            )
-        return in_one_program(self.identify, problem, bracket)
+    **Raises:** `ValueError` for a wrong bracket, windows, or rotor or sensor terms.
+    """
+    if problem.windows > 1:
+        remedy = f"got {problem.windows}: use an estimator that shoots"
+        raise ValueError(f"`problem.windows` must be 1 for this estimator, {remedy}.")
+    if problem.model.forcing_parameters or not problem.model.observes_states:
+        raise ValueError(
+            "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
+            "use an estimator that shoots."
+        )
+    return in_one_program(identify, problem, bracket)
 
 
 @eqx.filter_jit

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar, integer, setting
 from ..bracket import Bracket
-from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, fit_start, in_one_program
+from ..estimate import AbstractEstimator, Estimate, as_estimate, fit_start, in_one_program, recursively
 from ..flight import RATES
 from ..linalg import gram, invert
 from ..models.state import Rates
@@ -285,7 +285,7 @@ class EquationError(AbstractEstimator):
         return data.center + data.half_width * solve(*normal_equations(data.rows()[0]))[0]
 
 
-class RecursiveLeastSquares(AbstractRecursion):
+class RecursiveLeastSquares(AbstractEstimator):
     """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
 
     The recursion carries the normal matrix and its right-hand side. A parameter stays at the bracket's center until it
@@ -308,8 +308,12 @@ class RecursiveLeastSquares(AbstractRecursion):
     memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)
     bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
-    def identify(self, problem: ShootingProblem) -> Estimate:
-        """See `AbstractRecursion`."""
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight. Raises `ValueError` as `recursively` does."""
+        return recursively(self._identify, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem) -> Estimate:
+        """One flight, or a block of flights."""
         count, data = problem.unknowns.count, Regression.of(problem, self)
         rows, back = data.rows()
 

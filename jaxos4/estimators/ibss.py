@@ -14,6 +14,20 @@ from ..shooting import LocalModel, Stage, WindowUnknowns
 from .bisection import Brackets, Directions, Flag, PerDirection
 from .solver import AbstractSolver, Found, before_shots, chosen
 
+# How it searches. Steps are in standard deviations, scaled like those of `tolerance`.
+_COARSE = 0.5  # every stage but the last ends when the minimum is at most so far away
+_OPENING = 4.0  # the longest step of a stage's first sweep, in standard deviations of the stage's start
+_NARROW = 0.05  # half-width of a stage's first brackets, as a share of that
+_SAFETY = 2.0  # half-width of later brackets, in relative errors of the last predictions
+_MIN_WIDTH = 0.01  # the smallest half-width of later brackets, as a share of the longest step, which is the largest
+_WIDENING, _MAX_WIDENING = 4.0, 256.0  # of the next bracket, again and again, while the last shot is at its end
+_KEPT_RISE = 1.0  # of the cost in a sweep that is still kept
+_RETREAT, _ADVANCE = 0.25, 1.4  # of the longest step: after a sweep that was not kept, and after any other
+# The slopes of unknowns with a stride are inexact: the search also ends after a sweep whose predicted steps are so
+# short, if it lowered the cost by no more.
+_SHORT_STEP, _SMALL_GAIN = 0.3, 1e-4
+_DAMPING = 0.1  # added information, in 1/stride^2: that of unknowns with a stride misjudges the curvature
+
 
 class State(NamedTuple):
     """The search of a stage before a sweep.
@@ -58,22 +72,6 @@ class IBSS(AbstractSolver[State]):
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     - `shares`: before all data, the body rates are fitted to these shares of the flight. Errors grow with time, so the
       cost of a long flight has other minima.
-
-    How it searches; in standard deviations, which are scaled like those of `tolerance`:
-
-    - `coarse`: every stage but the last ends when the minimum is at most so far away.
-    - `opening`: the longest step of the first sweep of a stage, in standard deviations of the stage's start.
-    - `narrow`: half-width of the first brackets, as a share of that.
-    - `safety`: half-width of later brackets: this many times the relative error of the last predictions, as a share of
-      the longest step. It is at least `least` and at most 1.
-    - `widening`: if the last shot was at an end of its bracket, the next is wider by this factor, again and again, up
-      to `widest`.
-    - `chance`: a sweep may raise the cost by this much and is still kept.
-    - `retreat`, `advance`: after a sweep that is not kept, the next goes this share of the way; after any other, this
-      many times as far again.
-    - `short`, `gain`: if an unknown has a stride, its slopes are inexact. Then the search also ends after a sweep whose
-      predicted steps are at most `short`, if it lowers the cost by no more than `gain`.
-    - `damping`: added information, in units of 1/stride^2: that of unknowns with a stride misjudges the curvature.
     """
 
     shoots: ClassVar[bool] = True
@@ -84,19 +82,6 @@ class IBSS(AbstractSolver[State]):
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=0.005)
     reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
     shares: tuple[float, ...] = eqx.field(static=True, default=(0.1, 0.3, 1.0))
-    coarse: float = eqx.field(static=True, default=0.5)
-    opening: float = eqx.field(static=True, default=4.0)
-    narrow: float = eqx.field(static=True, default=0.05)
-    safety: float = eqx.field(static=True, default=2.0)
-    least: float = eqx.field(static=True, default=0.01)
-    widening: float = eqx.field(static=True, default=4.0)
-    widest: float = eqx.field(static=True, default=256.0)
-    chance: float = eqx.field(static=True, default=1.0)
-    retreat: float = eqx.field(static=True, default=0.25)
-    advance: float = eqx.field(static=True, default=1.4)
-    short: float = eqx.field(static=True, default=0.3)
-    gain: float = eqx.field(static=True, default=1e-4)
-    damping: float = eqx.field(static=True, default=0.1)
 
     def init(self, stage: Stage, before: Found) -> State:
         """At the start, with closed brackets: the first step of the loop is one shot there, and is compiled once."""
@@ -123,11 +108,11 @@ class IBSS(AbstractSolver[State]):
         unknowns, model = chosen(kept, (unknowns, model), (state.unknowns, state.model))
         directions = self._look_around(stage, unknowns, model)
         share, growth = self._next_widths(stage, state, brackets)
-        trust = jnp.where(kept, jnp.minimum(state.trust * self.advance, 1.0), state.trust * self.retreat)
+        trust = jnp.where(kept, jnp.minimum(state.trust * _ADVANCE, 1.0), state.trust * _RETREAT)
         later = jnp.maximum(share * directions.longest, stage.smallest_step) * growth
         restricted = jnp.where(trust < 1, trust * directions.longest, jnp.inf)
-        opening = self.opening * directions.sizes(state.spread)
-        half_width = jnp.where(is_start, self.narrow * opening, later)
+        opening = _OPENING * directions.sizes(state.spread)
+        half_width = jnp.where(is_start, _NARROW * opening, later)
         furthest = jnp.where(is_start, opening, restricted)
         near = self._is_near(stage, model, directions.predicted)
         return State(
@@ -160,7 +145,7 @@ class IBSS(AbstractSolver[State]):
         """The directions in which the cost is nearly separable, and predicted steps; the bracket is information."""
         of_bracket, (windows, _) = 1 / jnp.square(stage.off / 2), unknowns.shape
         shared = of_bracket[:, : stage.unknowns.count] / windows
-        has_prior, of_stride = stage.unknowns.precision > 0, self.damping / jnp.square(stage.unknowns.stride)
+        has_prior, of_stride = stage.unknowns.precision > 0, _DAMPING / jnp.square(stage.unknowns.stride)
         added = of_bracket.at[:, : stage.unknowns.count].set(jnp.where(has_prior, of_stride, shared))
         return Directions.at(unknowns, model, stage.limits(self.reach), added, stage.unknowns.count)
 
@@ -194,10 +179,10 @@ class IBSS(AbstractSolver[State]):
         before, gain = state.model, state.model.cost.sum() - model.cost.sum()
         feasible, was_feasible = model.feasible.all(), before.feasible.all()
         has_stride = jnp.isfinite(stage.unknowns.stride).any()
-        is_short = has_stride & (state.directions.longest <= self.short)
-        stalled = (gain <= self.gain) & feasible & was_feasible & is_short
+        is_short = has_stride & (state.directions.longest <= _SHORT_STEP)
+        stalled = (gain <= _SMALL_GAIN) & feasible & was_feasible & is_short
         # The cost of a trajectory that is not feasible means nothing.
-        not_worse = feasible & (model.cost.sum() <= before.cost.sum() + self.chance)
+        not_worse = feasible & (model.cost.sum() <= before.cost.sum() + _KEPT_RISE)
         bad = ~_finite(unknowns, model) | (was_feasible & ~not_worse)
         return ~(bad | (stalled & (gain < 0))), stalled
 
@@ -205,7 +190,7 @@ class IBSS(AbstractSolver[State]):
         """Whether steps, or slopes, which are as long, are short enough to end the stage: the last one ends finely."""
         misfit = stage.misfit(model.cost.sum())
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
-        return jnp.abs(steps).max() <= jnp.where(stage.last, fine, self.coarse * jnp.maximum(misfit, 1.0))
+        return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
     def _next_widths(self, stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:
         """The half-width of the next brackets as a share of the longest step, and `State.growth`, from the errors."""
@@ -213,8 +198,8 @@ class IBSS(AbstractSolver[State]):
         error = jnp.abs(steps - brackets.predicted).max()
         longest = jnp.maximum(jnp.abs(steps).max(), stage.smallest_step)
         at_end, was_open = (steps == brackets.lowest) | (steps == brackets.highest), brackets.highest > brackets.lowest
-        growth = jnp.where(at_end, jnp.minimum(self.widening * state.growth, self.widest), 1.0)
-        return jnp.clip(self.safety * error / longest, self.least, 1.0), jnp.where(was_open, growth, state.growth)
+        growth = jnp.where(at_end, jnp.minimum(_WIDENING * state.growth, _MAX_WIDENING), 1.0)
+        return jnp.clip(_SAFETY * error / longest, _MIN_WIDTH, 1.0), jnp.where(was_open, growth, state.growth)
 
 
 def _open(directions: Directions, half_width: PerDirection, furthest: PerDirection | Scalar) -> Brackets:

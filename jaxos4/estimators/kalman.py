@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Parameters, Scalar, integer
-from ..bracket import GAUSSIAN_PRIOR
-from ..estimate import AbstractRecursion, Estimate, as_estimate
+from ..bracket import GAUSSIAN_PRIOR, Bracket
+from ..estimate import AbstractEstimator, Estimate, as_estimate, recursively
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, Unknowns
@@ -24,7 +24,7 @@ _SETTLED = 0.1  # standard deviations: the passes end once one of them moves no 
 _Joint = tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]]
 
 
-class JointEKF(AbstractRecursion):
+class JointEKF(AbstractEstimator):
     """Joint extended Kalman filter: states and constant parameters from one recursion over the flight.
 
     - `passes`: the most passes over the flight. The first linearises the model around its own running estimate: the
@@ -47,8 +47,12 @@ class JointEKF(AbstractRecursion):
 
     passes: Count = eqx.field(converter=integer("passes", 1), default=10)
 
-    def identify(self, problem: ShootingProblem) -> Estimate:
-        """See `AbstractRecursion`."""
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight. Raises `ValueError` as `recursively` does."""
+        return recursively(self._identify, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem) -> Estimate:
+        """One flight, or a block of flights."""
         rows, prior = jax.tree.map(lambda leaf: leaf[0], problem.rows()), problem.unknowns.usable
         count, size = prior.center.shape[0], problem.size
         start = problem.first_state()[0]

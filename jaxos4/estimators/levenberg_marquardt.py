@@ -29,6 +29,11 @@ from ..shooting import (
 )
 from .solver import AbstractSolver, Found, chosen, cost_of, solve
 
+_COARSE = 1e-3  # the smallest `step_tolerance` of all stages but the last
+_FACTOR = 10.0  # by which a step is damped less after one that succeeded, and more after one that failed
+# Information that is always added about an unknown with a stride, in 1/stride^2: its own misjudges the curvature.
+_STRIDE_INFORMATION = 0.3
+
 
 class State(NamedTuple):
     """The search of a stage before a shot.
@@ -53,7 +58,6 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
     - `step_tolerance`: a stage ends with a step that changes no unknown by more, in the unit of how far off its initial
       guess may be. Cost and covariance are those before this step. 0: no step is short enough.
-    - `coarse`: `step_tolerance` of all stages but the last, at least.
     - `gain_tolerance`: a stage ends if hardly damped steps promise to lower the cost by less. An error of one standard
       deviation costs 0.5.
     - `flat`: it ends too if a step failed whose damping is more than 1, and which promised to lower the cost by less.
@@ -61,10 +65,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
     - `is_relative`: whether damping is relative to the information about each unknown (Marquardt). Otherwise it is
       relative to what is known before the flight (Levenberg): such a damping hardly changes the steps of a flight with
       much information.
-    - `damping`: of the first step. `least_damping`: of any other. `factor`: how much more, or less, is damped after a
-      step.
-    - `stride_information`: information that is always added about an unknown with a stride, in units of 1/stride^2: its
-      own information misjudges the curvature.
+    - `damping`: of the first step. `least_damping`: of any other.
     - `shares`: see `AbstractProblem.stages`. The rates are fitted first, and then all channels with them: from a wide
       bracket, a direct fit of all channels can end in another minimum.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
@@ -74,21 +75,18 @@ class LevenbergMarquardt(AbstractSolver[State]):
     in_closed_loop: ClassVar[bool] = True
 
     step_tolerance: Scalar = eqx.field(converter=setting("step_tolerance"), default=1e-5)
-    coarse: float = eqx.field(static=True, default=1e-3)
     gain_tolerance: Scalar = eqx.field(converter=setting("gain_tolerance"), default=0.0)
     flat: float = eqx.field(static=True, default=0.0)
     max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
     is_relative: bool = eqx.field(static=True, default=False)
     damping: float = eqx.field(static=True, default=1.0)
     least_damping: float = eqx.field(static=True, default=0.0)
-    factor: float = eqx.field(static=True, default=10.0)
-    stride_information: float = eqx.field(static=True, default=0.3)
     shares: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
 
     def init(self, stage: Stage, before: Found) -> State:
         """The first trial is the start. Any cost is better than none."""
-        damping = jnp.full((), self.factor * self.damping, dtype=float)
+        damping = jnp.full((), _FACTOR * self.damping, dtype=float)
         none, going = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
         return State(before.unknowns, before.model, before.unknowns, damping, none, going)
 
@@ -97,7 +95,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
         model, before = stage.local_model(state.trial), state.model
         better = (state.shots == 0) | (cost_of(model) < cost_of(before))
         best, model = chosen(better, (state.trial, model), (state.best, before))
-        damping = state.damping * jnp.where(better, 1 / self.factor, self.factor)
+        damping = state.damping * jnp.where(better, 1 / _FACTOR, _FACTOR)
         damping = jnp.maximum(damping, self.least_damping)
         step = jnp.clip(self._step(stage, best, model, damping), -stage.stride, stage.stride)
         trial = jnp.clip(best + step, *stage.limits(self.reach))
@@ -119,7 +117,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
     def _is_small(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Bool[Array, ""]:
         """Whether a step ends the stage."""
-        tolerance = jnp.where(stage.last, self.step_tolerance, jnp.maximum(self.step_tolerance, self.coarse))
+        tolerance = jnp.where(stage.last, self.step_tolerance, jnp.maximum(self.step_tolerance, _COARSE))
         unit, least = self._unit(stage, model.information), self._least(stage)
         # By how much the step should lower the cost, as if it were hardly damped.
         eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
@@ -139,7 +137,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
     def _least(self, stage: Stage) -> WindowUnknowns:
         """The information that damps each unknown in any case."""
-        return self.stride_information / jnp.square(stage.stride)
+        return _STRIDE_INFORMATION / jnp.square(stage.stride)
 
     def _unit(self, stage: Stage, information: Float[Array, "windows n n"]) -> WindowUnknowns:
         """The information that a damping of 1 adds; about a parameter once, as all windows share it."""

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, Scalar, integer, setting
-from ..bracket import GAUSSIAN_PRIOR
-from ..estimate import REACH, AbstractRecursion, Estimate, as_estimate, fit_start
+from ..bracket import GAUSSIAN_PRIOR, Bracket
+from ..estimate import REACH, AbstractEstimator, Estimate, as_estimate, fit_start, recursively
 from ..flight import RATES
 from ..linalg import gram, invert
 from ..models.state import stack, unstack
@@ -46,7 +46,7 @@ class _Filter(NamedTuple):
     covariance: Float[Array, "joint joint"]
 
 
-class SVSF(AbstractRecursion):
+class SVSF(AbstractEstimator):
     """Smooth Variable Structure Filter of the body rates and the parameters.
 
     - `rates_layer`: boundary layer of the rates, in multiples of the problem's sigma.
@@ -77,8 +77,12 @@ class SVSF(AbstractRecursion):
     equilibration: Scalar = eqx.field(converter=setting("equilibration", low=1.0), default=150.0)
     passes: int = eqx.field(static=True, converter=integer("passes", 1, static=True), default=4)
 
-    def identify(self, problem: ShootingProblem) -> Estimate:
-        """See `AbstractRecursion`."""
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight. Raises `ValueError` as `recursively` does."""
+        return recursively(self._identify, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem) -> Estimate:
+        """One flight, or a block of flights."""
         box, rates = problem.unknowns.usable, problem.restrict("rates")
         rows, start = jax.tree.map(lambda leaf: leaf[0], rates.rows()), rates.first_state()
         count, samples = box.center.shape[0], rows.measured[0].shape[0]

@@ -94,22 +94,22 @@ class AbstractModel(eqx.Module):
         """The factor of J_R in alpha2 = factor J_R / Ix and alpha5 = factor J_R / Iy."""
 
     @property
-    @abc.abstractmethod
     def force_axes(self) -> tuple[int, ...]:
-        """The axes along which the model predicts the measured specific force: 0, 1, 2 for x, y, z."""
+        """The axes along which the model predicts the measured specific force: 0, 1, 2 for x, y, z. Default: none."""
+        return ()
 
     @property
-    @abc.abstractmethod
     def observes_states(self) -> bool:
-        """Whether the sensors show the states alone: no bias, no specific force."""
+        """Whether the sensors show the states alone: no bias, no specific force. Default: they do."""
+        return True
 
     @abc.abstractmethod
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The forcing of a whole flight. Row k acts from sample k to sample k + 1."""
 
-    @abc.abstractmethod
     def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The forcing of a whole flight whose measurements may be means, see `Forcing.early`."""
+        """The forcing of a whole flight whose measurements may be means, see `Forcing.early`. Default: instants."""
+        return self.forcing(inputs, parameters)
 
     @abc.abstractmethod
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
@@ -119,18 +119,20 @@ class AbstractModel(eqx.Module):
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
         """The time derivative of the part of the cascade that `state` holds."""
 
-    @abc.abstractmethod
     def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
         """The output of noise-free sensors: the states in cascade order, then the specific force along `force_axes`."""
+        del forcing, parameters
+        return tuple(jax.tree.leaves(state))
 
-    @abc.abstractmethod
     def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> "ByRecording | None":
         """The model of one recording, if several in a row have parameters of their own. `stretch`: see `Flight`."""
+        del stretch
+        return None
 
     @property
-    @abc.abstractmethod
     def quantities(self) -> dict[str, list[str]]:
-        """The physical quantities beside moments of inertia, each with the names of its parameters."""
+        """The physical quantities beside moments of inertia, each with the names of its parameters. Default: none."""
+        return {}
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

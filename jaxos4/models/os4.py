@@ -7,12 +7,11 @@ with alpha by `alpha_from_inertia`; (14) `STATE_NAMES`.
 import abc
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from .._custom_types import Numeric, Scalar, as_float
+from .._custom_types import Scalar, as_float
 from ..airframe import INVERSES, OS4, Airframe, alpha_from_inertia
 from ..flight import Inputs
 from .abstract import DEFAULT_HALF_WIDTH, PARAMETER_NAMES, AbstractModel, Parameter
@@ -47,35 +46,12 @@ class AbstractOS4(AbstractModel):
         scaled = np.isin(np.arange(8), INVERSES)
         return jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0) * DEFAULT_HALF_WIDTH
 
-    def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> None:
-        """None: no recording has parameters of its own."""
-        del stretch
-
-    @property
-    def quantities(self) -> dict[str, list[str]]:
-        """None: alpha_1..8 follow from moments of inertia."""
-        return {}
-
-    @property
-    def force_axes(self) -> tuple[int, ...]:
-        """None: the OS4 has no accelerometer."""
-        return ()
-
-    @property
-    def observes_states(self) -> bool:
-        """True."""
-        return True
-
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """Torques and thrust by Eqs. (10)-(13), and the residual speed Omega_r = sum s_i omega_i."""
         del parameters
         omega, airframe = inputs.omega, self.airframe
         roll, pitch, yaw, thrust = (jnp.square(omega) @ airframe.mixer.T).T
         return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
-
-    def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """That of `forcing`: measurements are instants."""
-        return self.forcing(inputs, parameters)
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
         """See `AbstractModel`."""
@@ -88,11 +64,6 @@ class AbstractOS4(AbstractModel):
             return State(rates, attitude)
         ax, ay, az = self.acceleration(orientation, forcing)
         return State(rates, attitude, Translation(t.vx, ax, t.vy, ay, t.vz, az))
-
-    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
-        """The states in cascade order."""
-        del forcing, parameters
-        return tuple(jax.tree.leaves(state))
 
 
 class PublishedOS4(AbstractOS4):

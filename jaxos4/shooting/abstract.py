@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeVar
 
@@ -258,7 +259,7 @@ class Stages(NamedTuple):
         return Stage(
             unknowns=self.unknowns,
             off=self.off,
-            local_model=lambda unknowns: self.local_model(number, before, unknowns),
+            local_model=functools.partial(self.local_model, number, before),
             searched=self.searched[number],
             measurements=self.measurements[number],
             smallest_step=self.smallest_step[number],

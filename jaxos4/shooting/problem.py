@@ -5,7 +5,6 @@ import functools
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -31,7 +30,7 @@ from .scans import (
     windowed,
     with_tangents,
 )
-from .stages import ROUNDING, Plan
+from .stages import ROUNDING, stages_of
 
 # How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
 _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
@@ -249,58 +248,19 @@ class ShootingProblem(AbstractProblem):
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """See `AbstractProblem`."""
-        count, measured, known = self.unknowns.count, self.measured(), self.split(self.first_state()[0])
-        length = measured.shape[0] if self.length is None else self.length
-        plan = Plan.of(self.channels, shares, measured, self.sigma[self.columns], length, self.windows)
-        number, place, forced = len(plan.place), jnp.asarray(plan.place), self.forced_rows()
-        free, own = jnp.broadcast_to(self.unknowns.free, (number, count)), np.arange(self.free_size)
-        searched = jnp.concatenate([free, own < plan.sizes[:, None]], axis=1)
-        parts = [functools.partial(self._model_of_part, self.restrict(channels)) for channels in plan.channels]
-
-        def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
-            del before
-            length = self.length if plan.lengths is None else plan.lengths[stage]
-            own = unknowns[:, count:] if self.free_size else known
-            data = forced(unknowns[0, :count]), unknowns[:, :count], own, length
-            # The stage is the same in all lanes of a batch.
-            model = parts[0](*data) if len(parts) == 1 else jax.lax.switch(place[stage], parts, *data)
-            return model.restricted(searched[stage])
-
-        return Stages(
-            unknowns=self.unknowns,
-            off=self.initial_guess.off,
-            number=number,
-            first=0,
-            whole=number - 1,
-            local_model=local_model,
-            searched=searched,
-            measurements=plan.measurements,
-            smallest_step=plan.smallest_step,
-        )
-
-    def _model_of_part(
-        self, part: "ShootingProblem", rows: Rows, parameters: Array, own: Array, length: Length
-    ) -> LocalModel:
-        """The local model of the whole problem's `rows` on the channels of `part`, in all unknowns."""
-        part = eqx.tree_at(lambda p: p.length, part, length, is_leaf=lambda leaf: leaf is None)
-        compared = rows._replace(measured=rows.measured[: part.size] + rows.measured[self.size :])
-        model = each_window(part.model_of_window, compared, parameters, own[:, : part.size])
-        none, more = (0, 0), (0, self.free_size - part.free_size)
-        gradient, information = jnp.pad(model.gradient, (none, more)), jnp.pad(model.information, (none, more, more))
-        return model._replace(gradient=gradient, information=information)
+        return stages_of(self, shares)
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""
         return shoot(self._advance, rows, self._weights(), parameters, initial_state, self.length)
 
-    def model_of_window(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> LocalModel:
-        """The local model of one window, in the parameters and a free initial state."""
-        return shoot_with_derivatives(
+    @property
+    def model_of_window(self) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
+        """The function to the local model of one window, in the parameters and a free initial state."""
+        return functools.partial(
+            shoot_with_derivatives,
             self._advance,
-            rows,
             self._weights(),
-            parameters,
-            initial_state,
             forcing_parameters=self.model.forcing_parameters,
             initial_state_is_free=self.initial_state is None,
             length=self.length,
@@ -334,7 +294,8 @@ class ShootingProblem(AbstractProblem):
         return window_samples(self.flight.states.shape[-2], self.windows)
 
     def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
-        return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)
+        following = STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
+        return following, self.model.observe(state, forcing, parameters)
 
     def _weights(self) -> tuple[Scalar, ...]:
         return tuple(1 / self.sigma[self.columns])

@@ -84,11 +84,11 @@ def with_tangents(
     return new, slopes._replace(recording=zeros.recording, velocity=zeros.velocity)
 
 
-def _fold(step: Callable, first: Carry, rows: Rows, length: Length) -> Carry:
-    """The last carry of `step` over the rows that count."""
+def _fold(step: Callable[[Carry, Rows], tuple[Carry, None]], first: Carry, rows: Rows, length: Length) -> Carry:
+    """The last carry of a scan over the rows that count."""
     if length is None:
-        return jax.lax.scan(lambda carry, row: (step(carry, row), None), first, rows)[0]
-    return jax.lax.fori_loop(0, length, lambda i, carry: step(carry, jax.tree.map(lambda leaf: leaf[i], rows)), first)
+        return jax.lax.scan(step, first, rows)[0]
+    return jax.lax.fori_loop(0, length, lambda i, x: step(x, jax.tree.map(lambda leaf: leaf[i], rows))[0], first)
 
 
 def shoot(
@@ -108,11 +108,12 @@ def _shoot(
 ) -> Shot:
     scalars = tuple(at)
 
-    def step(carry: tuple[State, Shot], row: Rows) -> tuple[State, Shot]:
+    def step(carry: tuple[State, Shot], row: Rows) -> tuple[tuple[State, Shot], None]:
         state, shot = carry
         feasible = shot.feasible & _is_feasible(state)
         following, predicted = advance(state, row.forcing, scalars)
-        return following, Shot(shot.cost + _half_square(_errors(row, predicted, weights, feasible)), feasible)
+        cost = shot.cost + _half_square(_errors(row, predicted, weights, feasible))
+        return (following, Shot(cost, feasible)), None
 
     nothing = Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
     return _fold(step, (unstack(start), nothing), rows, length)[1]
@@ -120,8 +121,8 @@ def _shoot(
 
 def shoot_with_derivatives(
     advance: Advance,
-    rows: Rows,
     weights: tuple[Scalar, ...],
+    rows: Rows,
     parameters: Parameters,
     initial_state: InitialState,
     *,
@@ -130,11 +131,8 @@ def shoot_with_derivatives(
     length: Length = None,
 ) -> LocalModel:
     """`shoot` with gradient and information in the parameters and a free initial state. A batch is in lanes."""
-
-    def alone(*data: Any) -> LocalModel:
-        return _linearised_shot(
-            *data, forcing_parameters=forcing_parameters, initial_state_is_free=initial_state_is_free
-        )
+    how = {"forcing_parameters": forcing_parameters, "initial_state_is_free": initial_state_is_free}
+    alone = functools.partial(_linearised_shot, **how)
 
     def together(lanes: int, many: Any, shared: Any) -> LocalModel:
         if many[-1] is not None:  # lanes of different lengths
@@ -195,7 +193,7 @@ def _linearised_shot(
     # NumPy, so that they are constants of the program.
     parameter_tangents = tuple(np.eye(count, first_late, dtype=parameters.dtype))
 
-    def step(carry: _Carried, row: Rows) -> _Carried:
+    def step(carry: _Carried, row: Rows) -> tuple[_Carried, None]:
         feasible = carry.shot.feasible & _is_feasible(carry.state)
         # At rest after a failure, so that no derivative overflows.
         state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), carry.state)
@@ -204,8 +202,8 @@ def _linearised_shot(
         # The rates alone are cheaper to repeat.
         repeated = not lanes or state.attitude is None
         at, late = (state, forcing, scalars), carry.late
-        shot = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
-        following, push, push_late, cost, pull, squares = shot() if repeated else computed_once(feasible, shot)
+        sample = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
+        following, push, push_late, cost, pull, squares = sample() if repeated else computed_once(feasible, sample)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
             nothing, positions = jnp.zeros((first_late, *lanes), parameters.dtype), np.asarray(forcing_parameters)
@@ -225,7 +223,8 @@ def _linearised_shot(
             _added(blocks, panel, first_late, squares, slopes)
             for panel, blocks in zip(panels, carry.panels, strict=True)
         ]
-        return _Carried(following, tangent, late, Shot(carry.shot.cost + cost, feasible), gradient, information)
+        shot = Shot(carry.shot.cost + cost, feasible)
+        return _Carried(following, tangent, late, shot, gradient, information), None
 
     last = _fold(step, _before(initial_state, count, first_late, panels), rows, length)
     information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)

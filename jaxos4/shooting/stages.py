@@ -1,71 +1,86 @@
-"""The plan of a search in stages: the body rates of a short part of the flight first, then more.
+"""A search in stages: the body rates of a short part of the flight first, then more.
 
 Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, so the cost of a long
 flight has other minima: the first stages are short.
 """
 
-from typing import NamedTuple
+import functools
+from typing import TYPE_CHECKING
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
-from .._custom_types import Count
 from ..models.state import CHANNELS
+from .abstract import LocalModel, Stages, WindowUnknowns
+from .scans import Length, Rows, each_window
+
+if TYPE_CHECKING:
+    from .problem import ShootingProblem
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
 ROUNDING = 64.0
 
 
-class Plan(NamedTuple):
-    """The comparisons of each stage.
+def stages_of(problem: "ShootingProblem", shares: tuple[float, ...]) -> Stages:
+    """The stages of a problem, whose last is the whole.
 
-    - `channels`: of the stages, each once. `place`: of each stage's channels among them.
-    - `sizes`: the number of states that each stage simulates.
-    - `lengths`: the number of samples that each stage fits; `None` if all stages fit all of them.
-    - `measurements`: how many were measured in them.
-    - `smallest_step`: in standard deviations; below it, rounding decides the sign of a slope.
+    `shares`: of the flight, to which the body rates are fitted first. One of several windows is short enough as a
+    whole. All stages compare specific force.
     """
+    wanted = (share for share in shares if share == 1 or problem.windows == 1)
+    rates = tuple(("rates", share) for share in wanted if (problem.channels, share) != ("rates", 1))
+    stages, count = (*rates, (problem.channels, 1.0)), problem.unknowns.count
+    names = tuple(dict.fromkeys(name for name, _ in stages))
+    place = jnp.asarray([names.index(name) for name, _ in stages])
+    sizes = np.array([CHANNELS[name] for name, _ in stages])
+    measured, sigma = problem.measured(), problem.sigma[problem.columns]
+    samples, columns = measured.shape[0], np.arange(measured.shape[1])
+    fitted = (columns < sizes[:, None]) | (columns >= problem.size)
+    lengths = jnp.ceil(
+        np.array([share for _, share in stages]) * (samples if problem.length is None else problem.length)
+    ).astype(int)
+    within = (jnp.arange(samples) < lengths[:, None]).astype(float)
+    known, eps = within @ (~jnp.isnan(measured)).astype(float), jnp.finfo(sigma.dtype).eps
+    squares = (within @ jnp.square(jnp.nan_to_num(measured))) / jnp.maximum(known, 1)
+    largest = jnp.where(fitted, jnp.sqrt(squares) / sigma, 0.0).max(axis=1)
+    free = jnp.broadcast_to(problem.unknowns.free, (len(stages), count))
+    searched = jnp.concatenate([free, np.arange(problem.free_size) < sizes[:, None]], axis=1)
+    forced, first = problem.forced_rows(), problem.split(problem.first_state()[0])
+    parts = [functools.partial(_model_of_part, problem, problem.restrict(channels)) for channels in names]
+    are_whole = all(share == 1 for _, share in stages)
 
-    channels: tuple[str, ...]
-    place: Int[np.ndarray, " stages"]
-    sizes: Int[np.ndarray, " stages"]
-    lengths: Int[Array, " stages"] | None
-    measurements: Float[Array, " stages"]
-    smallest_step: Float[Array, " stages"]
+    def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
+        del before
+        length = problem.length if are_whole else lengths[stage]
+        own = unknowns[:, count:] if problem.free_size else first
+        data = forced(unknowns[0, :count]), unknowns[:, :count], own, length
+        # The stage is the same in all lanes of a batch.
+        model = parts[0](*data) if len(parts) == 1 else jax.lax.switch(place[stage], parts, *data)
+        return model.restricted(searched[stage])
 
-    @classmethod
-    def of(
-        cls,
-        channels: str,
-        shares: tuple[float, ...],
-        measured: Float[Array, "samples columns"],
-        sigma: Float[Array, " columns"],
-        samples: Count | int,
-        windows: int,
-    ) -> "Plan":
-        """The plan of a flight, whose last stage is the whole.
+    return Stages(
+        unknowns=problem.unknowns,
+        off=problem.initial_guess.off,
+        number=len(stages),
+        first=0,
+        whole=len(stages) - 1,
+        local_model=local_model,
+        searched=searched,
+        measurements=jnp.where(fitted, known, 0.0).sum(axis=1),
+        smallest_step=jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * largest),
+    )
 
-        - `channels`: that are compared. `shares`: of the flight, to which the body rates are fitted first.
-        - `measured`: states in cascade order, then specific force, which all stages compare. `sigma`: of their noise.
-        - `samples`: how many count. `windows`: of the flight; one of several is short enough as a whole.
-        """
-        wanted = (share for share in shares if share == 1 or windows == 1)
-        rates = tuple(("rates", share) for share in wanted if (channels, share) != ("rates", 1))
-        stages = (*rates, (channels, 1.0))
-        names, size = tuple(dict.fromkeys(name for name, _ in stages)), CHANNELS[channels]
-        sizes, columns = np.array([CHANNELS[name] for name, _ in stages]), np.arange(measured.shape[1])
-        fitted = (columns < sizes[:, None]) | (columns >= size)
-        lengths = jnp.ceil(np.array([share for _, share in stages]) * samples).astype(int)
-        within = (jnp.arange(measured.shape[0]) < lengths[:, None]).astype(float)
-        known, eps = within @ (~jnp.isnan(measured)).astype(float), jnp.finfo(sigma.dtype).eps
-        squares = (within @ jnp.square(jnp.nan_to_num(measured))) / jnp.maximum(known, 1)
-        largest = jnp.where(fitted, jnp.sqrt(squares) / sigma, 0.0).max(axis=1)
-        return cls(
-            channels=names,
-            place=np.array([names.index(name) for name, _ in stages]),
-            sizes=sizes,
-            lengths=None if all(share == 1 for _, share in stages) else lengths,
-            measurements=jnp.where(fitted, known, 0.0).sum(axis=1),
-            smallest_step=jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * largest),
-        )
+
+def _model_of_part(
+    problem: "ShootingProblem", part: "ShootingProblem", rows: Rows, parameters: Array, own: Array, length: Length
+) -> LocalModel:
+    """The local model of the whole problem's `rows` on the channels of `part`, in all unknowns."""
+    part = eqx.tree_at(lambda p: p.length, part, length, is_leaf=lambda leaf: leaf is None)
+    compared = rows._replace(measured=rows.measured[: part.size] + rows.measured[problem.size :])
+    model = each_window(part.model_of_window, compared, parameters, own[:, : part.size])
+    none, more = (0, 0), (0, problem.free_size - part.free_size)
+    gradient, information = jnp.pad(model.gradient, (none, more)), jnp.pad(model.information, (none, more, more))
+    return model._replace(gradient=gradient, information=information)
