@@ -21,6 +21,7 @@ from ..models.state import Attitude, Orientation, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
+from ..shooting.noise_unknowns import PRECISION
 from ..shooting.sums import joined
 from .envelope import Envelope, hover_squares
 from .rotor_speeds import drawn
@@ -165,7 +166,7 @@ class Fleet(eqx.Module):
             found = innovations.innovations(self.parameters, noise)
             information = found.information.sum(axis=-1)
             whole = joined(found.gradient.sum(axis=-1), information, count)[1]
-            prior = innovations.noise_unknowns.precision * (np.arange(whole.shape[0]) >= count)
+            prior = PRECISION * (np.arange(whole.shape[0]) >= count)
             return whole + jnp.diag(prior), information[:, :count, :count]
 
         return jax.vmap(one)(flights.omega, flights.states, flights.specific_force)

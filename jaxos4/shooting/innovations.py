@@ -26,7 +26,7 @@ from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
 from .filters import InputGains, Point, Segmented, innovate
 from .gains import INSTANT, LogNoise, Observed, Window
-from .noise_unknowns import NoiseUnknowns, levels, own_names
+from .noise_unknowns import TIMES, levels, own_names, with_noise
 from .problem import ShootingProblem
 from .scans import with_tangents
 from .segments import Segments, observe_in_segments
@@ -58,7 +58,6 @@ class InnovationsProblem(AbstractProblem):
     - `answers_within`: whether the controller answers a rate within its sample; otherwise feedthroughs are 0.
     - `noise_feedthrough`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default:
       not known, so that a search has two stages. The first finds them, the second counts them.
-    - `noise_unknowns`: how the noise is looked for.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants.
     """
 
@@ -70,7 +69,6 @@ class InnovationsProblem(AbstractProblem):
     answers_within: Bool[Array, ""]
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
-    noise_unknowns: NoiseUnknowns = eqx.field(static=True, default=NoiseUnknowns())
 
     def __init__(
         self,
@@ -83,7 +81,6 @@ class InnovationsProblem(AbstractProblem):
         input_innovations: Float[ArrayLike, "samples feedthroughs channels"] | None = None,
         noise_feedthrough: Float[ArrayLike, "channels feedthroughs"] | None = None,
         answers_within: Bool[ArrayLike, ""] = True,
-        noise_unknowns: NoiseUnknowns | None = None,
     ):
         if segments is None:
             segments = max(round((problem.flight.time.shape[-1] - settling) / (3 * SETTLING)), 1)
@@ -106,7 +103,6 @@ class InnovationsProblem(AbstractProblem):
         unknown = np.full((channels, self.input_innovations.shape[1]), np.nan)
         self.noise_feedthrough = as_float(unknown if noise_feedthrough is None else noise_feedthrough)
         self.answers_within = jnp.asarray(answers_within, dtype=bool)
-        self.noise_unknowns = NoiseUnknowns() if noise_unknowns is None else noise_unknowns
         unknowns = problem.unknowns.count + len(self._own) * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
         self.least_noise = as_float(np.zeros(channels) if least_noise is None else least_noise)
@@ -164,7 +160,7 @@ class InnovationsProblem(AbstractProblem):
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
         data = self.problem.measured(), self.flight.dt, self.least_noise
         has_input = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
-        return self.noise_unknowns.after(
+        return with_noise(
             self.problem.unknowns, self.channels, *data, has_input=has_input, answers_within=self.answers_within
         )
 
@@ -172,7 +168,7 @@ class InnovationsProblem(AbstractProblem):
     def initial_guess(self) -> InitialGuess:
         """`start` where it is not NaN; all starts are equal if it is a whole start. A filter finds its own state."""
         unknowns, count = self.unknowns.usable, self.problem.unknowns.count
-        place, times = np.arange(unknowns.count) - count, jnp.log(jnp.asarray(self.noise_unknowns.times))
+        place, times = np.arange(unknowns.count) - count, jnp.log(jnp.asarray(TIMES))
         is_time = (place >= 0) & (place % len(self._own) == 1)
         starts = jnp.where(is_time, times[:, None], unknowns.center)
         starts = jnp.clip(starts, unknowns.lowest, unknowns.highest)
