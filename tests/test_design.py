@@ -14,7 +14,7 @@ from jaxos4 import design
 from jaxos4.design import Envelope
 from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
 from jaxos4.design.rotor_speeds import drawn, fly_finely
-from jaxos4.design.task import CRITERIA, criterion_of
+from jaxos4.design.task import CRITERIA, criterion_of, design as search
 from jaxos4.study import load_study
 from jaxos4.study.cell import setup_of
 
@@ -211,6 +211,12 @@ def test_other_vehicles_in_other_gusts_keep_the_limits(references):
     uses = others.uses(references.designed.inputs, references.task.envelope)
     assert max(uses[name] for name in ("fastest", "slowest", "velocity", "distance")) <= 1
     assert max(uses[name] for name in ("angle", "rate")) < 1.15
+
+
+def test_a_criterion_that_is_not_finite_is_an_error(references):
+    lost = dataclasses.replace(references.task, added=np.full_like(references.task.added, np.nan))
+    with pytest.raises(jaxos4.InputError, match="accuracy after these references is not a finite number"):
+        search(lost, compare=False, key=jax.random.key(0), progress=lambda _: None)
 
 
 @pytest.mark.slow

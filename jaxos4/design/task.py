@@ -164,13 +164,19 @@ class Design(NamedTuple):
 
 
 def design(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -> Design:
-    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`."""
+    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`.
+
+    **Raises:** `InputError` if the criterion is not finite: there is nothing to search for.
+    """
     progress("compiling the search")
     searched, searches = task, _started(jax.random.fold_in(key, 2), task)
     for stage, penalty in enumerate(_PENALTIES):
         if stage == 2:
             searches = [min(searches, key=lambda search: search.cost)]
         searches = [_minimise(searched, search, as_float(penalty)) for search in searches]
+        if not np.isfinite(min(search.cost for search in searches)):
+            remedy = "narrow the bracket, or give stronger gusts for a vehicle under a controller"
+            raise InputError(f"the accuracy after these {task.kind} is not a finite number; {remedy}.")
         progress(f"search, stage {stage + 1} of {len(_PENALTIES)}")
         if stage:
             searched = searched.watching(min(searches, key=lambda search: search.cost).coefficients)
