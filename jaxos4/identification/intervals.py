@@ -28,7 +28,7 @@ from ..results import NINETY_FIVE, has_answer, result_names
 from .answers import VehicleAnswer
 from .data import Progress, silent
 from .results import Constant, FixedParameter
-from .search import Optimum, deviations, disturbances_of, search
+from .search import LOWER, Optimum, deviations, disturbances_of, search
 from .verdict import Move
 
 PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
@@ -43,7 +43,6 @@ MAX_FITS = 3  # for one end of an interval
 CLOSE = 0.1  # fits end if the root of twice the rise of the cost is this close to 1.96
 MIN_SLOPE = 0.1  # of this root for each standard deviation; it is 1 if the cost is quadratic
 PROFILE_TOLERANCE = 0.04  # of a fit, one or two steps; a cost that is too large by this moves an end by 1 %
-LOWER = 0.1  # an end whose cost is lower by more shows that the optimum is not the minimum
 MAX_MINIMA = 3  # whose ends are looked at
 _CLEAR = 1e-5  # the least share of a scaled unknown that the others do not explain, as a root
 

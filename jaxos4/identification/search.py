@@ -3,7 +3,7 @@
 The noise is among the unknowns of this likelihood. All searches return an `Optimum`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -23,7 +23,8 @@ NEAR_NOMINAL = 12.0  # standard deviations; further from its nominal value, a pa
 # Parameters near their nominal values are fixed there unless that raises the cost, prior included, by more: near a
 # nominal value, a cost with kinks is not quadratic, and standard deviations are too small.
 MAX_RISE = 5.0
-# The cost has a minimum in the delay for each row of the log. The usual delay [s] of measured speeds, and of commands.
+LOWER = 0.1  # a cost that is lower by more belongs to another minimum
+# The usual delay [s] of measured speeds, and of commands. The cost has a minimum in the delay for each row of the log.
 USUAL_DELAY, USUAL_DELAY_OF_COMMANDS = 0.0, 0.002
 
 
@@ -124,29 +125,29 @@ def search(
     if first is None or not has_answer(first.result):
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
-    for other in _near_usual_delay(estimator, likelihood, first):
-        spent += int(other.rollouts)
-        if has_answer(other.result) and float(other.cost) < float(first.cost):
-            first = other
-    optimum = Optimum(data, likelihood, first, first, likelihood.problem.unknowns, spent)
+    first, more = _lowest_in_delay(estimator, likelihood, first)
+    optimum = Optimum(data, likelihood, first, first, likelihood.problem.unknowns, spent + more)
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_nominal_values(estimator, optimum, progress)
 
 
-def _near_usual_delay(
-    estimator: AbstractEstimator, likelihood: InnovationsProblem, first: Estimate
-) -> Iterator[Estimate]:
-    """The minimum near the usual delay of the rotors, if the search of short samples led to another one."""
+def _lowest_in_delay(
+    estimator: Callable[[InnovationsProblem], Estimate], likelihood: InnovationsProblem, first: Estimate
+) -> tuple[Estimate, int]:
+    """The estimate, or a lower minimum near the usual delay of the rotors, and the rollouts that this took."""
     names = likelihood.problem.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(first.result):
-        return
+        return first, 0
     usual = USUAL_DELAY_OF_COMMANDS if "rotor_lag" in names else USUAL_DELAY
     if abs(float(first.parameters[names.index("rotor_delay")]) - usual) <= float(likelihood.flight.dt) / 2:
-        return
+        return first, 0
     near = jax.block_until_ready(estimator(likelihood.fix({"rotor_delay": np.asarray(usual)})))
-    if has_answer(near.result):
-        yield jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
+    if not has_answer(near.result):
+        return first, int(near.rollouts)
+    other = jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
+    is_lower = has_answer(other.result) and float(first.cost) - float(other.cost) > LOWER
+    return other if is_lower else first, int(near.rollouts) + int(other.rollouts)
 
 
 def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
