@@ -229,9 +229,9 @@ class AbstractEstimator(eqx.Module):
 def recursively(
     identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem, bracket: Bracket | None
 ) -> Estimate:
-    """`in_one_program`, if an algorithm can go through the flight sample by sample.
+    """The estimate by an algorithm that goes through a flight sample by sample, see `in_one_program`.
 
-    **Raises:** `ValueError` for a wrong bracket, windows, or rotor or sensor terms.
+    **Raises:** `ValueError` for a wrong bracket, and for windows, rotor or sensor terms, which it cannot handle.
     """
     if problem.windows > 1:
         remedy = f"got {problem.windows}: use an estimator that shoots"

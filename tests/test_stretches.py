@@ -10,7 +10,7 @@ from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.recording import Recording, read_recording, stretches
 from jaxos4.recording.motion import excitation
-from jaxos4.recording.stretches import Stretch, cut, nothing_usable
+from jaxos4.recording.stretches import Stretch, cut, end_of_tumble, nothing_usable
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)
@@ -92,6 +92,15 @@ def test_each_reason_to_leave_a_part_out(case):
     for airframe in (CRAZYFLIE, None) if case in ENDS else ():
         usable = usable_stretches(flight, airframe)[0]
         assert (usable.begin, usable.end) == pytest.approx(ENDS[case], abs=0.02)
+
+
+@pytest.mark.parametrize(("begin", "end", "recovered"), [(3.2, 4.5, 4.8), (8.0, 9.0, None)], ids=["launch", "flip"])
+def test_a_tumble_at_launch_is_noticed(begin, end, recovered):
+    """A flip later in the flight is none, and neither is the motion at the begin of a log that begins in flight."""
+    tumbling = changed(at(begin, end), "states", P, 12.0, rest=((0, 3),))
+    found = end_of_tumble(tumbling, CRAZYFLIE)
+    assert found == (None if recovered is None else pytest.approx(recovered, abs=0.02))
+    assert end_of_tumble(changed(at(0, 1), "states", P, 12.0), CRAZYFLIE) is None
 
 
 def test_neither_another_airframe_nor_a_slow_sensor_ends_a_flight():

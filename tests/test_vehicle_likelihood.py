@@ -211,7 +211,7 @@ def test_the_search_begins_again_near_the_usual_delay(delay, cost, chosen, searc
         return estimate(USUAL_DELAY_OF_COMMANDS, cost)
 
     first = estimate(delay, 2.0)
-    found, rollouts = _lowest_in_delay(estimator, likelihood, first)
+    found, rollouts = _lowest_in_delay(estimator, likelihood, first, USUAL_DELAY_OF_COMMANDS)
     assert (found is not first, rollouts, len(starts)) == (bool(chosen), 5 * searches, searches)
     if starts:
         assert [free for free, _ in starts] == [False, True]

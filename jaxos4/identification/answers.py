@@ -164,7 +164,8 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
 def dominated(answer: VehicleAnswer) -> dict[str, str]:
     """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
 
-    Yaw is one of them too if the flights say nothing of alpha8. Roll and pitch are then flagged for that reason.
+    Yaw is one of them too if the flights say nothing of alpha8. Roll without alpha3, and pitch without alpha6, are not
+    listed: their inertias are missing anyway.
     """
     omega, mixer = np.asarray(answer.problem.flight.omega, dtype=float), np.asarray(answer.problem.model.airframe.mixer)
     torques = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0)

@@ -88,8 +88,8 @@ def identify(
     else:
         options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
         wanted = _settings(FlightSettings, settings)
-        data, method = prepare_os4(recordings, subject, wanted, progress=progress, **options)
-        found = judge_os4(data, fit_os4(method, data.likelihood, progress=progress), method)
+        data, name, method = prepare_os4(recordings, subject, wanted, progress=progress, **options)
+        found = judge_os4(data, fit_os4(method, data.likelihood, progress=progress), method, name)
     return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)
 
 

@@ -63,8 +63,8 @@ def prepare_os4(
     validate: Recording | None,
     seed: int,
     progress: Progress,
-) -> tuple[Data[ShootingProblem], AbstractEstimator]:
-    """The data of one flight, and the estimator that searches its likelihood. Arguments as of `identify`."""
+) -> tuple[Data[ShootingProblem], str, AbstractEstimator]:
+    """The data of one flight, and the name and the estimator that searches it. Arguments as of `identify`."""
     recording, *others = recordings
     if others:
         raise InputError(
@@ -117,7 +117,7 @@ def prepare_os4(
     )
     findings = self_checks(recording, model.airframe, checks=KINEMATIC)
     data = Data(problem, problem, Clock(), provenance, held_out=held_out, findings=findings)
-    return data, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
+    return data, name, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
 
 
 def _given_network(
@@ -188,9 +188,8 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
     return OS4Answer(problem, estimate, bounds, rollouts, evaluation=evaluation, diagnostics=diagnostics)
 
 
-def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator) -> OS4Identification:
-    """The result of the flight of an OS4 that an estimator searched: with rigid body, issues and verdicts."""
-    name, _ = name_and_class(estimator)
+def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name: str) -> OS4Identification:
+    """The result of the flight of an OS4 that an estimator of this name searched: rigid body, issues and verdicts."""
     search, flown = str(result_names(answer.estimate.result)), answer.evaluation
     found = OS4Identification(
         model=class_name(answer.problem.model, MODELS),

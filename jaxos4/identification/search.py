@@ -125,7 +125,8 @@ def search(
     if first is None or not has_answer(first.result):
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
-    first, more = _lowest_in_delay(estimator, likelihood, first)
+    usual = USUAL_DELAY_OF_COMMANDS if data.follows_commands else USUAL_DELAY
+    first, more = _lowest_in_delay(estimator, likelihood, first, usual, progress)
     optimum = Optimum(data, likelihood, first, first, likelihood.problem.unknowns, spent + more)
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
@@ -133,15 +134,19 @@ def search(
 
 
 def _lowest_in_delay(
-    estimator: Callable[[InnovationsProblem], Estimate], likelihood: InnovationsProblem, first: Estimate
+    estimator: Callable[[InnovationsProblem], Estimate],
+    likelihood: InnovationsProblem,
+    first: Estimate,
+    usual: float,
+    progress: Progress = silent,
 ) -> tuple[Estimate, int]:
-    """The estimate, or a lower minimum near the usual delay of the rotors, and the rollouts that this took."""
+    """The estimate, or a lower minimum near the `usual` delay of the rotors [s], and the rollouts that this took."""
     names = likelihood.problem.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(first.result):
         return first, 0
-    usual = USUAL_DELAY_OF_COMMANDS if "rotor_lag" in names else USUAL_DELAY
     if abs(float(first.parameters[names.index("rotor_delay")]) - usual) <= float(likelihood.flight.dt) / 2:
         return first, 0
+    progress("fitting again near the usual delay of the rotors")
     near = jax.block_until_ready(estimator(likelihood.fix({"rotor_delay": np.asarray(usual)})))
     if not has_answer(near.result):
         return first, int(near.rollouts)

@@ -39,8 +39,8 @@ class VehicleSettings:
 
     - `terms`: of `jaxos4.TERMS`; by default those that the recordings allow.
     - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.
-    - `sample_time`: average to samples of this length [s]; by default 0.002 s, or 0.004 s for commands, if the
-      recordings have shorter ones.
+    - `sample_time`: average to samples of this length [s]; by default the best from 0.002 s (commands: 0.004 s), or
+      that of the recordings if it is longer, to 0.032 s.
     - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
     """
 

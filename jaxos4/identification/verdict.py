@@ -32,8 +32,8 @@ RESERVATION, CONTRADICTION = "successful", "implausible"
 
 
 # An issue that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. By
-# more than one of them, it makes a reservation; by neither, it is a note. A mere `reservation` contradicts only if it
-# moves the quantity by more than its own size. Errors of discretisation reach 3 %. Moves add up; see `judge`.
+# more than one of them, it makes a reservation; by neither, it is a note. A `RESERVATION` contradicts only if it
+# moves the quantity by more than its own size. Errors of discretisation reach 3 %. Moves add up.
 MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
 # Half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a reservation, or is not
 # identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
@@ -76,6 +76,9 @@ class Issue(msgspec.Struct, frozen=True):
     cause: str
     remedy: str
     moves: Moves = {}
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "moves", dict(self.moves))  # nobody else's
 
     def __str__(self) -> str:
         return f"{self.cause}; {self.remedy}"

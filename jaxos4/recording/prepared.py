@@ -20,7 +20,7 @@ from .level import force_level
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .noise import force_noise, vibrating_rates, without_noise
 from .richest import fair_share, note_of
-from .stretches import Stretch, cut, nothing_usable
+from .stretches import Stretch, cut, end_of_tumble, nothing_usable
 from .windows import averaged, concatenate, hold_out, whole_windows
 
 HOLDOUT = 0.25
@@ -184,6 +184,8 @@ def _cleaned(
         raise InputError(f"{name}: {slow}.")
     if limited := at_limit(evidence.plausible.recording, airframe):
         notes.append("; ".join(limited))
+    if begin is None and (recovered := end_of_tumble(evidence.plausible.recording, airframe)) is not None:
+        notes.append(f"{name}: tumbles at launch, and is steady from {recovered:.1f} s on (`begin` {recovered:.1f})")
     opposite = opposite_axes(usable, airframe)
     if refused := refused_note(opposite):
         raise InputError(f"{name}: {refused}.")

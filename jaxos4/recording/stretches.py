@@ -97,6 +97,21 @@ def nothing_usable(every: Sequence[Stretch]) -> str:
     return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
 
 
+LAUNCH = 3.0  # s after the ground
+TUMBLES = 10.0  # rad/s; a vehicle that turns faster so early was thrown, or tips over
+
+
+def end_of_tumble(recording: Recording, airframe: Airframe) -> float | None:
+    """When a vehicle that tumbles at its first launch has recovered [s]; `None` if it does not."""
+    dt, time = recording.dt, recording.time
+    flies = np.flatnonzero(~_ground(_thrust_share(recording, airframe), dt))
+    if not flies.size or flies[0] == 0:  # the log begins in flight
+        return None
+    launch = recording.states[flies[0] : flies[0] + _samples(LAUNCH, dt), RATES]
+    fast = np.flatnonzero(np.linalg.norm(launch, axis=1) > TUMBLES)
+    return float(time[flies[0] + fast[-1]]) + MARGIN if fast.size else None
+
+
 def cut(flight: Recording, stretch: Stretch) -> Recording:
     """The samples from `stretch.begin` to `stretch.end`; times stay. Raises `InputError` for fewer than two."""
     time, half = flight.time, flight.dt / 2

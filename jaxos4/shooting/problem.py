@@ -294,8 +294,7 @@ class ShootingProblem(AbstractProblem):
         return window_samples(self.flight.states.shape[-2], self.windows)
 
     def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
-        following = STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
-        return following, self.model.observe(state, forcing, parameters)
+        return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)
 
     def _weights(self) -> tuple[Scalar, ...]:
         return tuple(1 / self.sigma[self.columns])

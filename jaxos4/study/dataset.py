@@ -48,7 +48,7 @@ COORDINATES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 _FLIGHTS, _WIDE = (*SCENARIO, "flight"), ("model", "airframe", "width", "parameter")
 _VALUES = (*_FLIGHTS, "parameter")
 # What the file of a cell has. The truth is the same for all estimators.
-RESULTS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+OF_CELLS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "truth": ((*SCENARIO[:-1], "flight", "parameter"), "f8", "unit", "true parameter"),
     "estimate": (_VALUES, "f8", "unit", "estimated parameter; missing where `result` says that there is none"),
     "std": (_VALUES, "f8", "unit", "standard deviation that the estimator gives"),
@@ -59,7 +59,7 @@ RESULTS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "cost": (_FLIGHTS, "f8", "1", "1/2 |W (y - x)|^2 at the estimate, of the channels `seen`"),
     "hit": (_FLIGHTS, "i1", "1", "whether the hybrid's seed bracket held the truth; -1 for other estimators"),
 }
-SCHEMA = COORDINATES | RESULTS
+SCHEMA = COORDINATES | OF_CELLS
 SCHEMA |= {
     "unit": (("parameter",), "U", "1", "unit of the parameter"),
     "center": (_WIDE, "f8", "unit", "middle of the bracket"),
@@ -183,7 +183,7 @@ def assemble(store: Store) -> xr.Dataset:
     blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {
         name: np.full([len(coordinates[dim][1]) for dim in dims], blank.get(name, np.nan), kind)
-        for name, (dims, kind, *_) in RESULTS.items()
+        for name, (dims, kind, *_) in OF_CELLS.items()
     }
     for cell in map(study.cell, range(study.count)):
         if (results := store.read(cell.number)) is None:
@@ -200,7 +200,7 @@ def assemble(store: Store) -> xr.Dataset:
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
         with reading(store.cell_file(cell.number), "not a cell of this study", _RUN_AGAIN):
-            for name, (_, kind, *_) in RESULTS.items():
+            for name, (_, kind, *_) in OF_CELLS.items():
                 found = results[name].astype(kind, casting="same_kind")
                 arrays[name][shared if name == "truth" else own] = found
             if not np.isin(results["result"], np.arange(len(OUTCOMES))).all():

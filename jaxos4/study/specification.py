@@ -79,7 +79,7 @@ class Cell(NamedTuple):
 
 
 class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The specification of a study: a TOML file with these keys, all optional.
+    """The specification of a study: a TOML file with some of these keys.
 
     The axes of the grid are lists; every combination is flown `flights` times.
 
