@@ -95,7 +95,10 @@ def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Compar
     **Raises:** `InputError` for other results; `OSError` if a file cannot be read.
     """
     if len(results) < 2:
-        raise InputError(f"a comparison needs two results or more, got {len(results)}.")
+        raise InputError(f"a comparison needs two results or more, got {len(results)}; give one of each flight.")
+    files = [os.path.realpath(each) for each in results if not isinstance(each, Identification)]
+    if twice := sorted({path for path in files if files.count(path) > 1}):
+        raise InputError(f"{printable(Path(twice[0]).name)}: given twice; give one result of each flight.")
     every = [each if isinstance(each, Identification) else read_result(each) for each in results]
     # Of files, without their folders if these differ; without a file, those of the logs.
     paths = ["" if isinstance(each, Identification) else os.fspath(each) for each in results]

@@ -260,7 +260,7 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     assert "<svg" in (tmp_path / "out.svg").read_text(encoding="utf-8")
     page = (tmp_path / "out.html").read_text(encoding="utf-8")
     stands_alone(page)
-    says(words(page), "Errors 0.25 s ahead, relative to", "jaxos4 predict found.json log.csv")
+    says(words(page), "Better than constant rates and than a regression up to", "jaxos4 predict found.json log.csv")
     assert plain(written["quantities"]["attitude"]["error"][-1]) in words(page)
     assert run("predict", "found.json", "log.csv", "--horizon", "0.25", "--out", "out.csv", "--seed", "3")[0] == 0
     table = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)

@@ -388,6 +388,7 @@ def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):
     refused(run("compare", *files, "--quick"), "--quick: is for a comparison of estimators")
     written(identified_flight(), tmp_path / "os4.json")
     refused(run("compare", "0.json", "os4.json"), "os4.json: is of the published model")
+    refused(run("compare", "0.json", "./0.json"), "0.json: given twice; give one result of each flight")
     heavy = eqx.tree_at(lambda airframe: airframe.mass, CRAZYFLIE, jnp.asarray(0.03))
     other = of_inertias(1.66e-5, airframe=heavy)
     notes = jaxos4.compare_results([of_inertias(1.66e-5), other]).notes

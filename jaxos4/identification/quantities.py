@@ -59,7 +59,8 @@ def _too_wide(rows: dict[str, ParameterEstimate], half_widths: dict[str, float])
     """The parameters whose 95 % intervals are wider than their brackets."""
     for name, row in rows.items():
         if row.std is not None and NINETY_FIVE * row.std > half_widths[name]:
-            yield f"{name} is known to +-{NINETY_FIVE * row.std:.2g} {row.unit} only; fly with more motion"
+            unit = "" if row.unit == "1" else f" {row.unit}"
+            yield f"{name} is known to +-{NINETY_FIVE * row.std:.2g}{unit} only; fly with more motion"
 
 
 def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ def print_comparison(console: Console, found: Comparison) -> None:
         say(console, f"{reason}.")
     if len(of_inertias) < len(found.reasons):
         others = counted(len(found.reasons) - len(of_inertias), "reason")
-        say(console, f"{others} about other quantities: on the page")
+        say(console, f"{others} about other quantities: on the page of --report")
     for note in found.notes:
         say(console, f"note: {note}")
     say(console, f"p: the probability that results of one value scatter this much or more. {SHARED}")

@@ -231,7 +231,7 @@ def bridged(
 def fitted(recording: Recording, airframe: Airframe | None) -> str:
     """The parts that `jaxos4 estimate` would fit and hold out, in words."""
     if airframe is None:
-        return "Give the `airframe` to see here what would be fitted, and what held out."
+        return "Give --airframe to see here what would be fitted, and what held out."
     if recording.commanded and not airframe.has_full_scale:
         what = "this log has commands, and the rotor speed of full command is not known"
         return f"Nothing can be fitted: {what}; set max_rotor_speed [rad/s] in the airframe's file."

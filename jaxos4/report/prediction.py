@@ -6,7 +6,6 @@ import numpy as np
 from rich.console import Console
 
 from .._files import write_file
-from ..analysis.prediction import decisive_horizon
 from ..forecast import QUANTITIES, FlightPrediction
 from ..rotations import euler_angles
 from .page import Section, picture, table, text, write_page
@@ -108,18 +107,16 @@ def errors_ahead(found: FlightPrediction) -> Figure:
 
 
 def headline(found: FlightPrediction) -> str:
-    """How much better the vehicle predicts than the better simple prediction, a quarter of a second ahead."""
-    place = decisive_horizon(found.horizons, np.ones(found.horizons.size, bool))
-    simple = {name: np.fmin(x.constant[place], x.regression[place]) for name, x in found.quality.items()}
-    shares = {name: 100 * x.error[place] / simple[name] for name, x in found.quality.items() if simple[name] > 0}
-    if not shares:
+    """How far ahead the vehicle predicts each quantity better than both simple predictions."""
+    simple = {name: np.fmin(x.constant, x.regression) for name, x in found.quality.items()}
+    known = [name for name, errors in simple.items() if np.isfinite(errors).all()]
+    if not known:
         return "Nothing was measured that a prediction can be compared with."
-    said = ", ".join(f"{name} {share:.0f} %" for name, share in shares.items())
-    worse = ", ".join(name for name, share in shares.items() if share >= 100)
-    ahead = (
-        f"Errors {found.horizons[place]:.2g} s ahead, relative to constant rates or a regression, whichever is better"
-    )
-    return f"{ahead}: {said}.{f' Not predicted better: {worse}.' if worse else ''}"
+    better = {name: np.append(found.quality[name].error < simple[name], False).argmin() for name in known}
+    reach = ", ".join(f"{name} {found.horizons[count - 1]:.2g} s" for name, count in better.items() if count)
+    never = ", ".join(name for name, count in better.items() if not count)
+    said = [f"Better than constant rates and than a regression up to {reach} ahead."] * bool(reach)
+    return " ".join([*said, *[f"Never better: {never}."] * bool(never)])
 
 
 def write_prediction(path: str | os.PathLike[str], found: FlightPrediction, *, command: str = "") -> None:
@@ -131,7 +128,7 @@ def write_prediction(path: str | os.PathLike[str], found: FlightPrediction, *, c
         group = name
     drawn = picture(
         predicted_signals(found),
-        "Each prediction starts from the measured state and uses the recorded motors. Shown: the first "
+        "Each prediction starts from the measured state and uses the recorded motors. Shown: at most the first "
         f"{max(_LONGEST, 2 * found.horizons[-1]):.3g} s.",
     )
     grown = picture(
