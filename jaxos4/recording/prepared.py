@@ -185,7 +185,7 @@ def _cleaned(
     if limited := at_limit(evidence.plausible.recording, airframe):
         notes.append("; ".join(limited))
     if begin is None and (recovered := end_of_tumble(evidence.plausible.recording, airframe)) is not None:
-        notes.append(f"{name}: tumbles at launch, and is steady from {recovered:.1f} s on (`begin` {recovered:.1f})")
+        notes.append(f"{name}: tumbles at launch until {recovered:.1f} s (`begin` {recovered:.1f} leaves this out)")
     opposite = opposite_axes(usable, airframe)
     if refused := refused_note(opposite):
         raise InputError(f"{name}: {refused}.")
