@@ -247,6 +247,10 @@ def test_what_a_bag_lacks_is_said(bagged, tmp_path, save):
     short = {"columns": MAP | {"omega4": "/motor_speed.angular_velocities[4]"}}
     with pytest.raises(InputError, match="holds no rotor speeds or commands; name omega1..4"):
         read_log(path, columns=short)
+    dead = {f"command{i + 1}": f"/motor_speed.angular_velocities[{i}]" for i in range(3)}
+    dead |= {"command4": "/imu.orientation_covariance[0]"}
+    with pytest.raises(InputError, match="holds no rotor speeds or commands; name omega1..4 or command1..4"):
+        read_log(path, columns={"columns": {n: s for n, s in MAP.items() if "omega" not in n} | dead})
     with pytest.raises(InputError, match="holds no body rates; name p, q and r"):
         read_log(path, columns={"columns": {n: s for n, s in MAP.items() if n != "q"}})
     with pytest.raises(InputError, match="is a folder, not a file"):

@@ -264,8 +264,11 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[T
         return Series(t, np.column_stack([at(name) for name in names]))
 
     def rotors(names: Sequence[str]) -> Rotors | None:
-        found, is_measured = together(names), names == SPEED_NAMES
-        return found and Rotors.of(found, [chosen[name] for name in names], is_measured=is_measured)
+        """The samples with all four rotors; `None` if one of them never turns, also of commands: no vehicle flew so."""
+        found = together(names)
+        if found is None or not (found.values > 0).any(axis=0).all():
+            return None
+        return Rotors.of(found, [chosen[name] for name in names], is_measured=names == SPEED_NAMES)
 
     quaternion, angles = together(QUATERNION), together(ANGLES)
     if angles is None and quaternion is not None:
