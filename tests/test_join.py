@@ -98,6 +98,16 @@ def test_a_signal_is_written_read_cut_averaged_joined_and_padded(field, tmp_path
         assert some is None if signal.is_input else np.isnan(some[10:]).all() and np.isfinite(some[:10]).all()
 
 
+def test_a_force_that_was_never_measured_is_none_of_joined_stretches():
+    flown = Recording(0.01 * np.arange(20), np.full((20, 4), 300.0), np.full((20, 12), np.nan))
+    silent, heard = np.full((20, 3), np.nan), np.full((20, 3), 9.8)
+    whole = concatenate([flown._replace(specific_force=silent)] * 2)
+    assert whole.specific_force is None
+    assert whole.states.shape == (40, 12)
+    some = concatenate([flown._replace(specific_force=each) for each in (silent, heard)]).specific_force
+    np.testing.assert_array_equal(some, np.concatenate([silent, heard]))
+
+
 def test_the_cost_of_joined_flights_is_the_sum_of_theirs():
     model = jaxos4.FlightModel(terms=("lag", "delay", "offset"))
     omega, parts = jaxos4.multisine(jaxos4.OS4, duration=0.6), []

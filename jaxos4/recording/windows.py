@@ -60,9 +60,13 @@ def concatenate(stretches: Sequence[Recording]) -> Recording:
     sizes = [stretch.time.size for stretch in stretches]
 
     def whole(name: str, signal: Signal) -> np.ndarray | None:
-        """A signal of all stretches: NaN in those without it, or `None` if an input is missing in one of them."""
+        """A signal of all stretches: NaN in those without it, or `None` if an input is missing in one of them.
+
+        A sensor that measured nothing in any stretch is `None`, as if the vehicle had none. States are always there.
+        """
         rows = [getattr(stretch, name) for stretch in stretches]
-        missing = [each is None for each in rows]
+        always = signal.is_input or name == "states"
+        missing = [each is None or not (always or np.isfinite(each).any()) for each in rows]
         if all(missing) or (signal.is_input and any(missing)):
             return None
         nothing = [np.full((size, *(signal.shape or ())), np.nan) for size in sizes]
