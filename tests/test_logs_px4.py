@@ -28,6 +28,7 @@ from recorded_logs import FRD, VEHICLE, check, force, message, outcome, speeds
 from jaxos4.errors import InputError
 from jaxos4.logs import Sampling, read_log, read_recording
 from jaxos4.logs.messages import Messages
+from jaxos4.logs.ulog import _rotors
 
 # Commands
 
@@ -173,6 +174,19 @@ def test_idle_escs_give_way_to_commands_which_need_a_full_scale_and_invalid_posi
     np.testing.assert_allclose(read_log(path, full_scale=1.0)[0].omega, 0.4, rtol=1e-6)
     with pytest.raises(InputError, match=r"field actuator_motors.control\[0\]: the rotor speed of full command"):
         read_log(path)
+
+
+def test_idle_escs_without_commands_do_not_say_that_commands_are_used():
+    """The note is of what was chosen."""
+    t = grid(0.01)
+    none = {"t": t} | {f"esc[{i}].esc_rpm": np.zeros(t.size) for i in range(4)}
+    log = Messages("log", {"esc_status": {0: none}}, "")
+    assert _rotors(log) is None
+    assert log.notes == []
+    commands = {"t": t} | {f"control[{i}]": np.full(t.size, 0.4) for i in range(4)}
+    log = Messages("log", {"esc_status": {0: none}, "actuator_motors": {0: commands}}, "")
+    assert _rotors(log).names[0] == "actuator_motors.control[0]"
+    assert log.notes == ["esc_status holds no speed of at least one rotor: commands are used"]
 
 
 def test_what_was_appended_after_a_restart_does_not_break_it(save):

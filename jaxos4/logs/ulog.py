@@ -38,6 +38,7 @@ _TOPICS = (
 # Types of MAVLink, of PX4's control allocation and of its state that are no quadrotors. Others can be quadrotors.
 _OTHER_MAV_TYPES = {1, 3, 4, 7, *range(10, 16), *range(19, 26), 29, 35}
 _OTHER_AIRFRAMES, _OTHER_VEHICLES = {1, 2, 3, 4, 5, 6, 8, 10, 11, 12}, {2, 3, 4}
+_ESC_SPEEDS = [f"esc[{i}].esc_rpm" for i in range(4)]
 _MOTORS = range(101, 105)  # PX4's numbers of the output functions "Motor 1" to "Motor 4"
 _BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
 _OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other units
@@ -168,21 +169,19 @@ def _rotors(log: Messages) -> Rotors | None:
     chosen = every[next((i for i, rate in enumerate(rates) if fast_enough(rate)), rates.index(max(rates)))]
     if every[0].is_measured and not chosen.is_measured:
         log.notes.append(f"measured speeds (esc_status) were logged at {rates[0]:.2g} Hz only: commands are used")
+    elif not chosen.is_measured and log.series("esc_status", _ESC_SPEEDS) is not None:
+        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
     return chosen
 
 
 def _speeds(log: Messages) -> Rotors | None:
-    names = [f"esc[{i}].esc_rpm" for i in range(4)]
-    series = log.series("esc_status", names)
+    series = log.series("esc_status", _ESC_SPEEDS)
     if series is None:
         return None
     functions = [int(log.latest("esc_status", f"esc[{i}].actuator_function") or 0) for i in range(4)]
     order = motor_order(functions, _MOTORS) or range(4)
     speeds = Series(series.t, np.abs(series.values)[:, order] * (2 * math.pi / 60))
-    rotors = Rotors.of(speeds, [f"esc_status.{names[i]}" for i in order], is_measured=True)
-    if rotors is None:
-        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
-    return rotors
+    return Rotors.of(speeds, [f"esc_status.{_ESC_SPEEDS[i]}" for i in order], is_measured=True)
 
 
 def _motors(log: Messages) -> Rotors | None:
