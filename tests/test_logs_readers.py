@@ -94,7 +94,7 @@ UNREAD = {
         b'{"estimator": "ibss"}',
         "is a JSON file; the result of `jaxos4 estimate` is read by `jaxos4 report`",
     ),
-    "an airframe": (b"# weighed\n\nmass = 0.03\n", "is a TOML file; give an airframe as `airframe`"),
+    "an airframe": (b"# weighed\n\nmass = 0.03\n", "is a TOML file, not a log; give a log here (an airframe,"),
     "a column map": (b'[columns]\np = "gyro x"\n', "is a TOML file"),
     "other": (b"abc\x01\x02\x03", "is of a kind that is not known; export it as CSV"),
 }
@@ -106,6 +106,22 @@ def test_a_file_that_is_not_read_is_named_with_what_to_do(case, save):
     message = outcome(read, save(content))
     assert words in message
     assert message.endswith("Logs that are read: " + ", ".join(each.label for each in FORMATS) + ".")
+
+
+@pytest.mark.parametrize("time", ["[s] t", "[t]", "{t}", '"{t}"'])
+def test_a_csv_whose_first_column_begins_as_toml_or_json_does_is_read_by_a_column_map(time, save):
+    header, rows = flight_csv.csv().split("\n", 1)
+    names = {name: name for name in header.split(",")} | {"t": time.strip('"')}
+    plain, _ = read_log(save(f"{header}\n{rows}".encode()))
+    again, _ = read_log(save(f"{time}{header.removeprefix('t')}\n{rows}".encode()), columns={"columns": names})
+    np.testing.assert_array_equal(again.states, plain.states)
+
+
+@pytest.mark.parametrize("preamble", ["rate = 100 Hz", "rate = 100"])
+def test_a_csv_with_a_preamble_is_no_toml(preamble, save):
+    path = save(f"{preamble}\n{flight_csv.csv()}".encode())
+    assert log_format(path) is logs.CSV
+    assert "row 1: is separated by blanks" in outcome(read, path)
 
 
 class Failing:

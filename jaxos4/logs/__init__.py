@@ -9,9 +9,10 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
+from .._files import read_toml
 from .._registry import Registry
 from ..airframe import Airframe
-from ..errors import in_words, printable
+from ..errors import InputError, in_words, printable
 from ..flight import SIGNALS, Flight
 from .ardupilot import ARDUPILOT
 from .assemble import recording_of
@@ -60,16 +61,17 @@ _UNREAD = {
         "convert it to CSV by sdlog2_dump.py (of PX4 before version 1.10), and give a column map",
     ),
     rb".{16}BUILD|.{242}DJI": ("a log of DJI", "decode it by DatCon, and give its CSV with a column map"),
-    rb"(?:\xef\xbb\xbf)?\s*\{": (
+    rb"""(?:\xef\xbb\xbf)?\s*\{\s*(?:\}|"[^"\n]*"\s*:)""": (
         "a JSON file",
         "the result of `jaxos4 estimate` is read by `jaxos4 report`, `export` and `predict`; give a log here",
     ),
-    rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[ \t]*(?:\[\w|[\w-]+[ \t]*=)": (
-        "a TOML file",
-        "give an airframe as `airframe`, a column map as `columns`, a study to `jaxos4 study`, and a log here",
-    ),
     rb"[^\n]{0,4000}[\0-\x08\x0e-\x1f]": ("of a kind that is not known", "export it as CSV, and give a column map"),
 }
+_TOML = (
+    "a TOML file, not a log",
+    "give a log here (an airframe, a column map or the specification of a study goes elsewhere)",
+)
+_BEGIN = 1 << 18  # bytes by which a format is recognised
 
 Source = Flight | Recording | str | os.PathLike[str] | Any
 """A flight, the path of a log, or its arrays as `read_log` takes them."""
@@ -140,17 +142,26 @@ def log_format(path: LogPath) -> LogFormat:
     Raises `InputError` if the file cannot be opened, or is evidently of another kind.
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
-    with opened(inside if os.path.isfile(inside) else path, "rb") as file:
-        begin = file.read(1 << 18) if file.seekable() else b""
+    source = inside if os.path.isfile(inside) else path
+    with opened(source, "rb") as file:
+        begin = file.read(_BEGIN) if file.seekable() else b""
     # An archive may begin with a log that it holds without compression.
     formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1]
     kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin) or FORMATS[-1]
     unread = (each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL))
-    if kind is FORMATS[-1] and (known := next(unread, None)):
+    if kind is FORMATS[-1] and (known := next(unread, None) or (_TOML if _is_toml(source, begin) else None)):
         what, remedy = known
         labels = ", ".join((*(each.label for each in FORMATS), *_OTHERS))
         refuse(path, f"is {what}; {remedy}. Logs that are read: {labels}")
     return kind
+
+
+def _is_toml(path: LogPath, begin: bytes) -> bool:
+    """Whether a file that begins with these bytes is short and holds a table of TOML. No rows of a CSV are TOML."""
+    try:
+        return 0 < len(begin) < _BEGIN and bool(read_toml(path))
+    except InputError:
+        return False
 
 
 def _of_others(begin: bytes) -> LogFormat | None:
