@@ -12,13 +12,49 @@ from helpers import how_we_compile
 from small_experiments import plot, result_of
 
 from experiments import figures, shared
-from experiments.__main__ import main_of, scripts
+from experiments.__main__ import again, main, main_of, scripts
 from experiments.published import RECORDER, read
 from experiments.real_flights import agreement
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
+
+
+# The command line.
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_usage(arguments, capsys):
+    main(arguments)
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("again NAME", "render", *scripts()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nosuch.run"], "nosuch.run: no such script; give one of"),
+        (["again"], "again: no name; give names of files in"),
+        (["again", "nosuch"], "nosuch: no such result in"),
+        (["study.run", "nosuch.toml", "--out", "data"], "nosuch.toml"),
+    ],
+)
+def test_mistake_is_one_line(arguments, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    text = capsys.readouterr().err
+    assert end.value.code == 2
+    assert message in text
+    assert text.count("\n") == 1
+
+
+def test_again_ends_with_the_failure_of_a_script(monkeypatch):
+    monkeypatch.setattr("experiments.__main__.commands", lambda names: {name: ["nosuch.run"] for name in names})
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: subprocess.CompletedProcess([], 2))
+    with pytest.raises(SystemExit) as end:
+        again(["one"])
+    assert end.value.code == 1
 
 
 # Studies: experiments with a specification.
