@@ -11,13 +11,25 @@ import numpy as np
 
 import jaxos4
 from experiments.fits import INERTIAS, constants, identified
-from experiments.monte_carlo import Column, Row, interval, print_rows, print_table, product, study, text, write_report
+from experiments.monte_carlo import (
+    Column,
+    Row,
+    check_names,
+    interval,
+    print_rows,
+    print_table,
+    product,
+    study,
+    text,
+    write_report,
+)
 from experiments.public_flights.clocks import aligned
 from experiments.public_flights.gusts import measured_share, simulated
 from experiments.public_flights.rate_network import errors_of, trained
 from experiments.sample_times.run import VEHICLE as CINERAT
 from experiments.shared import flight_files
 from experiments.verdicts.faults import thinned
+from jaxos4.estimators import ESTIMATORS
 from jaxos4.recording import Recording, read_recording
 from jaxos4.results import NINETY_FIVE
 
@@ -94,6 +106,7 @@ def real_flight(
 
     `z` is the difference of two flights over its standard deviation; 99 % of such figures should be below 2.58.
     """
+    check_names("estimators", estimators, ESTIMATORS)
     paths = flight_files(flights, [f"arpl_crazyflie_{name}.csv" for name in names])
     recordings = {name: read_recording(path, ARPL) for name, path in zip(names, paths, strict=True)}
     groups = {name: [recording] for name, recording in recordings.items()}
@@ -264,6 +277,7 @@ def verdicts(flights: Path | None = None, names: list[str] = tuple(AIRFRAMES), o
 
     The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.
     """
+    check_names("names", names, AIRFRAMES)
     paths = dict(zip(names, flight_files(flights, names), strict=True))
     rows = study(out, {}, product(flight=names), lambda flight: judged(paths[flight], AIRFRAMES[flight]))
     lines = []

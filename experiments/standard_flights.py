@@ -14,7 +14,17 @@ import jax
 import numpy as np
 
 import jaxos4
-from experiments.monte_carlo import Column, Row, count_results, covered_error, print_rows, print_table, product, study
+from experiments.monte_carlo import (
+    Column,
+    Row,
+    check_names,
+    count_results,
+    covered_error,
+    print_rows,
+    print_table,
+    product,
+    study,
+)
 from experiments.shared import (
     DT,
     EFFICIENCY,
@@ -65,6 +75,8 @@ def baselines(
         _, (row, _) = (fit.row(flights, seed, kind) for _ in range(2))  # the first call compiles
         return row
 
+    check_names("noises", noises, NOISES)
+    check_names("estimators", estimators, ESTIMATORS)
     chosen = estimators or [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
     every = product(noise=noises, scale=scales, estimator=chosen)
     trials = (trial for trial in every if trial["scale"] or trial["noise"] == noises[0])
@@ -100,6 +112,8 @@ def efficiency(
         "published, all, 4 windows, output error": Fit(jaxos4.OutputError(), **windows),
     }
 
+    check_names("cases", cases, every)
+
     def row_of(case: str) -> Row:
         return every[case]._replace(scale=scale).row(flights, seed)[0]
 
@@ -124,6 +138,8 @@ def coverage(
     All flights have one true vehicle. The constants Ix, Iy, Iz, J_R are fitted to the alphas of each flight and their
     covariance. `steps`: training steps of the hybrid's network.
     """
+    check_names("model", [model], MODELS)
+    check_names("estimators", estimators, ESTIMATORS)
     vehicle, error = MODELS[model](jaxos4.OS4), np.sqrt(0.95 * 0.05 / flights)
 
     @functools.cache
@@ -227,6 +243,7 @@ def defaults(flights: int = 64, seed: int = 7, settings: list[str] = (), out: Pa
     Flights are identified with each value of a setting. The bound is that of the channels that the estimator sees.
     """
     every = every_setting()
+    check_names("settings", settings, every)
 
     @functools.cache
     def least_costs(*flown) -> np.ndarray:
@@ -265,6 +282,7 @@ def long_flight(
     deviation `drifts`. The model has no term for this factor. The simulated body rates drift away from the measured
     ones, and the drift grows with the length of a window.
     """
+    check_names("estimators", estimators, ESTIMATORS)
     model, compared = jaxos4.PublishedOS4(jaxos4.OS4), (0, 2, 3, 5, 7)  # identifiable parameters that are not 0
     recorded = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=duration), dt=DT)
     noise = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)

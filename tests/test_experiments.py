@@ -13,6 +13,7 @@ from small_experiments import plot, result_of
 
 from experiments import figures, shared
 from experiments.__main__ import again, main, main_of, scripts
+from experiments.closed_loop.run import print_cases
 from experiments.published import RECORDER, read
 from experiments.real_flights import agreement
 from jaxos4.study import load_study, metrics, read_results
@@ -38,6 +39,15 @@ def test_usage(arguments, capsys):
         (["again"], "again: no name; give names of files in"),
         (["again", "nosuch"], "nosuch: no such result in"),
         (["study.run", "nosuch.toml", "--out", "data"], "nosuch.toml"),
+        (["efficiency.run", "--cases", "nosuch"], "--cases: no 'nosuch'; give one of published, all; "),
+        (["defaults.run", "--settings", "nosuch"], "--settings: no 'nosuch'; give one of equation error, memory 0; "),
+        *(
+            ([script, *place, "--estimators", "filter-eror"], "--estimators: no 'filter-eror'; give one of ibss")
+            for script, *place in (
+                *(["baselines.run"], ["coverage.run"], ["long_flight.run"], ["precision.run"], ["real_flight.run"]),
+                *(["closed_loop.run"], ["closed_loop.effects"], ["rotorpy.run", "flights"]),
+            )
+        ),
     ],
 )
 def test_mistake_is_one_line(arguments, message, capsys):
@@ -55,6 +65,12 @@ def test_again_ends_with_the_failure_of_a_script(monkeypatch):
     with pytest.raises(SystemExit) as end:
         again(["one"])
     assert end.value.code == 1
+
+
+def test_case_whose_flights_are_all_refused_has_a_line():
+    row = {"gust": 5.0, "references": "random", "estimator": "filter-error", "result": "refused"}
+    print_cases("refused flights", [row, row])
+    assert RECORDER.tables[-1].rows == [["5", "random", "filter-error", *[""] * 7, "2 refused"]]
 
 
 # Studies: experiments with a specification.

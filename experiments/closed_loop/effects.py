@@ -19,7 +19,8 @@ import numpy as np
 
 import jaxos4
 from experiments.fits import WRONG_INERTIA, fit, given_airframe, print_summaries
-from experiments.monte_carlo import Row, product, study
+from experiments.monte_carlo import Row, check_names, product, study
+from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import STANDARD_TONES
 
 VEHICLE = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
@@ -184,6 +185,8 @@ def main(
 
     - `effects`: The cases.
     """
+    check_names("effects", effects, (*EFFECTS, ALL))
+    check_names("estimators", estimators, ESTIMATORS)
     flown = functools.cache(lambda kind: flights_of(kind, flights, duration, seed))
 
     def row_of(kind: str, estimator: str, flight: int) -> Row:

@@ -25,8 +25,9 @@ import numpy as np
 import jaxos4
 from experiments.closed_loop.effects import DELAY, DT, LAG, LARGEST, VEHICLE, flights_of, stacked
 from experiments.fits import INERTIAS, given_airframe, identified, shares_of_truth, summary, whole
-from experiments.monte_carlo import LOST, Row, groups, plus_minus, print_table, product, results_of, study
+from experiments.monte_carlo import LOST, Row, check_names, groups, plus_minus, print_table, product, results_of, study
 from jaxos4.design import standard_references
+from jaxos4.estimators import ESTIMATORS
 
 WINDOW = 62  # samples
 # Standard deviation of the gyro's noise [rad/s].
@@ -101,7 +102,7 @@ def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> Row:
 
 
 def print_cases(title: str, rows: list[Row]) -> None:
-    """One line for each estimator, strength of gusts and moment of inertia."""
+    """One line for each estimator, strength of gusts and moment of inertia; one without numbers if none has any."""
     lines = [
         (
             *(f"{gust:g}", references, estimator, name, str(row["flights"]), plus_minus(row)),
@@ -111,6 +112,9 @@ def print_cases(title: str, rows: list[Row]) -> None:
         for (gust, references, estimator), some in groups(rows, "gust", "references", "estimator").items()
         for name, row in summary(some).items()
     ]
+    for about, some in groups(rows, "gust", "references", "estimator").items():
+        if not summary(some):
+            lines.append((f"{about[0]:g}", *about[1:], *[""] * 7, results_of(some)))
     figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
     print_table(title, ("gust", "references", "estimator", "", *figures), lines)
 
@@ -130,6 +134,7 @@ def main(
     - `references`: random, designed, or a standard: 3211, doublet, ...
     - `wrong`: Error of the given moments of inertia, as a share.
     """
+    check_names("estimators", estimators, ESTIMATORS)
 
     @functools.cache
     def flown(gust: float, references: str) -> list[jaxos4.Flight | None]:

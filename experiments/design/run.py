@@ -12,10 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxos4
-from experiments.monte_carlo import Column, Row, print_rows, product, study
+from experiments.monte_carlo import Column, Row, check_names, print_rows, product, study
 from experiments.shared import DT, SPAN, fit_noisy, scores, standard_problem
 from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.models import MODELS
+
+WIDTHS = {"default": 1.0, "airframe": 1e-3}  # of brackets, in default half-widths
 
 
 def main(
@@ -28,9 +30,11 @@ def main(
     out: Path | None = None,
 ) -> None:
     """Measure what designed inputs gain."""
+    check_names("models", models, MODELS)
+    check_names("widths", widths, WIDTHS)
 
     def row_of(model: str, channels: str, vehicles: str) -> Row:
-        subject, width = MODELS[model](jaxos4.OS4), {"default": 1.0, "airframe": 1e-3}[vehicles]
+        subject, width = MODELS[model](jaxos4.OS4), WIDTHS[vehicles]
         bracket = jaxos4.Bracket.around(subject.alpha, width * np.asarray(subject.half_width))
         task = {"bracket": bracket, "duration": duration, "dt": DT, "channels": channels, "start_is_known": True}
         found = jaxos4.design_input(subject, **task, compare=True, key=seed)

@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxos4
 from experiments.benchmarks.worker import peak_mib
-from experiments.monte_carlo import Column, Row, count_results, print_rows, print_table, write_report
+from experiments.monte_carlo import Column, Row, check_names, count_results, print_rows, print_table, write_report
 from experiments.shared import CHUNK, DT, EFFICIENCY, ENDED, brackets_at, identify, measure, standard_problem
 from jaxos4.study import metrics
 
@@ -129,6 +129,7 @@ def main(
     - `steps`: Training steps of all networks; each has its own number without it.
     - `separate`: Train one network for each noise scale too.
     """
+    check_names("networks", networks, NETWORKS)
     report: Row = {"flights": flights, "seed": seed, "version": jaxos4.__version__, "load": os.getloadavg()}
     report |= {"rows": [], "training_seconds": {}}
 

@@ -21,6 +21,7 @@ from experiments.fits import INERTIAS, constants, fit, given_airframe, identifie
 from experiments.monte_carlo import (
     LOST,
     Row,
+    check_names,
     continued,
     covered_error,
     fill,
@@ -169,7 +170,11 @@ def main(
     report = continued(out, {"duration": duration, "seed": seed, "tuning": tuning}, "rows")
     for part in ("chosen", "real"):
         report.setdefault(part, [])
-    every, peers = cases(), installed([name for name in tools if name in PEERS])
+    every = cases()
+    check_names("only", only or (), every)
+    check_names("tools", tools, (OURS, *PEERS))
+    check_names("recorded", recorded, (*REAL, "-"))
+    peers = installed([name for name in tools if name in PEERS])
     wanted = only or list(every)
 
     @functools.lru_cache(maxsize=4)

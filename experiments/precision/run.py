@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Column, Row, count_results, print_rows, product, write_report
+from experiments.monte_carlo import Column, Row, check_names, count_results, print_rows, product, write_report
 from experiments.shared import EFFICIENCY, Fit, brackets_around, identify, measure
 from jaxos4._custom_types import as_float
 from jaxos4.estimators import ESTIMATORS, make_estimator
@@ -55,6 +55,7 @@ def main(
     out: Path | None = None,
 ) -> None:
     """RMSE / Cramer-Rao bound of each estimator in double and in single precision."""
+    check_names("estimators", estimators, ESTIMATORS)
     on_rates = Fit(jaxos4.IBSS(), channels="rates", known=known)
     fits = {name: on_rates._replace(channels=ESTIMATORS[name].looks_at, scale=scale) for name in estimators}
     problems = {name: fit.problem for name, fit in fits.items()}

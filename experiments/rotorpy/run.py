@@ -13,8 +13,9 @@ import numpy as np
 
 import jaxos4
 from experiments.fits import INERTIAS, fit, given_airframe, print_summaries, whole
-from experiments.monte_carlo import Row, print_table, product, study
+from experiments.monte_carlo import Row, check_names, print_table, product, study
 from experiments.rotorpy.flights import GUSTS, VEHICLE, quad_params, recorded
+from jaxos4.estimators import ESTIMATORS
 
 QUANTITIES = ("position", "velocity", "attitude", "rates")
 
@@ -73,6 +74,8 @@ def main(
     - `kinds`: calm, gusty.
     - `predict`: Identify each gusty flight, with motion capture, and predict the next 0.5 s ahead.
     """
+    check_names("kinds", kinds, GUSTS)
+    check_names("estimators", estimators, ESTIMATORS)
     settings = {"flights": flights, "duration": duration, "seed": seed}
     if predict:
         known, trials = read(recordings, settings, "gusty", captured=True), product(flight=range(flights))

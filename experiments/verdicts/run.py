@@ -16,7 +16,7 @@ import numpy as np
 import jaxos4
 from experiments.closed_loop.effects import ALL, EFFECTS, VEHICLE, flights_of
 from experiments.fits import INERTIAS, given_airframe, identified, shares_of_truth
-from experiments.monte_carlo import LOST, Row, plus_minus, print_table, share, statistics, study
+from experiments.monte_carlo import LOST, Row, check_names, plus_minus, print_table, share, statistics, study
 from experiments.verdicts.faults import FAULTS, Fault
 from jaxos4 import FrequencyResponse
 from jaxos4.airframe import MOTIONS
@@ -150,6 +150,7 @@ def main(
     - `spoiled`: Number of flights of each fault and size.
     - `rotorpy`: Number of flights of RotorPy, calm and in gusts.
     """
+    check_names("cases", cases, CASES)
     numbers = {name: spoiled if CASES[name][1] else rotorpy if name in ROTORPY else flights for name in cases}
     flown = functools.cache(lambda kind: good_flights(kind, max(numbers.values()), duration, seed))
     # An interrupted report has about as many flights of each case.
