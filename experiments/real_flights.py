@@ -27,7 +27,7 @@ from experiments.public_flights.clocks import aligned
 from experiments.public_flights.gusts import measured_share, simulated
 from experiments.public_flights.rate_network import errors_of, trained
 from experiments.sample_times.run import VEHICLE as CINERAT
-from experiments.shared import flight_files
+from experiments.shared import End, Estimators, Flights, Out, Report, flight_files
 from experiments.verdicts.faults import thinned
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.recording import Recording, read_recording
@@ -91,11 +91,11 @@ def skill_ahead(skill: Row | None) -> dict[str, tuple[float, float]]:
 
 
 def real_flight(
-    flights: Path | None = None,
-    end: float | None = None,
+    flights: Flights = None,
+    end: End = None,
     names: list[str] = ARPL_FLIGHTS,
-    estimators: list[str] = ("filter-error", "ibss"),
-    out: Path | None = None,
+    estimators: Estimators = ("filter-error", "ibss"),
+    out: Report = None,
 ) -> None:
     """Do flights of a real Crazyflie agree on its moments of inertia, and how well is the rest of a flight predicted?
 
@@ -146,15 +146,15 @@ def alone(recordings: list[Recording], end: float | None) -> Row:
 
 
 def public_flights(
-    flights: Path | None = None,
+    flights: Flights = None,
     fitted: list[str] = FITTED,
     predicted: list[str] = PREDICTED,
     compared: list[str] = (*FITTED, *PREDICTED),
-    end: float | None = None,
+    end: End = None,
     batches: int = 300,
     gusts: list[float] = (0.0, 2.0, 4.0, 8.0),
     simulations: int = 5,
-    out: Path | None = None,
+    out: Report = None,
 ) -> None:
     """Public flights of a Crazyflie 2.1 (NanoBench): identified alone and together, and predicted whole.
 
@@ -238,9 +238,7 @@ def print_shares(report: Row) -> None:
     print_table(title, ("flight", "rate", *headings), rows, width=180)
 
 
-def radio(
-    flights: Path | None = None, every: list[int] = (1, 10, 20, 40), end: float | None = None, out: Path | None = None
-) -> None:
+def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End = None, out: Report = None) -> None:
     """What does a radio do to an identification? A flight that was logged on board, with fewer of its commands.
 
     A radio brings each command as it was at one moment. The flight is one of `real_flight`, logged at 1 kHz. It is
@@ -272,7 +270,7 @@ def judged(path: Path, airframe: jaxos4.Airframe) -> Row:
     return row
 
 
-def verdicts(flights: Path | None = None, names: list[str] = tuple(AIRFRAMES), out: Path | None = None) -> None:
+def verdicts(flights: Flights = None, names: list[str] = tuple(AIRFRAMES), out: Out = None) -> None:
     """Which verdicts have moments of inertia on real flights, each identified alone; and do repeated flights agree?
 
     The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.

@@ -42,6 +42,14 @@ PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""
 DT = 0.01  # of a standard flight [s]
 CHUNK = 250  # flights in one call, limited by the memory for the derivatives of the residuals
+# Options of several scripts.
+Count = Annotated[int, typer.Option(help="Number of flights of each row or case.")]
+End = Annotated[float | None, typer.Option(help="Use recorded flights up to this time [s].")]
+Estimators = Annotated[list[str], typer.Option(help="Names of the estimators, as those of `jaxos4 estimate`.")]
+Flights = Annotated[Path | None, typer.Option(help="Folder of the recorded flights; by default $JAXOS4_FLIGHTS.")]
+Out = Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")]
+Report = Annotated[Path | None, typer.Option(help="JSON file for the results; written anew if it exists.")]
+Seed = Annotated[int, typer.Option(help="Random seed of flights, noise and starts.")]
 Folder = Annotated[Path, typer.Option(help="Folder of the results: a new one, or one of a study to be resumed.")]
 
 

@@ -6,7 +6,6 @@ truth. Flights are simulated with the model that is fitted (the inverse crime), 
 
 import functools
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -31,7 +30,11 @@ from experiments.shared import (
     ENDED,
     PARAMETERS,
     SPAN,
+    Count,
+    Estimators,
     Fit,
+    Out,
+    Seed,
     brackets_at,
     flight_keys,
     identify,
@@ -55,13 +58,13 @@ def accuracy(flights: int) -> str:
 
 
 def baselines(
-    flights: int = 200,
-    seed: int = 5,
+    flights: Count = 200,
+    seed: Seed = 5,
     channels: str = "rates",
-    estimators: list[str] = (),
+    estimators: Estimators = (),
     noises: list[str] = tuple(NOISES),
     scales: list[float] = (0.0, 0.1, 1.0, 10.0),
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """How do all estimators without a network perform, with their default settings, for each kind and scale of noise?
 
@@ -95,7 +98,7 @@ def baselines(
 
 
 def efficiency(
-    flights: int = 512, seed: int = 0, scale: float = 1.0, cases: list[str] = (), out: Path | None = None
+    flights: Count = 512, seed: Seed = 0, scale: float = 1.0, cases: list[str] = (), out: Out = None
 ) -> None:
     """How close do the shooting methods come to the Cramer-Rao bound?
 
@@ -124,14 +127,14 @@ def efficiency(
 
 
 def coverage(
-    flights: int = 2000,
-    seed: int = 11,
+    flights: Count = 2000,
+    seed: Seed = 11,
     model: str = "published",
     channels: str = "all",
-    estimators: list[str] = ("ibss", "hybrid", "output-error"),
+    estimators: Estimators = ("ibss", "hybrid", "output-error"),
     scales: list[float] = (0.1, 1.0, 10.0),
     steps: int = jaxos4.NetworkEstimator.steps,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """How often do 95 % intervals contain the truth, for the alphas and for the constants of the rigid body?
 
@@ -172,7 +175,7 @@ def coverage(
     print(f"Monte-Carlo error of each number: {100 * error:.2f} %.")
 
 
-def robust(flights: int = 256, seed: int = 13) -> None:
+def robust(flights: Count = 256, seed: Seed = 13) -> None:
     """How often do 95 % intervals contain the truth if the sensors' noise is coloured?
 
     IBSS identifies flights with Gauss-Markov noise. Intervals by the Cramer-Rao bound of white noise are compared with
@@ -237,7 +240,7 @@ def every_setting() -> dict[str, Setting]:
     }
 
 
-def defaults(flights: int = 64, seed: int = 7, settings: list[str] = (), out: Path | None = None) -> None:
+def defaults(flights: Count = 64, seed: Seed = 7, settings: list[str] = (), out: Out = None) -> None:
     """Are the estimators' defaults the best of their settings?
 
     Flights are identified with each value of a setting. The bound is that of the channels that the estimator sees.
@@ -269,12 +272,12 @@ def defaults(flights: int = 64, seed: int = 7, settings: list[str] = (), out: Pa
 
 def long_flight(
     duration: float = 60.0,
-    flights: int = 8,
-    seed: int = 3,
+    flights: Count = 8,
+    seed: Seed = 3,
     drifts: list[float] = (0.0, 1e-4, 1e-3),
     windows: list[int] = (1, 6, 30, 120),
-    estimators: list[str] = ("ibss", "output-error"),
-    out: Path | None = None,
+    estimators: Estimators = ("ibss", "output-error"),
+    out: Out = None,
 ) -> None:
     """How many windows does a long flight need if it drifts away from its model?
 

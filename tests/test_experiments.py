@@ -33,6 +33,23 @@ def test_usage(arguments, capsys):
 
 
 @pytest.mark.parametrize(
+    ("script", "texts"),
+    [
+        (
+            "closed_loop.run",
+            ["Number of flights", "Random seed of", "continued if it exists", "Names of the"],
+        ),
+        ("real_flight.run", ["Folder of the recorded flights", "up to this time", "written anew if it exists"]),
+    ],
+)
+def test_help_describes_the_common_options(script, texts, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    main([script, "--help"])
+    text = capsys.readouterr().out
+    assert all(each in text for each in texts)
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["nosuch.run"], "nosuch.run: no such script; give one of"),

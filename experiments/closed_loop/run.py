@@ -16,7 +16,6 @@ the whole flight fitted.
 
 import functools
 import time
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -26,6 +25,7 @@ import jaxos4
 from experiments.closed_loop.effects import DELAY, DT, LAG, LARGEST, VEHICLE, flights_of, stacked
 from experiments.fits import INERTIAS, given_airframe, identified, shares_of_truth, summary, whole
 from experiments.monte_carlo import LOST, Row, check_names, groups, plus_minus, print_table, product, results_of, study
+from experiments.shared import Count, Estimators, Out, Seed
 from jaxos4.design import standard_references
 from jaxos4.estimators import ESTIMATORS
 
@@ -120,14 +120,14 @@ def print_cases(title: str, rows: list[Row]) -> None:
 
 
 def main(
-    flights: int = 200,
+    flights: Count = 200,
     gusts: list[float] = (5.0, 10.0, 20.0),
     duration: float = 20.0,
-    seed: int = 16,
-    estimators: list[str] = ("equation-error", "output-error", "filter-error"),
+    seed: Seed = 16,
+    estimators: Estimators = ("equation-error", "output-error", "filter-error"),
     references: list[str] = ("random",),
     wrong: float = 0.25,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """Measure bias and coverage of moments of inertia over the strength of gusts.
 

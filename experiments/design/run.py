@@ -5,15 +5,13 @@ vehicles of the default bracket and for the airframe's vehicle alone. Its bounds
 inputs. Then IBSS identifies simulated flights of the designed input. The initial state is known.
 """
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxos4
 from experiments.monte_carlo import Column, Row, check_names, print_rows, product, study
-from experiments.shared import DT, SPAN, fit_noisy, scores, standard_problem
+from experiments.shared import DT, SPAN, Count, Out, Seed, fit_noisy, scores, standard_problem
 from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.models import MODELS
 
@@ -24,10 +22,10 @@ def main(
     models: list[str] = ("published", "corrected"),
     channels: list[str] = ("all", "rates"),
     widths: list[str] = ("default", "airframe"),
-    flights: int = 256,
+    flights: Count = 256,
     duration: float = 5.0,
-    seed: int = 0,
-    out: Path | None = None,
+    seed: Seed = 0,
+    out: Out = None,
 ) -> None:
     """Measure what designed inputs gain."""
     check_names("models", models, MODELS)

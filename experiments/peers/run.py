@@ -33,6 +33,7 @@ from experiments.monte_carlo import (
 )
 from experiments.peers.flights import REAL, Case, cases, real
 from experiments.peers.log import Fit, Log
+from experiments.shared import Count, Out, Seed
 from jaxos4.recording import Recording
 from jaxos4.results import NINETY_FIVE
 
@@ -151,15 +152,15 @@ def print_report(
 
 
 def main(
-    flights: int = 20,
+    flights: Count = 20,
     tuning: int = 1,
     duration: float = 20.0,
-    seed: int = 65,
+    seed: Seed = 65,
     only: list[str] | None = None,
     tools: list[str] = (OURS, *PEERS),
     recorded: list[str] = tuple(REAL),
     recordings: Path | None = None,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """Fit the same flights by each tool.
 

@@ -5,7 +5,6 @@ in double precision, and networks are trained in it. Estimators that see the rat
 """
 
 import io
-from pathlib import Path
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -15,7 +14,7 @@ import typer
 
 import jaxos4
 from experiments.monte_carlo import Column, Row, check_names, count_results, print_rows, product, write_report
-from experiments.shared import EFFICIENCY, Fit, brackets_around, identify, measure
+from experiments.shared import EFFICIENCY, Count, Estimators, Fit, Report, Seed, brackets_around, identify, measure
 from jaxos4._custom_types import as_float
 from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.networks import encode_network
@@ -46,13 +45,13 @@ def answers(network: bytes, name: str, *data: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def main(
-    flights: int = 256,
-    seed: int = 0,
-    estimators: list[str] = tuple(ESTIMATORS),
+    flights: Count = 256,
+    seed: Seed = 0,
+    estimators: Estimators = tuple(ESTIMATORS),
     scale: float = 1.0,
     known: Annotated[bool, typer.Option("--known/--free", help="Whether the initial state is known.")] = True,
     steps: int = jaxos4.NetworkEstimator.steps,
-    out: Path | None = None,
+    out: Report = None,
 ) -> None:
     """RMSE / Cramer-Rao bound of each estimator in double and in single precision."""
     check_names("estimators", estimators, ESTIMATORS)
