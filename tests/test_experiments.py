@@ -58,6 +58,7 @@ def test_help_describes_the_common_options(script, texts, capsys, monkeypatch):
         (["study.run", "nosuch.toml", "--out", "data"], "nosuch.toml"),
         (["efficiency.run", "--cases", "nosuch"], "--cases: no 'nosuch'; give one of published, all; "),
         (["defaults.run", "--settings", "nosuch"], "--settings: no 'nosuch'; give one of equation error, memory 0; "),
+        (["closed_loop.run", "--references", "nosuch"], "--references: no 'nosuch'; give one of random; designed; "),
         *(
             ([script, *place, "--estimators", "filter-eror"], "--estimators: no 'filter-eror'; give one of ibss")
             for script, *place in (

@@ -103,7 +103,7 @@ def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> Row:
 
 def print_cases(title: str, rows: list[Row]) -> None:
     """One line for each estimator, strength of gusts and moment of inertia; one without numbers if none has any."""
-    lines = [
+    lines: list[tuple[str, ...]] = [
         (
             *(f"{gust:g}", references, estimator, name, str(row["flights"]), plus_minus(row)),
             *(f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}", plus_minus(row, "efficiency", 1.0)),
@@ -135,6 +135,8 @@ def main(
     - `wrong`: Error of the given moments of inertia, as a share.
     """
     check_names("estimators", estimators, ESTIMATORS)
+    standard = standard_references(round(duration / DT) + 1, DT, LARGEST)
+    check_names("references", references, ("random", "designed", *standard))
 
     @functools.cache
     def flown(gust: float, references: str) -> list[jaxos4.Flight | None]:
