@@ -18,6 +18,7 @@ import typer
 
 from experiments.monte_carlo import machine
 from experiments.published import FOLDER, RECORDER, read, render
+from jaxos4.errors import InputError
 
 MODULES = ("studies", "standard_flights", "real_flights", "figures")  # of several scripts, by their names in `SCRIPTS`
 
@@ -48,7 +49,7 @@ def published(arguments: list[str]) -> str | None:
     place = arguments.index("--publish")
     name = arguments[place + 1] if place + 1 < len(arguments) else ""
     if not name.isidentifier():
-        raise SystemExit("--publish: needs a name of letters, digits and _.")
+        raise InputError("--publish: needs a name of letters, digits and _.")
     del arguments[place : place + 2]
     return name
 
@@ -57,7 +58,7 @@ def run(name: str, arguments: list[str]) -> None:
     """Runs a script with its arguments."""
     jax.config.update("jax_enable_x64", True)
     if name not in scripts():
-        raise SystemExit(f"{name}: no such script; give one of {', '.join(scripts())}, again or render.")
+        raise InputError(f"{name}: no such script; give one of {', '.join(scripts())}, again or render.")
     result = published(arguments)
     command = [name, *arguments]
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
@@ -82,17 +83,50 @@ def commands(names: list[str], folder: Path = FOLDER) -> dict[str, list[str]]:
 
 
 def again(names: list[str]) -> None:
-    """Computes published results once more, each in a process of its own."""
+    """Computes published results once more, each in a process of its own. Ends with 1 if a script failed."""
+    if not names:
+        raise InputError("again: no name; give names of files in experiments/results, without .json, or all.")
+    failed = False
     for name, arguments in commands(names).items():
         begin = time.perf_counter()
         ended = subprocess.run([sys.executable, "-m", "experiments", *arguments], check=False).returncode
         print(f"{name}: {time.perf_counter() - begin:.0f} s{f', ended with {ended}' if ended else ''}")
+        failed |= ended != 0
+    if failed:
+        raise SystemExit(1)
+
+
+def usage() -> str:
+    """The text of `--help`."""
+    return "\n".join(
+        (
+            "python -m experiments SCRIPT ...    runs a script; SCRIPT --help shows its options,",
+            "                                    --publish NAME makes a result file of its tables",
+            "python -m experiments again NAME    computes a published result once more; all: every one",
+            "python -m experiments render        writes the tables of the pages from the result files",
+            "",
+            "scripts:",
+            *(f"  {name}" for name in scripts()),
+        )
+    )
+
+
+def main(arguments: list[str]) -> None:
+    """Runs the command line. A user's mistake is one line, and ends with 2."""
+    try:
+        match arguments:
+            case [] | ["--help"]:
+                print(usage())
+            case ["render"]:
+                render()
+            case ["again", *names]:
+                again(names)
+            case [name, *options]:
+                run(name, options)
+    except (InputError, FileNotFoundError) as error:
+        print(InputError(str(error)), file=sys.stderr)
+        raise SystemExit(2) from None
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["render"]:
-        render()
-    elif sys.argv[1:2] == ["again"]:
-        again(sys.argv[2:])
-    else:
-        run(sys.argv[1] if len(sys.argv) > 1 else "none", sys.argv[2:])
+    main(sys.argv[1:])

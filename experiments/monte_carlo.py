@@ -16,6 +16,7 @@ from rich.table import Table
 
 import jaxos4
 from experiments.published import RECORDER, Table as Published, commit
+from jaxos4.errors import InputError
 from jaxos4.results import NINETY_FIVE
 
 Row = dict[str, Any]
@@ -154,6 +155,13 @@ def interval(value: Row | None, scale: float) -> str:
 def results_of(rows: list[Row]) -> str:
     """The results of flights as the text of a table cell."""
     return in_words(count_results(np.array([row["result"] for row in rows])))
+
+
+def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Refuses a name of an option that is not in its table, before anything is computed."""
+    known = list(known)
+    if wrong := [name for name in names if name not in known]:
+        raise InputError(f"--{option}: no {wrong[0]!r}; give one of {'; '.join(known)}.")
 
 
 def print_table(

@@ -103,10 +103,10 @@ RECORDER = Recorder()
 
 
 def read(name: str, folder: Path = FOLDER) -> Result:
-    """The published result of this name. Ends the script if there is none."""
+    """The published result of this name. `InputError`: there is none."""
     path = folder / f"{name}.json"
     if not path.is_file():
-        raise SystemExit(f"{name}: no such result in {folder}; run its script with --publish {name}.")
+        raise jaxos4.InputError(f"{name}: no such result in {folder}; run its script with --publish {name}.")
     return msgspec.json.decode(path.read_bytes(), type=Result)
 
 

@@ -11,13 +11,25 @@ import numpy as np
 
 import jaxos4
 from experiments.fits import INERTIAS, constants, identified
-from experiments.monte_carlo import Column, Row, interval, print_rows, print_table, product, study, text, write_report
+from experiments.monte_carlo import (
+    Column,
+    Row,
+    check_names,
+    interval,
+    print_rows,
+    print_table,
+    product,
+    study,
+    text,
+    write_report,
+)
 from experiments.public_flights.clocks import aligned
 from experiments.public_flights.gusts import measured_share, simulated
 from experiments.public_flights.rate_network import errors_of, trained
 from experiments.sample_times.run import VEHICLE as CINERAT
-from experiments.shared import flight_files
+from experiments.shared import End, Estimators, Flights, Out, Report, flight_files
 from experiments.verdicts.faults import thinned
+from jaxos4.estimators import ESTIMATORS
 from jaxos4.recording import Recording, read_recording
 from jaxos4.results import NINETY_FIVE
 
@@ -79,11 +91,11 @@ def skill_ahead(skill: Row | None) -> dict[str, tuple[float, float]]:
 
 
 def real_flight(
-    flights: Path | None = None,
-    end: float | None = None,
+    flights: Flights = None,
+    end: End = None,
     names: list[str] = ARPL_FLIGHTS,
-    estimators: list[str] = ("filter-error", "ibss"),
-    out: Path | None = None,
+    estimators: Estimators = ("filter-error", "ibss"),
+    out: Report = None,
 ) -> None:
     """Do flights of a real Crazyflie agree on its moments of inertia, and how well is the rest of a flight predicted?
 
@@ -94,6 +106,7 @@ def real_flight(
 
     `z` is the difference of two flights over its standard deviation; 99 % of such figures should be below 2.58.
     """
+    check_names("estimators", estimators, ESTIMATORS)
     paths = flight_files(flights, [f"arpl_crazyflie_{name}.csv" for name in names])
     recordings = {name: read_recording(path, ARPL) for name, path in zip(names, paths, strict=True)}
     groups = {name: [recording] for name, recording in recordings.items()}
@@ -133,15 +146,15 @@ def alone(recordings: list[Recording], end: float | None) -> Row:
 
 
 def public_flights(
-    flights: Path | None = None,
+    flights: Flights = None,
     fitted: list[str] = FITTED,
     predicted: list[str] = PREDICTED,
     compared: list[str] = (*FITTED, *PREDICTED),
-    end: float | None = None,
+    end: End = None,
     batches: int = 300,
     gusts: list[float] = (0.0, 2.0, 4.0, 8.0),
     simulations: int = 5,
-    out: Path | None = None,
+    out: Report = None,
 ) -> None:
     """Public flights of a Crazyflie 2.1 (NanoBench): identified alone and together, and predicted whole.
 
@@ -225,9 +238,7 @@ def print_shares(report: Row) -> None:
     print_table(title, ("flight", "rate", *headings), rows, width=180)
 
 
-def radio(
-    flights: Path | None = None, every: list[int] = (1, 10, 20, 40), end: float | None = None, out: Path | None = None
-) -> None:
+def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End = None, out: Report = None) -> None:
     """What does a radio do to an identification? A flight that was logged on board, with fewer of its commands.
 
     A radio brings each command as it was at one moment. The flight is one of `real_flight`, logged at 1 kHz. It is
@@ -259,11 +270,12 @@ def judged(path: Path, airframe: jaxos4.Airframe) -> Row:
     return row
 
 
-def verdicts(flights: Path | None = None, names: list[str] = tuple(AIRFRAMES), out: Path | None = None) -> None:
+def verdicts(flights: Flights = None, names: list[str] = tuple(AIRFRAMES), out: Out = None) -> None:
     """Which verdicts have moments of inertia on real flights, each identified alone; and do repeated flights agree?
 
     The airframe of each vehicle has the rotors where their centres were measured. Motion capture is not shifted.
     """
+    check_names("names", names, AIRFRAMES)
     paths = dict(zip(names, flight_files(flights, names), strict=True))
     rows = study(out, {}, product(flight=names), lambda flight: judged(paths[flight], AIRFRAMES[flight]))
     lines = []

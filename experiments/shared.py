@@ -23,6 +23,7 @@ from jaxos4._files import write_netcdf
 from jaxos4.analysis.evaluation import cramer_rao_bound
 from jaxos4.bracket import Bracket
 from jaxos4.cli.studies import run_with_bar
+from jaxos4.errors import InputError
 from jaxos4.estimate import AbstractEstimator, Estimate
 from jaxos4.excitation import multisine
 from jaxos4.flight import Flight
@@ -41,18 +42,28 @@ PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""
 DT = 0.01  # of a standard flight [s]
 CHUNK = 250  # flights in one call, limited by the memory for the derivatives of the residuals
+# Options of several scripts.
+Count = Annotated[int, typer.Option(help="Number of flights of each row or case.")]
+End = Annotated[float | None, typer.Option(help="Use recorded flights up to this time [s].")]
+Estimators = Annotated[list[str], typer.Option(help="Names of the estimators, as those of `jaxos4 estimate`.")]
+Flights = Annotated[Path | None, typer.Option(help="Folder of the recorded flights; by default $JAXOS4_FLIGHTS.")]
+Out = Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")]
+Report = Annotated[Path | None, typer.Option(help="JSON file for the results; written anew if it exists.")]
+Seed = Annotated[int, typer.Option(help="Random seed of flights, noise and starts.")]
 Folder = Annotated[Path, typer.Option(help="Folder of the results: a new one, or one of a study to be resumed.")]
 
 
 def flight_files(folder: Path | None, names: Iterable[str]) -> list[Path]:
-    """The files of recorded flights in a folder, by default `$JAXOS4_FLIGHTS`. Ends the script if one is missing."""
+    """The files of recorded flights in a folder, by default `$JAXOS4_FLIGHTS`. `InputError`: one is missing."""
     if folder is None and os.environ.get("JAXOS4_FLIGHTS"):
         folder = Path(os.environ["JAXOS4_FLIGHTS"])
-    paths = [] if folder is None else [folder / name for name in names]
-    missing = next((path.name for path in paths if not path.is_file()), None)
-    if folder is None or missing is not None:
-        raise SystemExit(f"--flights: no {missing or 'flights'} in {folder}: give the folder of the flights.")
-    return paths
+    advice = "give the folder of the flights, here or in the environment variable JAXOS4_FLIGHTS."
+    if folder is None:
+        raise InputError(f"--flights: no folder; {advice}")
+    names = list(names)
+    if missing := [name for name in names if not (folder / name).is_file()]:
+        raise InputError(f"--flights: no {missing[0]} in the folder {folder}; {advice}")
+    return [folder / name for name in names]
 
 
 def run_studies(studies: dict[str, Study], out: Path) -> None:

@@ -6,7 +6,6 @@ truth. Flights are simulated with the model that is fitted (the inverse crime), 
 
 import functools
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,14 +13,28 @@ import jax
 import numpy as np
 
 import jaxos4
-from experiments.monte_carlo import Column, Row, count_results, covered_error, print_rows, print_table, product, study
+from experiments.monte_carlo import (
+    Column,
+    Row,
+    check_names,
+    count_results,
+    covered_error,
+    print_rows,
+    print_table,
+    product,
+    study,
+)
 from experiments.shared import (
     DT,
     EFFICIENCY,
     ENDED,
     PARAMETERS,
     SPAN,
+    Count,
+    Estimators,
     Fit,
+    Out,
+    Seed,
     brackets_at,
     flight_keys,
     identify,
@@ -45,13 +58,13 @@ def accuracy(flights: int) -> str:
 
 
 def baselines(
-    flights: int = 200,
-    seed: int = 5,
+    flights: Count = 200,
+    seed: Seed = 5,
     channels: str = "rates",
-    estimators: list[str] = (),
+    estimators: Estimators = (),
     noises: list[str] = tuple(NOISES),
     scales: list[float] = (0.0, 0.1, 1.0, 10.0),
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """How do all estimators without a network perform, with their default settings, for each kind and scale of noise?
 
@@ -65,6 +78,8 @@ def baselines(
         _, (row, _) = (fit.row(flights, seed, kind) for _ in range(2))  # the first call compiles
         return row
 
+    check_names("noises", noises, NOISES)
+    check_names("estimators", estimators, ESTIMATORS)
     chosen = estimators or [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
     every = product(noise=noises, scale=scales, estimator=chosen)
     trials = (trial for trial in every if trial["scale"] or trial["noise"] == noises[0])
@@ -83,7 +98,7 @@ def baselines(
 
 
 def efficiency(
-    flights: int = 512, seed: int = 0, scale: float = 1.0, cases: list[str] = (), out: Path | None = None
+    flights: Count = 512, seed: Seed = 0, scale: float = 1.0, cases: list[str] = (), out: Out = None
 ) -> None:
     """How close do the shooting methods come to the Cramer-Rao bound?
 
@@ -100,6 +115,8 @@ def efficiency(
         "published, all, 4 windows, output error": Fit(jaxos4.OutputError(), **windows),
     }
 
+    check_names("cases", cases, every)
+
     def row_of(case: str) -> Row:
         return every[case]._replace(scale=scale).row(flights, seed)[0]
 
@@ -110,20 +127,22 @@ def efficiency(
 
 
 def coverage(
-    flights: int = 2000,
-    seed: int = 11,
+    flights: Count = 2000,
+    seed: Seed = 11,
     model: str = "published",
     channels: str = "all",
-    estimators: list[str] = ("ibss", "hybrid", "output-error"),
+    estimators: Estimators = ("ibss", "hybrid", "output-error"),
     scales: list[float] = (0.1, 1.0, 10.0),
     steps: int = jaxos4.NetworkEstimator.steps,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """How often do 95 % intervals contain the truth, for the alphas and for the constants of the rigid body?
 
     All flights have one true vehicle. The constants Ix, Iy, Iz, J_R are fitted to the alphas of each flight and their
     covariance. `steps`: training steps of the hybrid's network.
     """
+    check_names("model", [model], MODELS)
+    check_names("estimators", estimators, ESTIMATORS)
     vehicle, error = MODELS[model](jaxos4.OS4), np.sqrt(0.95 * 0.05 / flights)
 
     @functools.cache
@@ -156,7 +175,7 @@ def coverage(
     print(f"Monte-Carlo error of each number: {100 * error:.2f} %.")
 
 
-def robust(flights: int = 256, seed: int = 13) -> None:
+def robust(flights: Count = 256, seed: Seed = 13) -> None:
     """How often do 95 % intervals contain the truth if the sensors' noise is coloured?
 
     IBSS identifies flights with Gauss-Markov noise. Intervals by the Cramer-Rao bound of white noise are compared with
@@ -221,12 +240,13 @@ def every_setting() -> dict[str, Setting]:
     }
 
 
-def defaults(flights: int = 64, seed: int = 7, settings: list[str] = (), out: Path | None = None) -> None:
+def defaults(flights: Count = 64, seed: Seed = 7, settings: list[str] = (), out: Out = None) -> None:
     """Are the estimators' defaults the best of their settings?
 
     Flights are identified with each value of a setting. The bound is that of the channels that the estimator sees.
     """
     every = every_setting()
+    check_names("settings", settings, every)
 
     @functools.cache
     def least_costs(*flown) -> np.ndarray:
@@ -252,12 +272,12 @@ def defaults(flights: int = 64, seed: int = 7, settings: list[str] = (), out: Pa
 
 def long_flight(
     duration: float = 60.0,
-    flights: int = 8,
-    seed: int = 3,
+    flights: Count = 8,
+    seed: Seed = 3,
     drifts: list[float] = (0.0, 1e-4, 1e-3),
     windows: list[int] = (1, 6, 30, 120),
-    estimators: list[str] = ("ibss", "output-error"),
-    out: Path | None = None,
+    estimators: Estimators = ("ibss", "output-error"),
+    out: Out = None,
 ) -> None:
     """How many windows does a long flight need if it drifts away from its model?
 
@@ -265,6 +285,7 @@ def long_flight(
     deviation `drifts`. The model has no term for this factor. The simulated body rates drift away from the measured
     ones, and the drift grows with the length of a window.
     """
+    check_names("estimators", estimators, ESTIMATORS)
     model, compared = jaxos4.PublishedOS4(jaxos4.OS4), (0, 2, 3, 5, 7)  # identifiable parameters that are not 0
     recorded = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=duration), dt=DT)
     noise = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)

@@ -12,13 +12,83 @@ from helpers import how_we_compile
 from small_experiments import plot, result_of
 
 from experiments import figures, shared
-from experiments.__main__ import main_of, scripts
+from experiments.__main__ import again, main, main_of, scripts
+from experiments.closed_loop.run import print_cases
 from experiments.published import RECORDER, read
 from experiments.real_flights import agreement
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
+
+
+# The command line.
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_usage(arguments, capsys):
+    main(arguments)
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("again NAME", "render", *scripts()))
+
+
+@pytest.mark.parametrize(
+    ("script", "texts"),
+    [
+        (
+            "closed_loop.run",
+            ["Number of flights", "Random seed of", "continued if it exists", "Names of the"],
+        ),
+        ("real_flight.run", ["Folder of the recorded flights", "up to this time", "written anew if it exists"]),
+    ],
+)
+def test_help_describes_the_common_options(script, texts, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    main([script, "--help"])
+    text = capsys.readouterr().out
+    assert all(each in text for each in texts)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nosuch.run"], "nosuch.run: no such script; give one of"),
+        (["again"], "again: no name; give names of files in"),
+        (["again", "nosuch"], "nosuch: no such result in"),
+        (["study.run", "nosuch.toml", "--out", "data"], "nosuch.toml"),
+        (["efficiency.run", "--cases", "nosuch"], "--cases: no 'nosuch'; give one of published, all; "),
+        (["defaults.run", "--settings", "nosuch"], "--settings: no 'nosuch'; give one of equation error, memory 0; "),
+        (["closed_loop.run", "--references", "nosuch"], "--references: no 'nosuch'; give one of random; designed; "),
+        *(
+            ([script, *place, "--estimators", "filter-eror"], "--estimators: no 'filter-eror'; give one of ibss")
+            for script, *place in (
+                *(["baselines.run"], ["coverage.run"], ["long_flight.run"], ["precision.run"], ["real_flight.run"]),
+                *(["closed_loop.run"], ["closed_loop.effects"], ["rotorpy.run", "flights"]),
+            )
+        ),
+    ],
+)
+def test_mistake_is_one_line(arguments, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    text = capsys.readouterr().err
+    assert end.value.code == 2
+    assert message in text
+    assert text.count("\n") == 1
+
+
+def test_again_ends_with_the_failure_of_a_script(monkeypatch):
+    monkeypatch.setattr("experiments.__main__.commands", lambda names: {name: ["nosuch.run"] for name in names})
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: subprocess.CompletedProcess([], 2))
+    with pytest.raises(SystemExit) as end:
+        again(["one"])
+    assert end.value.code == 1
+
+
+def test_case_whose_flights_are_all_refused_has_a_line():
+    row = {"gust": 5.0, "references": "random", "estimator": "filter-error", "result": "refused"}
+    print_cases("refused flights", [row, row])
+    assert RECORDER.tables[-1].rows == [["5", "random", "filter-error", *[""] * 7, "2 refused"]]
 
 
 # Studies: experiments with a specification.

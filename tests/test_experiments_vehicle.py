@@ -33,10 +33,12 @@ def test_flights_that_disagree_are_found():
 
 def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
-    with pytest.raises(SystemExit, match="--flights: no flights in None: give"):
+    with pytest.raises(jaxos4.InputError, match="--flights: no folder; give .* JAXOS4_FLIGHTS"):
         main_of("real_flight.run")(out=tmp_path / "out")
-    with pytest.raises(SystemExit, match="--flights: no arpl_crazyflie_rollpitch.csv in"):
+    with pytest.raises(jaxos4.InputError, match="--flights: no arpl_crazyflie_rollpitch.csv in"):
         main_of("real_flight.run")(flights=tmp_path, out=tmp_path / "out")
+    with pytest.raises(jaxos4.InputError, match="--flights: no nanobench/B8_star_fast_rep1.csv in"):
+        main_of("public_flights.run")(flights=tmp_path, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -6,6 +6,7 @@ import jaxos4
 from experiments.__main__ import commands
 from experiments.monte_carlo import machine, print_table
 from experiments.published import FOLDER, PAGES, Recorder, read, rendered, shown
+from jaxos4.errors import InputError
 
 MINOR = jaxos4.__version__.split(".")[:2]
 
@@ -53,7 +54,7 @@ def test_results_are_computed_again_by_their_own_commands(tmp_path):
     one = ["small.run", "--cases", "two words", "--flights", "1", "--publish", "one"]
     assert commands(["one"], tmp_path) == {"one": one}
     assert list(commands(["all"], tmp_path)) == ["one", "two"]
-    with pytest.raises(SystemExit, match="three: no such result"):
+    with pytest.raises(InputError, match="three: no such result"):
         commands(["three"], tmp_path)
 
 

@@ -5,7 +5,6 @@ contender is timed only if it reaches the same optimum. Each runs in a process o
 alternate, so that each ratio compares laps under the same load of the machine.
 """
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from experiments.benchmarks.contenders import FITS, NETWORKS, QUICK, SHOTS, Cont
 from experiments.benchmarks.race import line_up, race, ratios
 from experiments.benchmarks.tables import print_report
 from experiments.monte_carlo import machine, write_report
+from experiments.shared import Report, Seed
 from jaxos4.flight import Inputs
 
 DT = 0.01
@@ -169,8 +169,8 @@ def main(
     grow_parameters: list[int] = (1, 2, 4, 8),
     network_steps: int = 3000,
     simulations: int = 10_000,
-    seed: int = 0,
-    out: Path | None = None,
+    seed: Seed = 0,
+    out: Report = None,
 ) -> None:
     """Time all contenders, and print tables.
 

@@ -19,7 +19,9 @@ import numpy as np
 
 import jaxos4
 from experiments.fits import WRONG_INERTIA, fit, given_airframe, print_summaries
-from experiments.monte_carlo import Row, product, study
+from experiments.monte_carlo import Row, check_names, product, study
+from experiments.shared import Count, Estimators, Out, Seed
+from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import STANDARD_TONES
 
 VEHICLE = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
@@ -173,17 +175,19 @@ def _fly(
 
 
 def main(
-    flights: int = 50,
+    flights: Count = 50,
     effects: list[str] = (*EFFECTS, ALL),
     duration: float = 20.0,
-    seed: int = 22,
-    estimators: list[str] = ("filter-error",),
-    out: Path | None = None,
+    seed: Seed = 22,
+    estimators: Estimators = ("filter-error",),
+    out: Out = None,
 ) -> None:
     """Measure errors and coverage for each effect.
 
     - `effects`: The cases.
     """
+    check_names("effects", effects, (*EFFECTS, ALL))
+    check_names("estimators", estimators, ESTIMATORS)
     flown = functools.cache(lambda kind: flights_of(kind, flights, duration, seed))
 
     def row_of(kind: str, estimator: str, flight: int) -> Row:

@@ -16,7 +16,6 @@ the whole flight fitted.
 
 import functools
 import time
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -25,8 +24,10 @@ import numpy as np
 import jaxos4
 from experiments.closed_loop.effects import DELAY, DT, LAG, LARGEST, VEHICLE, flights_of, stacked
 from experiments.fits import INERTIAS, given_airframe, identified, shares_of_truth, summary, whole
-from experiments.monte_carlo import LOST, Row, groups, plus_minus, print_table, product, results_of, study
+from experiments.monte_carlo import LOST, Row, check_names, groups, plus_minus, print_table, product, results_of, study
+from experiments.shared import Count, Estimators, Out, Seed
 from jaxos4.design import standard_references
+from jaxos4.estimators import ESTIMATORS
 
 WINDOW = 62  # samples
 # Standard deviation of the gyro's noise [rad/s].
@@ -101,8 +102,8 @@ def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> Row:
 
 
 def print_cases(title: str, rows: list[Row]) -> None:
-    """One line for each estimator, strength of gusts and moment of inertia."""
-    lines = [
+    """One line for each estimator, strength of gusts and moment of inertia; one without numbers if none has any."""
+    lines: list[tuple[str, ...]] = [
         (
             *(f"{gust:g}", references, estimator, name, str(row["flights"]), plus_minus(row)),
             *(f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}", plus_minus(row, "efficiency", 1.0)),
@@ -111,25 +112,31 @@ def print_cases(title: str, rows: list[Row]) -> None:
         for (gust, references, estimator), some in groups(rows, "gust", "references", "estimator").items()
         for name, row in summary(some).items()
     ]
+    for about, some in groups(rows, "gust", "references", "estimator").items():
+        if not summary(some):
+            lines.append((f"{about[0]:g}", *about[1:], *[""] * 7, results_of(some)))
     figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
     print_table(title, ("gust", "references", "estimator", "", *figures), lines)
 
 
 def main(
-    flights: int = 200,
+    flights: Count = 200,
     gusts: list[float] = (5.0, 10.0, 20.0),
     duration: float = 20.0,
-    seed: int = 16,
-    estimators: list[str] = ("equation-error", "output-error", "filter-error"),
+    seed: Seed = 16,
+    estimators: Estimators = ("equation-error", "output-error", "filter-error"),
     references: list[str] = ("random",),
     wrong: float = 0.25,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """Measure bias and coverage of moments of inertia over the strength of gusts.
 
     - `references`: random, designed, or a standard: 3211, doublet, ...
     - `wrong`: Error of the given moments of inertia, as a share.
     """
+    check_names("estimators", estimators, ESTIMATORS)
+    standard = standard_references(round(duration / DT) + 1, DT, LARGEST)
+    check_names("references", references, ("random", "designed", *standard))
 
     @functools.cache
     def flown(gust: float, references: str) -> list[jaxos4.Flight | None]:

@@ -5,32 +5,34 @@ vehicles of the default bracket and for the airframe's vehicle alone. Its bounds
 inputs. Then IBSS identifies simulated flights of the designed input. The initial state is known.
 """
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxos4
-from experiments.monte_carlo import Column, Row, print_rows, product, study
-from experiments.shared import DT, SPAN, fit_noisy, scores, standard_problem
+from experiments.monte_carlo import Column, Row, check_names, print_rows, product, study
+from experiments.shared import DT, SPAN, Count, Out, Seed, fit_noisy, scores, standard_problem
 from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.models import MODELS
+
+WIDTHS = {"default": 1.0, "airframe": 1e-3}  # of brackets, in default half-widths
 
 
 def main(
     models: list[str] = ("published", "corrected"),
     channels: list[str] = ("all", "rates"),
     widths: list[str] = ("default", "airframe"),
-    flights: int = 256,
+    flights: Count = 256,
     duration: float = 5.0,
-    seed: int = 0,
-    out: Path | None = None,
+    seed: Seed = 0,
+    out: Out = None,
 ) -> None:
     """Measure what designed inputs gain."""
+    check_names("models", models, MODELS)
+    check_names("widths", widths, WIDTHS)
 
     def row_of(model: str, channels: str, vehicles: str) -> Row:
-        subject, width = MODELS[model](jaxos4.OS4), {"default": 1.0, "airframe": 1e-3}[vehicles]
+        subject, width = MODELS[model](jaxos4.OS4), WIDTHS[vehicles]
         bracket = jaxos4.Bracket.around(subject.alpha, width * np.asarray(subject.half_width))
         task = {"bracket": bracket, "duration": duration, "dt": DT, "channels": channels, "start_is_known": True}
         found = jaxos4.design_input(subject, **task, compare=True, key=seed)

@@ -5,7 +5,6 @@ Each error is in units of the Cramer-Rao bound at that flight's own truth.
 
 import os
 import time
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -14,8 +13,20 @@ import numpy as np
 
 import jaxos4
 from experiments.benchmarks.worker import peak_mib
-from experiments.monte_carlo import Column, Row, count_results, print_rows, print_table, write_report
-from experiments.shared import CHUNK, DT, EFFICIENCY, ENDED, brackets_at, identify, measure, standard_problem
+from experiments.monte_carlo import Column, Row, check_names, count_results, print_rows, print_table, write_report
+from experiments.shared import (
+    CHUNK,
+    DT,
+    EFFICIENCY,
+    ENDED,
+    Count,
+    Report,
+    Seed,
+    brackets_at,
+    identify,
+    measure,
+    standard_problem,
+)
 from jaxos4.study import metrics
 
 LEVELS = (0.5, 0.9, 0.99)
@@ -112,15 +123,15 @@ def amortised(network: jaxos4.TrainedNetwork, channels: str, flights: int) -> di
 
 
 def main(
-    flights: int = 2000,
-    seed: int = 7,
+    flights: Count = 2000,
+    seed: Seed = 7,
     networks: list[str] = tuple(NETWORKS),
     noises: list[float] = (0.1, 1.0, 10.0),
     channels: str = "all",
     steps: int | None = None,
     many: int = 10_000,
     separate: bool = True,
-    out: Path | None = None,
+    out: Report = None,
 ) -> None:
     """Networks, hybrid and IBSS on flights drawn over the whole bracket. Networks are trained with seed 0.
 
@@ -129,6 +140,7 @@ def main(
     - `steps`: Training steps of all networks; each has its own number without it.
     - `separate`: Train one network for each noise scale too.
     """
+    check_names("networks", networks, NETWORKS)
     report: Row = {"flights": flights, "seed": seed, "version": jaxos4.__version__, "load": os.getloadavg()}
     report |= {"rows": [], "training_seconds": {}}
 

@@ -21,6 +21,7 @@ from experiments.fits import INERTIAS, constants, fit, given_airframe, identifie
 from experiments.monte_carlo import (
     LOST,
     Row,
+    check_names,
     continued,
     covered_error,
     fill,
@@ -32,6 +33,7 @@ from experiments.monte_carlo import (
 )
 from experiments.peers.flights import REAL, Case, cases, real
 from experiments.peers.log import Fit, Log
+from experiments.shared import Count, Out, Seed
 from jaxos4.recording import Recording
 from jaxos4.results import NINETY_FIVE
 
@@ -150,15 +152,15 @@ def print_report(
 
 
 def main(
-    flights: int = 20,
+    flights: Count = 20,
     tuning: int = 1,
     duration: float = 20.0,
-    seed: int = 65,
+    seed: Seed = 65,
     only: list[str] | None = None,
     tools: list[str] = (OURS, *PEERS),
     recorded: list[str] = tuple(REAL),
     recordings: Path | None = None,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """Fit the same flights by each tool.
 
@@ -169,7 +171,11 @@ def main(
     report = continued(out, {"duration": duration, "seed": seed, "tuning": tuning}, "rows")
     for part in ("chosen", "real"):
         report.setdefault(part, [])
-    every, peers = cases(), installed([name for name in tools if name in PEERS])
+    every = cases()
+    check_names("only", only or (), every)
+    check_names("tools", tools, (OURS, *PEERS))
+    check_names("recorded", recorded, (*REAL, "-"))
+    peers = installed([name for name in tools if name in PEERS])
     wanted = only or list(every)
 
     @functools.lru_cache(maxsize=4)

@@ -5,7 +5,6 @@ in double precision, and networks are trained in it. Estimators that see the rat
 """
 
 import io
-from pathlib import Path
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -14,8 +13,8 @@ import numpy as np
 import typer
 
 import jaxos4
-from experiments.monte_carlo import Column, Row, count_results, print_rows, product, write_report
-from experiments.shared import EFFICIENCY, Fit, brackets_around, identify, measure
+from experiments.monte_carlo import Column, Row, check_names, count_results, print_rows, product, write_report
+from experiments.shared import EFFICIENCY, Count, Estimators, Fit, Report, Seed, brackets_around, identify, measure
 from jaxos4._custom_types import as_float
 from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.networks import encode_network
@@ -46,15 +45,16 @@ def answers(network: bytes, name: str, *data: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def main(
-    flights: int = 256,
-    seed: int = 0,
-    estimators: list[str] = tuple(ESTIMATORS),
+    flights: Count = 256,
+    seed: Seed = 0,
+    estimators: Estimators = tuple(ESTIMATORS),
     scale: float = 1.0,
     known: Annotated[bool, typer.Option("--known/--free", help="Whether the initial state is known.")] = True,
     steps: int = jaxos4.NetworkEstimator.steps,
-    out: Path | None = None,
+    out: Report = None,
 ) -> None:
     """RMSE / Cramer-Rao bound of each estimator in double and in single precision."""
+    check_names("estimators", estimators, ESTIMATORS)
     on_rates = Fit(jaxos4.IBSS(), channels="rates", known=known)
     fits = {name: on_rates._replace(channels=ESTIMATORS[name].looks_at, scale=scale) for name in estimators}
     problems = {name: fit.problem for name, fit in fits.items()}

@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 import jaxos4
 from experiments.monte_carlo import plus_minus, print_table, statistics
 from experiments.rotorpy.flights import VEHICLE, fly
+from experiments.shared import Count, Seed
 
 # Time constants of poles, then of zeros, at which searches start, in samples.
 STARTS = {1: [(125.0, 2.0)], 2: [(125.0, 5.0, 2.0, 2.0), (125.0, 5.0, 1.1, 5.0)]}
@@ -60,7 +61,7 @@ def thrust_of(flight: jaxos4.Flight) -> np.ndarray:
     return float(VEHICLE.thrust_coefficient) / float(VEHICLE.mass) * np.square(flight.omega).sum(axis=1)
 
 
-def main(flights: int = 20, gust: float = 1.5, duration: float = 20.0, seed: int = 48) -> None:
+def main(flights: Count = 20, gust: float = 1.5, duration: float = 20.0, seed: Seed = 48) -> None:
     """Fit the scale of the thrust of RotorPy's Hummingbird in gusts.
 
     - `gust`: Standard deviation of the wind along each axis [m/s].

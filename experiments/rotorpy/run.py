@@ -13,8 +13,10 @@ import numpy as np
 
 import jaxos4
 from experiments.fits import INERTIAS, fit, given_airframe, print_summaries, whole
-from experiments.monte_carlo import Row, print_table, product, study
+from experiments.monte_carlo import Row, check_names, print_table, product, study
 from experiments.rotorpy.flights import GUSTS, VEHICLE, quad_params, recorded
+from experiments.shared import Count, Estimators, Out, Seed
+from jaxos4.estimators import ESTIMATORS
 
 QUANTITIES = ("position", "velocity", "attitude", "rates")
 
@@ -59,13 +61,13 @@ def prediction(flights: list[jaxos4.Flight], i: int, horizon: float = 0.5) -> Ro
 
 def main(
     recordings: Path,
-    flights: int = 20,
+    flights: Count = 20,
     kinds: list[str] = tuple(GUSTS),
     duration: float = 20.0,
-    seed: int = 21,
-    estimators: list[str] = ("filter-error", "ibss", "hybrid"),
+    seed: Seed = 21,
+    estimators: Estimators = ("filter-error", "ibss", "hybrid"),
     predict: bool = False,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """Fly and identify RotorPy's Hummingbird.
 
@@ -73,6 +75,8 @@ def main(
     - `kinds`: calm, gusty.
     - `predict`: Identify each gusty flight, with motion capture, and predict the next 0.5 s ahead.
     """
+    check_names("kinds", kinds, GUSTS)
+    check_names("estimators", estimators, ESTIMATORS)
     settings = {"flights": flights, "duration": duration, "seed": seed}
     if predict:
         known, trials = read(recordings, settings, "gusty", captured=True), product(flight=range(flights))

@@ -19,6 +19,7 @@ import numpy as np
 import jaxos4
 from experiments.fits import identified
 from experiments.monte_carlo import Row, groups, plus_minus, print_table, product, results_of, statistics, study
+from experiments.shared import Count, Out
 from jaxos4.recording import Recording
 
 VEHICLE = jaxos4.load_airframe(Path(__file__).with_name("cinerat.toml"))
@@ -95,7 +96,7 @@ def print_cases(rows: list[Row], true: dict[str, float]) -> None:
 
 
 def main(
-    flights: int = 40,
+    flights: Count = 40,
     logged: str = "speeds",
     sample_times: list[float] = SAMPLE_TIMES,
     dt: float = 0.004,
@@ -103,7 +104,7 @@ def main(
     gust: float = 1.0,
     duration: float = 60.0,
     seed: int = 0,
-    out: Path | None = None,
+    out: Out = None,
 ) -> None:
     """Measure errors and coverage at several sample times.
 

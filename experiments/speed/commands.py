@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from experiments.monte_carlo import print_table
-from experiments.shared import flight_files
+from experiments.shared import Flights, flight_files
 
 REAL = "arpl_crazyflie_rollpitch.csv"
 PREPARED = {
@@ -49,11 +49,10 @@ def seconds_of(command: str, folder: Path, cache: Path) -> float:
     return time.perf_counter() - begin
 
 
-def main(repeats: int = 3, commands: list[str] = COMMANDS, flights: Path | None = None) -> None:
+def main(repeats: int = 3, commands: list[str] = COMMANDS, flights: Flights = None) -> None:
     """Time commands in processes of their own.
 
     - `repeats`: Number of runs once more. `commands`: The commands.
-    - `flights`: Folder of real flights; $JAXOS4_FLIGHTS by default.
     """
     real = flight_files(flights, [REAL])[0] if flights or os.environ.get("JAXOS4_FLIGHTS") else None
     chosen = [*commands, *([f"estimate {REAL} --airframe crazyflie --report real.html"] if real else [])]

@@ -5,7 +5,6 @@ Double precision, on the device that JAX finds. Each time is the median of runs 
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,7 +12,7 @@ import numpy as np
 
 import jaxos4
 from experiments.monte_carlo import Column, Row, machine, print_rows, write_report
-from experiments.shared import DT, standard_problem
+from experiments.shared import DT, Report, standard_problem
 from jaxos4.simulation import METHODS
 
 STEPS = 500  # of the standard flight
@@ -52,7 +51,7 @@ def slopes(problem: jaxos4.ShootingProblem, trials: jax.Array) -> tuple[jax.Arra
     return jax.vmap(lambda x: jax.jvp(problem.cost, (x,), (x,)))(trials)
 
 
-def main(batch: int = 4096, repeats: int = 7, out: Path | None = None) -> None:
+def main(batch: int = 4096, repeats: int = 7, out: Report = None) -> None:
     """Measure computing times.
 
     - `batch`: Number of shots in one call.

@@ -22,6 +22,7 @@ import numpy as np
 import jaxos4
 from experiments.fits import INERTIAS, identified
 from experiments.monte_carlo import Row, plus_minus, print_table, product, share, statistics, study
+from experiments.shared import Out
 from experiments.verdicts.run import FAR, SURE
 from jaxos4.identification.physical import physical_quantities
 from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED
@@ -180,9 +181,7 @@ def print_tables(rows: list[Row]) -> None:
     print_table("damping and drag", headings, linearised(rows))
 
 
-def main(
-    truth: Path | None = None, cases: list[str] = (), sag: int = 0, clean: int = 0, out: Path | None = None
-) -> None:
+def main(truth: Path | None = None, cases: list[str] = (), sag: int = 0, clean: int = 0, out: Out = None) -> None:
     """Judge answers against the truth of an independent simulator.
 
     - `truth`: Folder of the simulator; $JAXOS4_TRUTH by default.

@@ -7,7 +7,6 @@ for the right model and for wrong ones.
 
 import functools
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ import numpy as np
 import jaxos4
 from experiments.closed_loop.effects import DELAY, EFFECTS, GUST, LAG, VEHICLE, flights_of
 from experiments.monte_carlo import LOST, Row, print_table, share, study
+from experiments.shared import Count, Out, Seed
 from experiments.verdicts.run import agreements, print_responses
 from jaxos4.airframe import MOTIONS
 from jaxos4.analysis.frequency_response import Agreement
@@ -49,13 +49,13 @@ def answered(flight: jaxos4.Flight, kind: str) -> Row:
 
 
 def main(
-    flights: int = 200,
+    flights: Count = 200,
     gusts: list[float] = (2.5, 5.0, 10.0),
     effects: list[str] = DESCRIBED,
     sample_times: list[str] = ("4 ms", "8 ms"),
     duration: float = 20.0,
-    seed: int = 48,
-    out: Path | None = None,
+    seed: Seed = 48,
+    out: Out = None,
 ) -> None:
     """Count how often the intervals of the frequency response hold 1 at the true parameters.
 

@@ -9,14 +9,14 @@ cause is right if a fault of `faults.py` is named as it is, wherever the answer 
 
 import functools
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 import jaxos4
 from experiments.closed_loop.effects import ALL, EFFECTS, VEHICLE, flights_of
 from experiments.fits import INERTIAS, given_airframe, identified, shares_of_truth
-from experiments.monte_carlo import LOST, Row, plus_minus, print_table, share, statistics, study
+from experiments.monte_carlo import LOST, Row, check_names, plus_minus, print_table, share, statistics, study
+from experiments.shared import Count, Out, Seed
 from experiments.verdicts.faults import FAULTS, Fault
 from jaxos4 import FrequencyResponse
 from jaxos4.airframe import MOTIONS
@@ -137,19 +137,20 @@ def print_tables(rows: list[Row]) -> None:
 
 
 def main(
-    flights: int = 100,
+    flights: Count = 100,
     spoiled: int = 20,
     rotorpy: int = 20,
     cases: list[str] = tuple(CASES),
     duration: float = 20.0,
-    seed: int = 48,
-    out: Path | None = None,
+    seed: Seed = 48,
+    out: Out = None,
 ) -> None:
     """Count right and wrong verdicts for each effect, and for each fault in three sizes.
 
     - `spoiled`: Number of flights of each fault and size.
     - `rotorpy`: Number of flights of RotorPy, calm and in gusts.
     """
+    check_names("cases", cases, CASES)
     numbers = {name: spoiled if CASES[name][1] else rotorpy if name in ROTORPY else flights for name in cases}
     flown = functools.cache(lambda kind: good_flights(kind, max(numbers.values()), duration, seed))
     # An interrupted report has about as many flights of each case.
