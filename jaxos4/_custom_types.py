@@ -49,7 +49,7 @@ def as_list(array: np.ndarray) -> list[Any]:
 
 
 def as_array(kind: Any, values: Any) -> np.ndarray:
-    """The array of a field of `Arrays` from lists of numbers, for `dec_hook` of msgspec.
+    """The array of a field of `Arrays` from lists of numbers. Raises `ValueError`.
 
     A missing number is NaN. An array without rows has the number of axes of the field, with the lengths that are known.
     """

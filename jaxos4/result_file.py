@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
@@ -11,6 +11,10 @@ import numpy as np
 from ._custom_types import as_array
 from ._files import read_json
 from .airframe import MOTIONS, airframe_from_table
+from .analysis.diagnostics import Correlations
+from .analysis.frequency_response import FrequencyResponse
+from .analysis.prediction import Predictions
+from .analysis.traces import Traces
 from .errors import InputError, named, of_schema, shortened
 from .identification.results import (
     APART,
@@ -29,12 +33,19 @@ _REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run 
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
 _EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
 _FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
+# What holds arrays. msgspec would compare their axes with those of the caller's arrays, in his context of jaxtyping.
+_ARRAYS = {"traces": Traces, "correlations": Correlations, "response": FrequencyResponse}
+_ARRAYS |= {"predictions": Predictions, "trajectories": Predictions}
 
 
 def _file_of(kind: type[Identification]) -> type[msgspec.Struct]:
     """The fields of a file of this kind of result: those of the result, with what has another form there."""
     own = [
-        (x.name, x.type, _FIELD(name=x.encode_name, default=x.default, default_factory=x.default_factory))
+        (
+            x.name,
+            dict[str, Any] | None if x.name in _ARRAYS else x.type,
+            _FIELD(name=x.encode_name, default=x.default, default_factory=x.default_factory),
+        )
         for x in msgspec.structs.fields(kind)
         if x.name not in APART
     ]
@@ -56,11 +67,14 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
     kind = VehicleIdentification if is_vehicle else OS4Identification
     with named(path):
         try:
-            fields = msgspec.structs.asdict(msgspec.convert(value, _FILES[kind], dec_hook=as_array))
+            fields = msgspec.structs.asdict(msgspec.convert(value, _FILES[kind]))
         except msgspec.ValidationError as error:
             raise InputError(f"not a result: {shortened(of_schema(error), 200)}; {_REMEDY}.") from None
         if fields["airframe"] is None:
             raise InputError(f"{fields['result']}: {_EMPTY}")
+        for name in _ARRAYS.keys() & fields.keys():
+            if fields[name] is not None:
+                fields[name] = _with_arrays(_ARRAYS[name], fields[name], name)
         constants, tests = {}, {}
         for name, each in fields.pop("constants").items():
             (constants if isinstance(each, Constant) else tests)[name] = each
@@ -69,6 +83,27 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
         if problem := next(_problems(found, [*tests]), None):
             raise InputError(f"{problem}; {_AGAIN}")
     return found
+
+
+def _with_arrays(kind: type[msgspec.Struct], table: Any, place: str) -> Any:
+    """What holds arrays, or others that do, from lists of numbers by name. Raises `InputError`."""
+    if not isinstance(table, dict):
+        raise InputError(f"`{place}`: is not a table of arrays; {_REMEDY}.")
+    fields: dict[str, Any] = {}
+    hints: dict[str, Any] = get_type_hints(kind)
+    if missing := [name for name in hints if name not in table]:
+        raise InputError(f"`{place}`: object missing required field `{missing[0]}`; {_REMEDY}.")
+    for name, hint in hints.items():
+        value, own = table[name], f"{place}.{name}"
+        if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+            fields[name] = _with_arrays(hint, value, own)
+            continue
+        try:
+            fields[name] = as_array(hint, value) if hasattr(hint, "dtypes") else float(value)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"`{own}`: {error}; {_AGAIN}") from None
+    with named(f"`{place}`"):
+        return kind(**fields)
 
 
 def vehicle_result(found: Identification | str | os.PathLike[str]) -> VehicleIdentification:

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, refused
+from jaxtyping import Float, jaxtyped
 from matplotlib.figure import Figure
 from pages import printed, says, stands_alone, words
 from rich.console import Console
@@ -401,3 +402,13 @@ def test_a_damaged_result_ends_in_one_line(tmp_path):
     few = identified_vehicle(**FULL, predictions=synthetic_predictions(6)).to_dict()
     tables = [json.dumps(few), json.dumps(identified_flight().to_dict())]
     survives_strange_values(shown, path, tables, examples=25)
+
+
+def test_a_result_is_read_in_a_function_whose_axes_have_the_same_names(tmp_path):
+    """Those of the caller's arrays, and those of predictions and trajectories, are not compared."""
+    found = identified_vehicle(**FULL)
+    found = msgspec.structs.replace(found, trajectories=found.predictions.thinned(2))
+    with jaxtyped("context"):
+        assert isinstance(np.zeros(9), Float[np.ndarray, " starts"])
+        again = written(found, tmp_path / "found.json")
+    assert again.trajectories.start.size < again.predictions.start.size
