@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -140,9 +141,15 @@ def in_words(counts: dict[str, int]) -> str:
 
 
 def plus_minus(row: Row, name: str = "mean", scale: float = 100.0) -> str:
-    """A figure of `statistics` with its Monte-Carlo error, by default in percent, as the text of a table cell."""
-    error = row[f"{name}_error"]
-    return number(scale * row[name]) + ("" if error is None else f" +- {number(scale * error, 2)}")
+    """A figure of `statistics` with its Monte-Carlo error, by default in percent, as the text of a table cell.
+
+    The error has two digits, and the figure as many decimals.
+    """
+    value, error = scale * row[name], row[f"{name}_error"]
+    if error is None or not 0 < error < math.inf:
+        return number(value) + ("" if error is None else f" +- {number(scale * error, 2)}")
+    decimals = max(1 - math.floor(math.log10(scale * error)), 0)
+    return f"{value:.{decimals}f} +- {scale * error:.{decimals}f}"
 
 
 def interval(value: Row | None, scale: float) -> str:
