@@ -23,6 +23,7 @@ from jaxos4.identification.results import (
     PredictionSkill,
     RateSkill,
 )
+from jaxos4.identification.search import Optimum
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import read_recording
 from jaxos4.results import RESULTS
@@ -173,7 +174,7 @@ def test_a_disturbance_larger_than_the_control_is_named():
     problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12))
     counts = map(jnp.asarray, (0.0, 1, 1))
     estimate = jaxos4.Estimate(model.alpha, jnp.eye(8), jnp.zeros(3), *counts, RESULTS.successful)
-    nothing = {"optimum": None, "widened": {}}
+    nothing = {"optimum": Optimum._make(len(Optimum._fields) * [None]), "widened": {}}
     answer = VehicleAnswer(problem, estimate, np.ones(8), 1, disturbances=gusts, **nothing)
     weak = dominated(answer)
     assert list(weak) == ["pitch"]

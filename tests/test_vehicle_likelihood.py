@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -197,13 +196,15 @@ def test_the_noise_of_an_accelerometer_is_at_least_its_count_and_half_of_its_sec
 )
 def test_the_search_begins_again_near_the_usual_delay(delay, cost, chosen, searches):
     """The cost has a minimum in the delay for each row of a log: 17 ms instead of 0 made Ix 12 % too large."""
-    likelihood, starts = dataclasses.replace(problem_of(flown()), answers_within=np.array(False)), []
+    likelihood, starts = dataclasses.replace(problem_of(flown()), answers_within=jnp.array(False)), []
     names = likelihood.problem.unknowns.names
 
     def estimate(delay, cost):
         values = np.zeros(likelihood.unknowns.count)
         values[names.index("rotor_delay")] = delay
-        return SimpleNamespace(parameters=values, cost=np.array(cost), result=RESULTS.successful, rollouts=5)
+        counts = jnp.asarray(cost), jnp.asarray(5), jnp.asarray(1)
+        covariance = jnp.eye(values.size)
+        return jaxos4.Estimate(jnp.asarray(values), covariance, jnp.zeros(0), *counts, RESULTS.successful)
 
     def estimator(problem):
         place = names.index("rotor_delay")
