@@ -33,7 +33,7 @@ _REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run 
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
 _EMPTY = "holds no estimate; see what `jaxos4 estimate` says about the flight."
 _FIELD: Any = msgspec.field  # its types do not know that a field can have neither default
-# What holds arrays. msgspec would compare their axes with those of the caller's arrays, in his context of jaxtyping.
+# Fields that hold arrays. msgspec would check them in the caller's context of jaxtyping, with the axes of its arrays.
 _ARRAYS = {"traces": Traces, "correlations": Correlations, "response": FrequencyResponse}
 _ARRAYS |= {"predictions": Predictions, "trajectories": Predictions}
 
@@ -72,9 +72,9 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
             raise InputError(f"not a result: {shortened(of_schema(error), 200)}; {_REMEDY}.") from None
         if fields["airframe"] is None:
             raise InputError(f"{fields['result']}: {_EMPTY}")
-        for name in _ARRAYS.keys() & fields.keys():
-            if fields[name] is not None:
-                fields[name] = _with_arrays(_ARRAYS[name], fields[name], name)
+        for name, holder in _ARRAYS.items():  # in this order: of several faults, the same one is named each time
+            if fields.get(name) is not None:
+                fields[name] = _with_arrays(holder, fields[name], name)
         constants, tests = {}, {}
         for name, each in fields.pop("constants").items():
             (constants if isinstance(each, Constant) else tests)[name] = each
@@ -86,7 +86,7 @@ def read_result(path: str | os.PathLike[str]) -> Identification:
 
 
 def _with_arrays(kind: type[msgspec.Struct], table: Any, place: str) -> Any:
-    """What holds arrays, or others that do, from lists of numbers by name. Raises `InputError`."""
+    """A struct of arrays, or of such structs, from lists of numbers by name. Raises `InputError`."""
     if not isinstance(table, dict):
         raise InputError(f"`{place}`: is not a table of arrays; {_REMEDY}.")
     fields: dict[str, Any] = {}

@@ -170,18 +170,20 @@ def design(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -
     """
     progress("compiling the search")
     searched, searches = task, _started(jax.random.fold_in(key, 2), task)
+    best = searches[0]
     for stage, penalty in enumerate(_PENALTIES):
         if stage == 2:
-            searches = [min(searches, key=lambda search: search.cost)]
+            searches = [best]
         searches = [_minimise(searched, search, as_float(penalty)) for search in searches]
-        if not np.isfinite(min(search.cost for search in searches)):
+        best = min(searches, key=lambda search: search.cost)
+        if not np.isfinite(best.cost):
             remedy = "narrow the bracket, or give stronger gusts for a vehicle under a controller"
             raise InputError(f"the accuracy after these {task.kind} is not a finite number; {remedy}.")
         progress(f"search, stage {stage + 1} of {len(_PENALTIES)}")
         if stage:
-            searched = searched.watching(min(searches, key=lambda search: search.cost).coefficients)
+            searched = searched.watching(best.coefficients)
     progress(f"flying {task.vehicles} vehicles")
-    flown = {"designed": task.flown(np.asarray(searches[0].coefficients))}
+    flown = {"designed": task.flown(np.asarray(best.coefficients))}
     progress("bounds")
     judged = task.judged(flown | (task.standard() if compare else {}))
     return Design(task, judged.pop("designed"), judged)
