@@ -101,7 +101,7 @@ def test_what_a_simulator_lacks_and_what_is_replaced_or_does_not_vary_is_noted(w
     del values["alpha8"], values["yaw_damping"]
     apart = {"alpha1": held(-0.7), "alpha8": held(3.5e4), "yaw_damping": held(0.0)}
     notes = export_vehicle(read_result(write(vehicle_result(values, held=apart))), "mujoco", samples=1).notes
-    for name, width in (("Iz", "1.26e-05 kg m^2"), ("yaw_damping", "2")):  # 40 %, and the bracket of the term
+    for name, width in (("Iz", "1.26e-05 kg m^2"), ("yaw_damping", "0.5")):  # 40 %, and the bracket of the term
         assert any(note.startswith(f"{name}: varies by {width} (std): a guess") for note in notes)
     assert "alpha4: replaced by the values that follow from Ix, Iy, Iz" in notes
     (of_rotors,) = [note for note in notes if "alpha2" in note]

@@ -84,14 +84,14 @@ def test_ten_thousand_vehicles_have_the_mean_and_the_covariance_of_the_estimate(
 
 
 def test_reservations_widen_the_quantity_that_they_concern(write):
-    """By the share of an inertia, and of the half-width of a parameter's bracket: 5 1/s, 5 1/s and 2 1/s."""
+    """By the share of an inertia, and of the half-width of a parameter's bracket: 5 1/s, 5 1/s and 0.5 1/s."""
     plain = stds(read_result(write(vehicle_result())))
     doubts = [doubt("Ix", 0.06), doubt("Ix", 0.08), doubt("Iy"), doubt("damping", 0.1), doubt("Iz", 0.03, 0.5)]
     found = read_result(write(vehicle_result(doubts=doubts)))
     added = {name: std**2 - plain[name] ** 2 for name, std in stds(found).items()}
     ix, iy, _ = found.vehicle.inertia
     expected = {"Ix": (0.1 * ix) ** 2, "Iy": (0.05 * iy) ** 2}  # 5 % if nothing says how far
-    expected |= {"roll_damping": 0.25, "pitch_damping": 0.25, "yaw_damping": 0.04}
+    expected |= {"roll_damping": 0.25, "pitch_damping": 0.25, "yaw_damping": 0.0025}
     for name, variance in added.items():
         assert variance == pytest.approx(expected.get(name, 0.0), abs=1e-9 * plain[name] ** 2), name
     widened = {name for name, row in found.gaussian.items() if row["origin"] != "the estimate"}

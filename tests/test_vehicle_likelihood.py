@@ -110,7 +110,7 @@ def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(rows, place):
 
 @pytest.mark.parametrize(
     ("logged", "commanded", "shortest"),
-    [(0.001, False, 0.002), (0.002, False, 0.002), (0.005, False, 0.005), (0.001, True, 0.004), (0.002, True, 0.004)],
+    [(0.001, False, 0.002), (0.002, False, 0.002), (0.005, False, 0.005), (0.001, True, 0.002), (0.002, True, 0.004)],
 )
 def test_the_shortest_samples_hold_single_rows_of_measured_speeds(logged, commanded, shortest):
     assert finest(logged, commanded=commanded) == pytest.approx(shortest)

@@ -209,10 +209,10 @@ _OWN: dict[str, Term] = {
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
-        # By thrust about roll and pitch, by drag about yaw.
+        # By thrust about roll and pitch. About yaw by the drag of rotors, about 0.3 1/s, times m r^2 / Iz, about 2.
         tuple(
-            Parameter(f"{x}_damping", "1/s", half_width, nonnegative=True, contradiction=_DAMPED)
-            for x, half_width in zip(MOTIONS, (5.0, 5.0, 2.0), strict=True)
+            Parameter(f"{x}_damping", "1/s", half_width, center=center, nonnegative=True, contradiction=_DAMPED)
+            for x, center, half_width in zip(MOTIONS, (0.0, 0.0, 0.5), (5.0, 5.0, 0.5), strict=True)
         ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
         quantity="damping",

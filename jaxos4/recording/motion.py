@@ -205,33 +205,46 @@ def _response(flown: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndar
 LEVELS = 2.0, 8.0
 
 
-def velocity_of(recording: Recording, *, forgets: float = 2.0) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
+FOLLOWS = 0.5  # s; dead reckoning follows a measured velocity, whose noise would hide the drag, with this time constant
+# s; dead reckoning forgets its velocity with these time constants. Where motion along z has a period of a few seconds,
+# what is forgotten in 2 s looks like thrust: z_drag is 15 % too large. Without attitude, 20 s sum up too many errors.
+FORGETS, FORGETS_WITHOUT_ATTITUDE = 20.0, 2.0
+
+
+def velocity_of(
+    recording: Recording, *, forgets: float | None = None
+) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
     """The motion of a vehicle through still air; `None` if the log does not say enough.
 
-    A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
-    this sum, and slow changes of the velocity, are forgotten; torque and thrust answer faster ones.
+    The velocity is dead reckoned from gyro and accelerometer, v' = force - g up - rates x v, and follows the measured
+    velocity if there is one. Without, slow errors of this sum, and slow changes of the velocity, are forgotten; torque
+    and thrust answer faster ones.
 
     **Arguments:**
 
     - `recording`: of one stretch.
-    - `forgets`: dead reckoning forgets its velocity with this time constant [s].
+    - `forgets`: time constant with which a velocity that is not measured is forgotten [s].
 
     **Returns:** the velocity along the body's axes [m/s], and the upright direction in these axes by each time
     constant. Both are the same if the attitude was measured.
     """
     angles, velocity = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY))
     to_body = None if angles is None else rotations_to_body(angles)
+    up, measured = None if to_body is None else to_body[:, :, 2], None
     if to_body is not None and velocity is not None:
-        return np.einsum("tij,tj->ti", to_body, velocity), (to_body[:, :, 2], to_body[:, :, 2])
+        measured = np.einsum("tij,tj->ti", to_body, velocity)
     rates, force = _gapless(recording, RATES), recording.specific_force
     if rates is None or force is None or np.isnan(force).all(axis=0).any():
-        return None
+        return None if measured is None or up is None else (measured, (up, up))
     force = filled(force)
-    if to_body is None:
-        up, slow = (_upright(rates, force, recording.dt, level) for level in LEVELS)
+    if up is None:
+        fast, slow = (_upright(rates, force, recording.dt, level) for level in LEVELS)
     else:
-        up = slow = to_body[:, :, 2]
-    return _dead_reckoned(rates, force, up, recording.dt, forgets), (up, slow)
+        fast = slow = up
+    if measured is not None:
+        return _dead_reckoned(rates, force, fast, recording.dt, FOLLOWS, measured), (fast, slow)
+    forgets = forgets or (FORGETS_WITHOUT_ATTITUDE if up is None else FORGETS)
+    return _dead_reckoned(rates, force, fast, recording.dt, forgets, np.zeros(force.shape)), (fast, slow)
 
 
 def measures_velocity(recording: Recording) -> bool:
@@ -266,18 +279,23 @@ def _dead_reckoned(
     force: Float[np.ndarray, "samples 3"],
     up: Float[np.ndarray, "samples 3"],
     dt: float,
-    forgets: float,
+    follows: float,
+    velocity: Float[np.ndarray, "samples 3"],
 ) -> Float[np.ndarray, "samples 3"]:
-    """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays."""
+    """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays.
+
+    It is drawn to a given `velocity` with the time constant `follows` [s].
+    """
     push = force - GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
-    kept, (vx, vy, vz), velocities = math.exp(-dt / forgets), (0.0, 0.0, 0.0), []
-    for (p, q, r), (ax, ay, az) in zip(rates.tolist(), push.tolist(), strict=True):
+    kept = math.exp(-dt / follows)
+    drawn, (vx, vy, vz), velocities = (1 - kept) * velocity, velocity[0].tolist(), []
+    for (p, q, r), (ax, ay, az), (x, y, z) in zip(rates.tolist(), push.tolist(), drawn.tolist(), strict=True):
         velocities.append((vx, vy, vz))
         vx, vy, vz = (
-            kept * (vx + dt * (ax - q * vz + r * vy)),
-            kept * (vy + dt * (ay - r * vx + p * vz)),
-            kept * (vz + dt * (az - p * vy + q * vx)),
+            kept * (vx + dt * (ax - q * vz + r * vy)) + x,
+            kept * (vy + dt * (ay - r * vx + p * vz)) + y,
+            kept * (vz + dt * (az - p * vy + q * vx)) + z,
         )
     return np.array(velocities)
 

@@ -31,7 +31,8 @@ _NEARLY = 1.01  # sample times that differ by less than this factor count as equ
 WINDOW = 0.25  # s
 MIN_SAMPLES = 4  # of a window
 # The shortest sample by default [s]. A fast controller responds to single rows of a log, which a mean does not hold: in
-# samples of 4 ms instead of 2, Ix is 1 % and the damping 0.2 /s larger. Motors hide the difference from commands.
+# samples of 4 ms instead of 2, Ix is 1 to 3 % and the damping 0.2 /s larger. Commands of a log without two rows in 2 ms
+# hold too little of the controller to gain from that.
 SHORTEST, SHORTEST_OF_COMMANDS = 0.002, 0.004
 LONGEST = 0.032  # s; the longest sample at which an answer is compared with that of shorter ones
 # A given sample time becomes a multiple of the log's if that changes it by less than this share.
@@ -268,7 +269,7 @@ def finest(
     slowest: float, sample_time: float | None = None, *, commanded: bool = False, predicted: bool = False
 ) -> float:
     """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: of the logs."""
-    default = SHORTEST_OF_COMMANDS if commanded else SHORTEST
+    default = SHORTEST_OF_COMMANDS if commanded and 2 * slowest > SHORTEST * _NEARLY else SHORTEST
     shortest = max(default if sample_time is None else sample_time, slowest)
     whole = max(round(shortest / slowest), 1) * slowest  # samples of whole rows
     is_near = sample_time is None or abs(whole - shortest) < WHOLE * shortest
