@@ -49,7 +49,8 @@ DIVERGED = {"result": "nonfinite_trajectory"}
 )
 def test_the_text_of_a_flight_warns_and_is_short_without_an_answer(changes, said):
     says(printed(identified_flight(**changes)), said)
-    assert "`window`" not in printed(identified_flight(**DIVERGED, estimator="rls"))
+    for other in ("rls", "AnEstimatorOfYourOwn"):
+        assert "`window`" not in printed(identified_flight(**DIVERGED, estimator=other))
     assert printed(identified_flight(result="bracket_invalid")) == ""
     assert printed(identified_vehicle(verdicts={}, **DIVERGED)) == "note: t is not uniform"
 

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
+from ..flight import SIGNALS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities, possible
@@ -34,8 +35,12 @@ _SIGNIFICANCE = 0.01
 _COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
 
 _COMMANDS = "of full scale (commands)"
-_UNITS = {"p q r": "rad/s", "phi theta psi": "rad", "x y z": "m", "vx vy vz": "m/s", "ax ay az": "m/s^2"}
-_UNITS |= {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
+# The unit of channels that are shown together.
+_STATES = "p q r", "phi theta psi", "x y z", "vx vy vz"
+_OTHERS = [name for name, signal in SIGNALS.items() if signal.columns and name != "states"]
+_UNITS = {names: SIGNALS["states"].columns[names.split()[0]] for names in _STATES}
+_UNITS |= {" ".join(SIGNALS[name].columns): next(iter(SIGNALS[name].columns.values())) for name in _OTHERS}
+_UNITS["rotor1 rotor2 rotor3 rotor4"] = "rad/s"
 
 Section = Iterator[str | Listing]
 
@@ -108,7 +113,8 @@ def notes_of(found: Identification) -> list[str]:
 def _failure(found: Identification) -> Section:
     if found.result != "nonfinite_trajectory" or found.is_vehicle:
         return
-    shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
+    kind = ESTIMATORS.get(found.estimator)
+    shoots = kind is not None and (kind.shoots or kind.needs_network)
     yield (
         "No estimate: the model's trajectory diverged wherever the search went. The vehicle may do something that "
         f"the model lacks{' (try `window`, or a shorter one)' if shoots else ''}, or the airframe's constants "
