@@ -13,14 +13,14 @@ from ..flight import SIGNALS, SPEED_NAMES
 from ..rotations import euler_angles
 from .messages import ANGLES
 from .table import LogPath, Table, listed, quoted, refuse
-from .values import COLUMNS, PWM, PWM_ZERO, Quantity
+from .values import COLUMNS, PWM, PWM_ZERO, ColumnLimits
 
 ColumnsGiven = LogPath | Mapping[str, Any] | None
 """A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
 
 PRESETS = {path.stem: path for path in sorted(Path(__file__).with_name("presets").glob("*.toml"))}
 QUATERNION = ("qw", "qx", "qy", "qz")
-_QUATERNION = Quantity("of a quaternion", -math.inf, math.inf, "")
+_QUATERNION = ColumnLimits("of a quaternion", -math.inf, math.inf, "")
 _COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
 _VECTORS = [tuple(signal.columns) for signal in SIGNALS.values() if len(signal.columns) == 3]
 _ALONG_YZ = [name for vector in _VECTORS for name in vector[1:]]

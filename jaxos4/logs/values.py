@@ -17,8 +17,8 @@ from .sampling import filled
 from .table import Recording, Table
 
 
-class Quantity(NamedTuple):
-    """The numbers that a column can hold.
+class ColumnLimits(NamedTuple):
+    """The unit of a column, and the numbers that it can hold.
 
     - `unit`: of the column. `others`: units in which a log may have it, and their factors to `unit`.
     - `least`, `largest`: what lies beyond is impossible: out of reach of any quadrotor, but not of a wrong unit.
@@ -50,23 +50,23 @@ _PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
 _OF_UNIT = {  # of the signals of a flight
     each.unit: each
     for each in (
-        Quantity("m", -1e6, 1e6, _POSITION, others={"cm": 0.01, "mm": 1e-3}),
-        Quantity("m/s", -1e3, 1e3, _VELOCITY, others={"cm/s": 0.01, "mm/s": 1e-3}),
-        Quantity("rad/s", -60.0, 60.0, "it looks like deg/s: divide by 57.3", others=_TURNING),
-        Quantity("rad", -1e4, 1e4, "it looks like degrees: divide by 57.3", others={"deg": _DEGREE}),
-        Quantity("m/s^2", -1e3, 1e3, _FORCE, others={"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}),
-        Quantity("V", -200.0, 200.0, _VOLTAGE, others={"mV": 1e-3}, zero=False),
+        ColumnLimits("m", -1e6, 1e6, _POSITION, others={"cm": 0.01, "mm": 1e-3}),
+        ColumnLimits("m/s", -1e3, 1e3, _VELOCITY, others={"cm/s": 0.01, "mm/s": 1e-3}),
+        ColumnLimits("rad/s", -60.0, 60.0, "it looks like deg/s: divide by 57.3", others=_TURNING),
+        ColumnLimits("rad", -1e4, 1e4, "it looks like degrees: divide by 57.3", others={"deg": _DEGREE}),
+        ColumnLimits("m/s^2", -1e3, 1e3, _FORCE, others={"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}),
+        ColumnLimits("V", -200.0, 200.0, _VOLTAGE, others={"mV": 1e-3}, zero=False),
     )
 }
 COLUMNS = {
-    "t": Quantity("s", -1e11, 1e11, _TIME, others={"ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
-    **dict.fromkeys(SPEED_NAMES, Quantity("rad/s", 0, 1e5, _SPEED, _SIGN, others=_TURNING)),
-    **dict.fromkeys(COMMAND_NAMES, Quantity("of full scale", 0, 1, _COMMAND, others={"%": 0.01, PWM: 1e-3})),
+    "t": ColumnLimits("s", -1e11, 1e11, _TIME, others={"ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
+    **dict.fromkeys(SPEED_NAMES, ColumnLimits("rad/s", 0, 1e5, _SPEED, _SIGN, others=_TURNING)),
+    **dict.fromkeys(COMMAND_NAMES, ColumnLimits("of full scale", 0, 1, _COMMAND, others={"%": 0.01, PWM: 1e-3})),
     **{name: _OF_UNIT[unit] for signal in SIGNALS.values() for name, unit in signal.columns.items()},
 }
 """The columns that a log can have: the time, the rotors, and those of the signals of a flight."""
 _RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
-PITCH = {"theta": Quantity("rad", -_RIGHT_ANGLE, _RIGHT_ANGLE, _PITCH)}
+PITCH = {"theta": ColumnLimits("rad", -_RIGHT_ANGLE, _RIGHT_ANGLE, _PITCH)}
 """The pitch of a log: one that was not read from a file may be any number."""
 
 
@@ -84,7 +84,7 @@ def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " sample
 
 
 def without_impossible(
-    table: Table, limits: Mapping[str, Quantity] = COLUMNS, *, most: float = 0.01, farthest: float = 10.0
+    table: Table, limits: Mapping[str, ColumnLimits] = COLUMNS, *, most: float = 0.01, farthest: float = 10.0
 ) -> Table:
     """The table without the values outside of `limits`, or `dropped`: they count as not measured.
 

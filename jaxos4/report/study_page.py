@@ -10,7 +10,7 @@ from markupsafe import Markup
 from .._files import check_writable, write_file
 from ..logs.table import counted
 from ..study import metrics
-from . import one_flight, study_tables
+from . import study_of_one_flight, study_tables
 from .page import Section, folded, picture, table, text, write_page
 from .panels import Figure, Line, Panel, Scale, across, spread
 from .study_tables import ScenarioData, best_estimators, bounds, error_unit, names, positive_scales, scenarios
@@ -107,7 +107,7 @@ def _about(dataset: xr.Dataset) -> str:
         "jaxos4 estimate FLIGHT --report shows those of a flight."
     )
     about = f"Identification of a quadrotor's parameters from simulated, noisy flights: {', '.join(sizes)}."
-    return about + of_one * one_flight.is_of_one(dataset)
+    return about + of_one * study_of_one_flight.is_of_one(dataset)
 
 
 def _trouble(dataset: xr.Dataset) -> list[Markup]:
@@ -127,8 +127,8 @@ def _trouble(dataset: xr.Dataset) -> list[Markup]:
 def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: bool) -> list[Section]:
     """The sections of one scenario."""
     number, label, data = scenario
-    of_one, estimators = one_flight.is_of_one(data), names(data, "estimator")
-    tables = {"estimates": one_flight.estimates(data)} if of_one else {}
+    of_one, estimators = study_of_one_flight.is_of_one(data), names(data, "estimator")
+    tables = {"estimates": study_of_one_flight.estimates(data)} if of_one else {}
     tables |= study_tables.scenario_tables(data)
     differ = "; ".join(f"{', '.join(who)} see {seen}" for seen, who in study_tables.channels_by_estimator(data).items())
     differ = f" Not of the same channels: {differ}" if "; " in differ else ""
@@ -151,7 +151,7 @@ def _scenario(scenario: ScenarioData, figures: Mapping[str, Figure], has_zero: b
 
     first = []
     if of_one:
-        outcomes = one_flight.outcomes(data)
+        outcomes = study_of_one_flight.outcomes(data)
         first.append(text(outcomes) if len(outcomes) > 1 else text(outcomes[0], "verdict"))
         first += [drawn("intervals"), shown("estimates")]
     elif best := best_estimators(data):
@@ -188,7 +188,11 @@ def _end(specification: str) -> list[Markup]:
 
 def draw(scenario: ScenarioData, *, several: bool = False) -> dict[str, Figure]:
     """The figures whose data are present. `several`: their names end with the scenario's number."""
-    kinds = {"intervals": one_flight.intervals} if one_flight.is_of_one(scenario.data) else SCENARIO_FIGURES
+    kinds = (
+        {"intervals": study_of_one_flight.intervals}
+        if study_of_one_flight.is_of_one(scenario.data)
+        else SCENARIO_FIGURES
+    )
     found = {name: make(scenario.data) for name, make in kinds.items()}
     suffix = f"-{scenario.number}" if several else ""
     return {name: figure._replace(stem=f"{name}{suffix}") for name, figure in found.items() if figure is not None}
