@@ -178,7 +178,7 @@ def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Cons
                 RESERVATION,
                 f"from {agreement.low:g} to {agreement.high:g} Hz, the vehicle {verb} {_compared(ratio)} the "
                 f"model (95 %: {low:.2f} to {high:.2f} times)",
-                f"fly more {axis.motion}, or look at its frequency response for what the model lacks",
+                f"fly more {axis.motion}, or look at its frequency response for effects that the model lacks",
                 {axis.inertia: Move(share, share * row.estimate / row.std)},
             )
 

@@ -282,7 +282,7 @@ def _flat(constants: Mapping[str, Constant]) -> Iterator[Issue]:
 
 
 def _rotor_inertia(table: Mapping[str, ParameterEstimate], iz: Constant) -> Iterator[Issue]:
-    """The rotors' inertia by their gyroscopic torque in roll and pitch, if it contradicts that by their yaw reaction.
+    """A difference between the rotors' inertia from their gyroscopic torques and from their reaction in yaw.
 
     The first is alpha2 / alpha3, with alpha2 = J_R / Ix and alpha3 = 1 / Ix. The second is the reaction, J_R / Iz,
     over alpha8. They agree if Iz is right.

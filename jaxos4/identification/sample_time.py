@@ -194,7 +194,7 @@ def _agree(row: SampleTime, other: SampleTime) -> bool:
 
 
 def _less_certain(row: SampleTime, other: SampleTime) -> bool:
-    """Whether another sample time knows Ix or Iy clearly better."""
+    """Whether Ix or Iy is clearly more certain at the other sample time."""
     both = {ROLL.inertia, PITCH.inertia} & row.constants.keys() & other.constants.keys()
     return any(row.constants[name].std > WIDER * other.constants[name].std for name in both)
 
