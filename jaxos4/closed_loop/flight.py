@@ -1,4 +1,4 @@
-"""A flight in closed loop: the true vehicle, its controller, and what its sensors log."""
+"""A flight in closed loop: the true vehicle, its controller, and the log of its sensors."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -29,13 +29,13 @@ def fly_closed_loop(
 
     - `references`: roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, of shape (samples,
       4).
-    - `dt`: the sample time of the log [s]. The controller runs `loop.log_every` times in it.
-    - `key`: for the gusts and the noise.
+    - `dt`: the sample time of the log [s]. The controller runs `loop.log_every` times in each sample.
+    - `key`: random key of the gusts and the noise.
     - `substeps`: Runge-Kutta steps of the physics in each sample, a multiple of `loop.log_every`.
 
     **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands that
-    act from sample k on, or the speed of each rotor at sample k. After a failure (`result`) measurements are NaN,
-    speeds 0.
+    act from sample k on, or the speed of each rotor at sample k. After a failure (`result`), measurements are NaN and
+    speeds are 0.
 
     **Raises:** `ValueError` that names the argument.
     """
@@ -68,7 +68,7 @@ def fly_standard(
 
 
 class _Acting(NamedTuple):
-    """Rotors with the vertical gust, Omega_r', gusts of p', q', r', and wind along the body's axes during a step."""
+    """Forcing by rotors and vertical gust, Omega_r', gusts of p', q', r', and wind along the body's axes in a step."""
 
     rotors: Forcing
     spin_up: Scalar
@@ -121,7 +121,8 @@ def _physics(loop: ClosedLoop) -> tuple[Callable[[BodyMotion, _Acting], BodyMoti
 class _Drawn(NamedTuple):
     """The random numbers of a flight, in rows for each run of the controller.
 
-    `gusts` with the constant torque, `winds`, `noise` of gyro, attitude and accelerometer, `own`: of a second gyro.
+    `gusts` include the constant torque. `noise` is that of gyro, attitude and accelerometer, `own` that of the
+    controller's gyro.
     """
 
     gusts: Float[Array, "*runs ends 4"]
@@ -131,7 +132,7 @@ class _Drawn(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """The state between two runs of the controller. Row k + 1 of `commands` is that of run k."""
+    """The state between two runs of the controller. Row k + 1 of `commands` holds the command of run k."""
 
     motion: BodyMotion
     speeds: Float[Array, "4"]
@@ -164,7 +165,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
     allocation = mixer.T @ invert(mixer @ mixer.T)  # the mixer's inverse, without a call of LAPACK
     hover_cube = jnp.asarray(airframe.hover_speed) ** 3
-    # A command acts `late` runs after its own, and in the first `part` of a run the one before it still acts.
+    # A command acts `late` runs after its own. In the first `part` of a run, the command before it still acts.
     late = jnp.floor(loop.rotor_delay / period).astype(int)
     part = loop.rotor_delay / period - late
 
@@ -213,7 +214,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
 
 
 def _hovering(loop: ClosedLoop, allocation: Array, runs: int) -> _Carry:
-    """Before the first run: level and at rest, with rotors that carry the weight."""
+    """The state before the first run: level and at rest, with rotors that carry the weight."""
     airframe, zero = loop.airframe, jnp.zeros(())
     weight = as_float(airframe.mass * airframe.gravity)
     hover, _ = _speeds(allocation, jnp.zeros(3), weight, airframe.max_rotor_speed)
@@ -234,7 +235,7 @@ def _control(
     integral: PerAxis,
     dt: Scalar,
 ) -> tuple[Float[Array, "4"], PerAxis]:
-    """The commands [rad/s] of one run, and the integrators after it. `seen`: the body rates that it answers."""
+    """The commands [rad/s] of one run, and the integrators after it. `seen`: the measured body rates."""
     airframe = loop.airframe
     error = loop.attitude_gain * (reference[:3] - attitude) - seen
     demand = loop.rate_gain * error + integral

@@ -1,4 +1,4 @@
-"""The sensors of a flight in closed loop: vibration and filters, and what a recorder loses and confuses."""
+"""The sensors of a flight in closed loop: vibration, filters, and the faults of a recorder."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -25,9 +25,9 @@ class BodyMotion(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Gyro of the log, that of the controller, and accelerometer, raw and filtered; `angles` of the rotors [rad].
+    """The log's gyro, the controller's gyro and the accelerometer, raw and filtered; `angles` of the rotors [rad].
 
-    `gyros`: the filtered gyro of the log in each run so far [rad/s].
+    `gyros`: the log's gyro after its filter, in each run so far [rad/s].
     """
 
     raw: Float[Array, "9"]
@@ -43,8 +43,8 @@ def sensing(
 
     Filters are of the first order, y' = (x - y) / T, and exact for signals that are linear in each run.
 
-    **Returns:** a function of the signals, the number of a run, and what is sensed in it. It gives the signals of the
-    next run, and the body rates that are logged, and that the controller answers.
+    **Returns:** a function of the signals, the number of a run, and its rotor speeds and unfiltered measurements. It
+    returns the signals of the next run, the body rates for the log, and the body rates for the controller.
     """
     phases = jax.random.uniform(key, (4, 6), maxval=2 * np.pi)
     amplitude = jnp.repeat(jnp.stack([sensors.gyro_vibration, sensors.force_vibration]), 3)
@@ -77,7 +77,7 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, BodyMotion, Array, Ar
     every, sensors, keys = loop.log_every, loop.sensors, jax.random.split(key, 3)
     commands = loop.logged == "commands"
     omega = logged[0]
-    if sensors is not None:  # recorded late, not only by whole runs
+    if sensors is not None:  # recorded late, also by fractions of a run
         runs, latest = sensors.clock_offset * every / dt, len(omega) - 1
         whole = jnp.floor(runs).astype(int)
         now, before = (omega[jnp.clip(jnp.arange(latest + 1) - whole - i, 0, latest)] for i in (0, 1))

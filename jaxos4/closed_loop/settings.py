@@ -26,11 +26,11 @@ _BODY, _XYZ, _XY, _TILT = MOTIONS, ("x", "y", "z"), ("x", "y"), MOTIONS[:2]
 
 
 class Air(eqx.Module):
-    """The forces and moments of the air on a vehicle in closed loop. With these defaults it exerts none.
+    """The forces and moments of the air on a vehicle in closed loop. With the defaults there are none.
 
     The wind is a vector of Ornstein-Uhlenbeck processes along the axes of the body. The airspeed v is the velocity
-    minus the wind. It adds -drag_x v_x, -drag_y v_y, -inflow v_z to the specific force, flapping_roll v_y to the roll
-    acceleration, and flapping_pitch v_x to the pitch acceleration.
+    minus the wind. The air adds -drag_x v_x, -drag_y v_y, -inflow v_z to the specific force, flapping_roll v_y to the
+    roll acceleration, and flapping_pitch v_x to the pitch acceleration.
 
     - `wind`: standard deviation along x, y, z [m/s]. `wind_time`: the correlation time [s].
     - `drag`: of the rotors along x and y [1/s].
@@ -48,20 +48,20 @@ class Air(eqx.Module):
 
 
 class Sensors(eqx.Module):
-    """Effects of gyro, accelerometer and recorder besides white noise. With these defaults there are none.
+    """Effects of gyro, accelerometer and recorder besides white noise. With the defaults there are none.
 
     - `gyro_vibration` [rad/s], `force_vibration` [m/s^2]: amplitude of the sine that each rotor in hover adds to each
       axis, once for each revolution. The amplitude is proportional to the squared speed. Sampling causes aliasing.
     - `gyro_filter`, `force_filter`: time constants of the first-order low-pass filters before logging [s]. They filter
       the noise too.
-    - `gyro_delay`: of the filtered gyro [s], as the log and a controller that answers it see it.
+    - `gyro_delay`: delay of the filtered gyro [s], in the log and for a controller that uses the log's gyro.
     - `speed_noise`, `speed_step`: standard deviation and rounding step of the logged rotor speeds or commands [rad/s].
     - `clock_offset`: delay of the logged rotors behind the gyro [s]; negative: the rotors are logged earlier.
     - `dropouts`: the shares of samples that gyro and accelerometer lose (NaN), independently.
     - `bad_samples`: the number of values `impossible` at random places of gyro and accelerometer.
     - `velocity_noise`: standard deviation of the measured velocity [m/s]. `None`: not measured. Needs `ClosedLoop.air`.
-    - `controller_gyro_noise`: `None`: the controller answers the body rates of the log. A number: it answers the true
-      rates with white noise of its own with this standard deviation [rad/s], behind a filter with the time constant
+    - `controller_gyro_noise`: `None`: the controller uses the body rates of the log. A number: it uses a second gyro,
+      with white noise of this standard deviation [rad/s] behind a filter with the time constant
       `controller_gyro_filter` [s].
 
     **Raises:** `ValueError` that names the setting.
@@ -89,38 +89,38 @@ class ClosedLoop(eqx.Module):
 
     A setting "for each axis" is one number for all axes, or three for roll, pitch and yaw.
 
-    The vehicle. Its equations are those of `FlightModel` with the terms offset, damping, reaction, motor and delay, and
-    what `air` adds:
+    The vehicle has the equations of `FlightModel` with the terms offset, damping, reaction, motor and delay, and the
+    effects of `air`:
 
     - `airframe`: the true constants.
-    - `rotor_lag`, `rotor_delay`: lag and delay of the rotors behind their commands [s], not only whole samples.
+    - `rotor_lag`, `rotor_delay`: lag and delay of the rotors behind their commands [s], also in fractions of a sample.
     - `thrust_curve`, `motor_braking`: see `jaxos4.models.rotors`. With 1 and 1, rotors are first-order systems. Other
       values need `max_rotor_speed`.
     - `offset`: a constant torque over the inertia, for each axis [rad/s^2].
     - `damping`: a moment against the body rate, for each axis [1/s].
     - `sag`: the share of their thrust and drag that the rotors lose during the flight, linearly in time.
-    - `load_sag`: a battery whose voltage falls with the load, which is the mean cube of the rotor speeds over that in
-      hover: the motors get the command times 1 - `load_sag` (load - 1).
-    - `air`: wind, drag, inflow and flapping. `None`: the air exerts nothing, and the velocity is not simulated.
+    - `load_sag`: the fall of the battery's voltage with the load, which is the mean cube of the rotor speeds relative
+      to hover: the motors get the command times 1 - `load_sag` (load - 1).
+    - `air`: wind, drag, inflow and flapping. `None`: no forces of the air; the velocity is not simulated.
 
-    The gusts, which are Ornstein-Uhlenbeck processes:
+    The gusts are Ornstein-Uhlenbeck processes:
 
     - `gust`: standard deviation of the disturbance torque over the inertia, for each axis [rad/s^2].
     - `thrust_gust`: standard deviation of the disturbance of the vertical specific force [m/s^2].
-    - `gust_time`: their correlation time [s].
+    - `gust_time`: the correlation time of both [s].
 
     The sensors have white noise:
 
     - `gyro_noise` [rad/s], `attitude_noise` [rad], `force_noise` (accelerometer) [m/s^2]: standard deviations.
-    - `sensors`: vibration, filters, clocks, losses, and a gyro of the controller's own. `None`: white noise is all.
+    - `sensors`: vibration, filters, clocks, losses, and a second gyro for the controller. `None`: only white noise.
 
-    The controller: attitude error x `attitude_gain` is the wanted body rate. A PI controller of the body rate makes the
-    wanted angular acceleration. Torque is that x `controller_inertia`. The thrust carries the weight, up to a tilt of
-    60 degrees, whose cosine is `steepest`. A rotor that would have to be slower than 0 or faster than its maximum
-    saturates, and the integrators then stop.
+    The controller demands a body rate of attitude error x `attitude_gain`. From the error of the body rate, a PI
+    controller demands an angular acceleration. The torque is this acceleration x `controller_inertia`. The thrust
+    carries the weight, up to a tilt of 60 degrees, whose cosine is `steepest`. A rotor that would have to be slower
+    than 0 or faster than its maximum saturates, and the integrators then stop.
 
     - `attitude_gain` [1/s], `rate_gain` [1/s], `integral_gain` [1/s^2]: for each axis.
-    - `controller_inertia`: Ix, Iy, Iz that the controller knows [kg m^2]; the true ones by default.
+    - `controller_inertia`: Ix, Iy, Iz that the controller assumes [kg m^2]; by default the true ones.
     - `log_every`: the controller runs this many times in each sample of the log.
     - `logged`: `"commands"`, or `"speeds"` for measured rotor speeds.
 

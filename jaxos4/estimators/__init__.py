@@ -1,6 +1,6 @@
 """Estimators: from a likelihood, with the bracket of its unknowns, to an `Estimate`. Each algorithm has its own file.
 
-`__init__.pyi` names them; each is imported when it is first used.
+`__init__.pyi` names them. An estimator is imported when it is first used.
 """
 
 import lazy_loader

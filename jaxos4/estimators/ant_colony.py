@@ -1,11 +1,13 @@
-"""Ant colony optimisation for continuous domains (ACO_R): a baseline that searches by a population.
+"""Ant colony optimisation for continuous domains (ACO_R): a population-based baseline.
 
-An archive holds the best points so far. Each ant chooses one of them, a good one more often, and samples a Gaussian
-around it, whose standard deviation along each direction is in proportion to the mean distance of the archive. The new
-points replace the worst, so that the archive contracts around a minimum. The directions are drawn from the archive.
+An archive holds the best points so far. Each ant chooses one of them, preferring good ones, and samples from a Gaussian
+around it. Its standard deviation along each direction is proportional to the mean distance of the archive from the
+point. The new points replace the worst, so that the archive contracts around a minimum. The directions are drawn from
+the archive.
 
 Reference: Socha and Dorigo 2008, European Journal of Operational Research 185(3), 1155-1173: the kernels in sec. 3, and
-the rotation for correlated variables in sec. 4. Here all ants of a sweep share the directions; there each has its own.
+the rotation for correlated variables in sec. 4. In the paper each ant has its own directions; here all ants of a sweep
+share them.
 """
 
 from typing import ClassVar, NamedTuple
@@ -27,9 +29,9 @@ Costs = Float[Array, " archive"]
 class Colony(NamedTuple):
     """The archive, best point first.
 
-    - `points`, `costs`: their unknowns in half-widths from the start, and their costs.
+    - `points`, `costs`: the unknowns of the points, in half-widths from the start, and their costs.
     - `start`: the unknowns where the search began.
-    - `sweeps`: how many are done.
+    - `sweeps`: the number of sweeps so far.
     """
 
     points: Points
@@ -41,8 +43,8 @@ class Colony(NamedTuple):
 class AntColony(AbstractSolver[Colony]):
     """Ant colony optimisation (ACO_R) of the cost, without derivatives.
 
-    It finds the optimum of the other methods that shoot, with many times their rollouts, and so shows what derivatives
-    are worth. Use another method if the initial state is free: it adds 3 to 12 unknowns for each window.
+    It finds the same optimum as the other methods that shoot, with many times their rollouts, and so shows the value of
+    derivatives. Use another method if the initial state is free, which adds 3 to 12 unknowns for each window.
 
     - `archive`: number of points. The first is the bracket's center, the others are uniform in the bracket.
     - `ants`: number of new points in each sweep. They are simulated in parallel.
@@ -61,7 +63,7 @@ class AntColony(AbstractSolver[Colony]):
 
     shoots: ClassVar[bool] = True
     in_closed_loop: ClassVar[bool] = True
-    in_comparison: ClassVar[bool] = False  # `experiments/comparison` has it
+    in_comparison: ClassVar[bool] = False  # `experiments/comparison` includes it
     is_local: ClassVar[bool] = False
 
     archive: int = eqx.field(static=True, converter=integer("archive", 2, static=True), default=50)
@@ -74,7 +76,7 @@ class AntColony(AbstractSolver[Colony]):
     shares: tuple[float, ...] = eqx.field(static=True, default=())
 
     def init(self, stage: Stage, before: Found) -> Colony:
-        """The start, and points that are uniform around it."""
+        """The start, and points drawn uniformly around it."""
         (windows, unknowns), count = stage.off.shape, stage.unknowns.count
         shape = self.archive, count + windows * (unknowns - count)
         points = jax.random.uniform(self._keys[1], shape, minval=-1, maxval=1, dtype=float).at[0].set(0.0)
@@ -114,7 +116,7 @@ class AntColony(AbstractSolver[Colony]):
         return sweeps, first
 
     def _unknowns(self, stage: Stage, start: WindowUnknowns, point: Float[Array, " unknowns"]) -> WindowUnknowns:
-        """The unknowns of a point: the shared ones, and those of each window."""
+        """The unknowns of a point in the rows of windows: the shared ones, then the window's initial state."""
         count, width = stage.unknowns.count, jnp.where(stage.searched, stage.off, 0.0)
         own = point[count:].reshape(start.shape[0], -1)
         steps = jnp.concatenate([jnp.broadcast_to(point[:count], (start.shape[0], count)), own], axis=1)
@@ -125,7 +127,7 @@ class AntColony(AbstractSolver[Colony]):
         return jax.vmap(lambda point: cost_of(stage.local_model(self._unknowns(stage, start, point))))(points)
 
     def _best(self, points: Float[Array, "tried unknowns"], costs: Float[Array, " tried"]) -> tuple[Points, Costs]:
-        """The best points, as many as the archive holds, in order of their cost; equal ones by age."""
+        """The best points, as many as the archive holds, in order of cost; points of equal cost in order of age."""
         order = jnp.argsort(costs, stable=True)[: self.archive]
         return points[order], costs[order]
 
@@ -138,7 +140,8 @@ class AntColony(AbstractSolver[Colony]):
 def _directions(differences: Points, key: Key) -> Float[Array, "unknowns unknowns"]:
     """An orthonormal basis, one direction in each row, drawn from the differences of the archive from a point.
 
-    Gram-Schmidt: a remaining difference of length d is drawn with a probability in proportion to d^4; without any: 0.
+    Gram-Schmidt: a remaining difference of length d is drawn with a probability proportional to d^4. If none remains,
+    the direction is 0.
     """
     rounding = ROUNDING * jnp.finfo(differences.dtype).eps
     floor = jnp.square(rounding) * jnp.square(differences).sum(axis=1).max()

@@ -1,8 +1,8 @@
 """The parts of IBSS: the directions of a sweep, and the brackets along them.
 
-All steps are in standard deviations. The unknowns of a window are the shared ones, then its own initial state.
-The directions of its initial state come first. Along each shared direction, the initial states move too, to where they
-fit best.
+All steps are in standard deviations. The unknowns of a window are the shared ones, then the window's initial state. The
+directions of the initial state come first. Along each shared direction, the initial states move too, to where they fit
+best.
 """
 
 from typing import NamedTuple
@@ -20,11 +20,11 @@ PerDirection = Float[Array, "windows n"]
 
 
 class Directions(NamedTuple):
-    """The directions of a sweep, in which the cost is nearly separable, and the way along them.
+    """The directions of a sweep, along which the cost is nearly separable, and the distances along them.
 
     - `factor`, `basis`: see `JointFactor`. A direction is a column of `basis`.
-    - `moves`: the unknowns that may move: all but those at a limit beyond which the cost falls.
-    - `below`, `above`: the way to the limits, against and along each direction.
+    - `moves`: the unknowns that may move: all except those at a limit beyond which the cost falls.
+    - `below`, `above`: the distance to the limits, against and along each direction.
     - `predicted`: the step to the minimum of the local model.
     """
 
@@ -50,7 +50,7 @@ class Directions(NamedTuple):
         added: WindowUnknowns,
         count: int,
     ) -> "Directions":
-        """The directions at some unknowns, of which `count` are shared. `added`: information that the cost lacks."""
+        """The directions at some unknowns, of which `count` are shared. `added`: information added to the cost's."""
         moves = movable(unknowns, model.gradient, limits, count)
         information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
         factor, basis = joint_factor(information + jax.vmap(jnp.diag)(added), count)
@@ -78,8 +78,8 @@ class Brackets(NamedTuple):
     """The bracket along each direction, as steps from where the sweep began.
 
     - `predicted`: the predicted step to the minimum.
-    - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: those of the part that no slope
-      has excluded. If the minimum lies beyond an opened end, both are at that end.
+    - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: the ends of the part that no
+      slope has excluded. If the minimum lies beyond an opened end, both are at that end.
     - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope at `last`, and how fast it
       changes.
     """
@@ -96,7 +96,7 @@ class Brackets(NamedTuple):
 
     @classmethod
     def around(cls, predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection):
-        """Brackets around predicted steps. The first trials are their middles; the rates are 1, as the information."""
+        """Brackets around predicted steps. First trials are in the middle; rates are 1, like the information."""
         predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
         lowest, highest = jnp.maximum(predicted - half_width, -below), jnp.minimum(predicted + half_width, above)
         middle, zero = (lowest + highest) / 2, jnp.zeros_like(lowest)
@@ -105,8 +105,8 @@ class Brackets(NamedTuple):
     def narrowed(self, slope: PerDirection) -> "Brackets":
         """The brackets after a shot at their trials: **the sign of the slope decides**, the secant proposes.
 
-        The next trial is where a line through the last two slopes is zero. If that lies outside of the bracket, it is
-        the end there, or the middle if a shot has moved that end.
+        The next trial is where a line through the last two slopes is zero. If this point lies outside of the bracket,
+        the next trial is the nearest end, or the middle if a shot has moved that end.
         """
         lower = jnp.where(slope <= 0, self.trial, self.lower)
         upper = jnp.where(slope >= 0, self.trial, self.upper)

@@ -36,7 +36,7 @@ _MANY = 100  # columns; one flight has at most 30
 class Regression(NamedTuple):
     """A flight as a regression for the parameters, in half-widths from the bracket's center.
 
-    - `center`, `half_width`: of the bracket; a half-width of 0 holds a parameter.
+    - `center`, `half_width`: of the bracket; a half-width of 0 fixes a parameter.
     - `rates`: NaN if not measured, and at the first sample if the initial state is known.
     - `anchor`: the known initial rates; NaN if they are free. `anchored`: whether they are known.
     - `settings`: `memory`, `bridge` and `forgetting`.
@@ -52,7 +52,7 @@ class Regression(NamedTuple):
 
     @classmethod
     def of(cls, problem: ShootingProblem, settings: "EquationError | RecursiveLeastSquares") -> "Regression":
-        """The regression of a flight's body rates. Parameters in which it is not linear stay at their center."""
+        """The regression for a flight's body rates. Parameters in which it is not linear stay at their center."""
         unknowns, rates = problem.unknowns.usable, problem.restrict("rates")
         linear = np.array([not each.in_forcing for each in problem.model.parameters])
         anchored = problem.initial_state is not None
@@ -66,9 +66,9 @@ class Regression(NamedTuple):
         return self.problem.sigma[RATES]
 
     def rows(self) -> tuple[RegressionRows, Callable[[RegressionRows], Float[Array, "samples 3"]]]:
-        """Regressors, then the output: a row of unit noise for p, q and r at every sample, 0 for a missing one.
+        """Regressors, then the output: a row of unit noise for p, q and r at every sample, 0 if it was not measured.
 
-        The function turns the slope of a number in the rows into its slope in the measured rates.
+        The function turns a derivative with respect to the rows into one with respect to the measured rates.
         """
         rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
         return rows, lambda slope: back(slope)[0]
@@ -103,7 +103,7 @@ class Regression(NamedTuple):
         return jax.lax.scan(step, start, (increments, usable, output, measured))[1]
 
     def _fill(self, rates) -> tuple[Float[Array, "samples 3"], Bool[Array, "samples 3"]]:
-        """Rates with short gaps bridged by straight lines and other gaps set to 0, and which of them are known."""
+        """Rates with short gaps bridged by straight lines and other gaps set to 0, and which values are known."""
         samples = jnp.arange(rates.shape[0])[:, None]
         first = (samples == 0) & self.anchored
         rates = jnp.where(first, self.anchor, rates)
@@ -188,7 +188,7 @@ class Regression(NamedTuple):
         initial_state, _, _, rollouts = fit_start(problem, parameters)
         choices = (parameters, initial_state), (center, problem.first_state()[0])
         choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
-        # One after the other, so that the simulation is compiled once.
+        # In sequence, so that the simulation is compiled once.
         shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
         flies = shots.feasible[0] & jnp.isfinite(shots.cost[0])
         (parameters, initial_state), shot = jax.tree.map(
@@ -209,9 +209,9 @@ class Regression(NamedTuple):
 
 
 def normal_equations(rows: Float[Array, "*rows columns"]) -> tuple[Matrix, Float[Array, " parameters"]]:
-    """X^T X and X^T y of rows [X, y]. Plain sums give the same digits alone and in a batch.
+    """X^T X and X^T y of rows [X, y]. Plain sums give the same digits for one flight and for a batch.
 
-    Their products of the many columns of pooled logs, which are no batch, would not fit into any memory.
+    Pooled logs, which are no batch, have so many columns that the products of plain sums would not fit into memory.
     """
     rows = rows.reshape(-1, rows.shape[-1])
     regressors, output = rows[:, :-1], rows[:, -1]
@@ -239,16 +239,16 @@ class EquationError(AbstractEstimator):
     Only the body rates are used; the cost counts all channels. A free initial state is fitted to the parameters
     afterwards.
 
-    - `memory`: how the rates are differentiated, from 0 to 1: the mean of the earlier samples is subtracted, in which
-      each weighs `memory` times its successor. 0: forward differences (ordinary least squares); 1: the integrated
+    - `memory`: how the rates are differentiated, from 0 to 1: the mean of the earlier samples is subtracted, where a
+      sample weighs `memory` times its successor. 0: forward differences (ordinary least squares); 1: the integrated
       regression, generalised least squares for white noise of the rates.
     - `bridge`: a gap of up to this many samples in a rate is bridged by a straight line in the regressors. A longer gap
       splits the integration in two.
 
-    A known initial state is exact for a `memory` of 1, and one more sample for a smaller one. Without noise the answer
-    is exact for forward Euler; for another `method` the trapezoidal rule leaves a small error. The covariance has the
-    white noise of `sigma` in regressors and outputs, to first order, but neither the bias nor forces that the model
-    lacks. Without measurements of a rate the result is `unidentifiable`.
+    A known initial state is exact if `memory` is 1, and counts as one more sample otherwise. Without noise the answer
+    is exact for forward Euler; for another `method` the trapezoidal rule leaves a small error. The covariance includes
+    the white noise of `sigma` in regressors and outputs, to first order, but neither the bias nor forces that the model
+    lacks. If a rate was not measured, the result is `unidentifiable`.
 
     References: Klein and Morelli, Aircraft System Identification, ch. 5; Jategaonkar, Flight Vehicle System
     Identification, ch. 6; Ljung, System Identification, section 7.3.
@@ -291,8 +291,8 @@ class RecursiveLeastSquares(AbstractEstimator):
     The recursion carries the normal matrix and its right-hand side. A parameter stays at the bracket's center until it
     is excited.
 
-    - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1: the estimate describes the
-      last 1 / (1 - forgetting) samples or so. With 1 the last estimate is that of `EquationError`.
+    - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1: the estimate describes about
+      the last 1 / (1 - forgetting) samples. With 1 the last estimate equals that of `EquationError`.
     - `memory`, `bridge`: as in `EquationError`. With a `forgetting` below 1 a known initial state counts like one
       sample.
 

@@ -1,4 +1,4 @@
-"""The hybrid: a network says where to look, and IBSS finds the answer there."""
+"""The hybrid estimator: a network gives the start of the search, and IBSS finds the answer near it."""
 
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
@@ -18,26 +18,27 @@ from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem, in_
 from .ibss import IBSS
 from .solver import solve
 
-_LEVEL = 0.999  # the share of flights in which the seed's intervals hold all parameters at once
-# The seed was wrong if the answer is this many half-widths of these intervals away from the seed.
+_LEVEL = 0.999  # the share of flights in which the seed's intervals contain all parameters at once
+# The seed was wrong if the answer is more than this many half-widths of its intervals away.
 _MISSED = 2.0
-# A cost this many standard deviations above that of pure noise is not explained.
+# Residuals are not explained if the cost is this many standard deviations above that of pure noise.
 _UNEXPLAINED = 5.0
 
 
 class Hybrid(AbstractEstimator):
     """IBSS near the answer of a network.
 
-    The network's answer, the *seed*, and its covariance open the first brackets, against all of the problem's channels;
-    what the network does not look at begins at the first measurements. If the search shows that the seed was wrong, or
-    if the network had no answer, IBSS searches the whole bracket too. The better answer is returned.
+    The network's answer, the *seed*, and its covariance open the first brackets. The search then compares all of the
+    problem's channels; states that the network does not see start at their first measurements. If the search shows that
+    the seed was wrong, or if the network had no answer, IBSS searches the whole bracket too. The better answer is
+    returned.
 
     The estimate's `seed` is the bracket of the network's 99.9 % intervals for all parameters at once. `rollouts` are
     those of network and search together.
 
-    - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
-    - `ibss`: how to search.
-    - `seen`: the part of the flight that the network looks at, by default the shooting problem. It may differ from the
+    - `network`: a trained network. A network that sees all of the problem's channels makes the search shortest.
+    - `ibss`: the settings of the search.
+    - `seen`: the part of the flight that the network sees, by default the shooting problem. It may differ from the
       training problem only in the measured values.
     """
 
@@ -61,7 +62,7 @@ class Seed(NamedTuple):
 
     - `parameters`, `covariance`: the covariance is infinite if there is no answer.
     - `half_width`: of the 99.9 % intervals for all parameters at once.
-    - `initial_state`: at the first sample of each window, of the channels that the other estimator looks at.
+    - `initial_state`: at the first sample of each window, in the channels that the other estimator sees.
     - `rollouts`: of the other estimator.
     """
 
@@ -102,7 +103,7 @@ def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
     # The half-width is two standard deviations.
     wide_spread = jnp.diag(jnp.square(guess.off[0, :count] / 2))
     (windows, size), own = guess.off.shape, unknowns.count
-    # The network's channels come first; a problem whose initial state is no unknown needs none of them.
+    # The network's channels come first. A problem whose initial state is not unknown needs none of them.
     estimated = seed.initial_state.reshape(windows, -1)[:, : size - own]
     begin = jnp.full((windows, size), jnp.nan).at[:, :count].set(seed.parameters)
     begin = begin.at[:, own : own + estimated.shape[1]].set(estimated)
@@ -138,7 +139,7 @@ def _confirms(near: Estimate, seed: Seed, measurements: Scalar) -> Bool[Array, "
     far = jnp.abs(near.parameters[: seed.parameters.shape[0]] - seed.parameters) > _MISSED * seed.half_width
     # A parameter that is not identifiable near the seed is not identifiable elsewhere either.
     ended = (near.result == RESULTS.successful) | (near.result == RESULTS.unidentifiable)
-    # Where the noise is an unknown, no measurements are counted, and the cost does not show that the rest is noise.
+    # If the noise is an unknown, `measurements` is 0, and the cost does not show whether the residuals are noise.
     explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2 * measurements)
     explained = explained & (measurements > 0)
     return ended & ~far.any() & explained

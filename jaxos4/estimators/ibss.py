@@ -1,4 +1,4 @@
-"""Iterative Bi-Section Shooting (IBSS): narrow brackets by the slope of the cost; its steps are our choice."""
+"""Iterative Bi-Section Shooting (IBSS): brackets are narrowed by the slope of the cost. The steps are our choice."""
 
 from typing import ClassVar, NamedTuple
 
@@ -14,30 +14,31 @@ from ..shooting import LocalModel, Stage, WindowUnknowns
 from .bisection import Brackets, Directions, Flag, PerDirection
 from .solver import AbstractSolver, Found, before_shots, chosen
 
-# How it searches. Steps are in standard deviations, scaled like those of `tolerance`.
-_COARSE = 0.5  # every stage but the last ends when the minimum is at most so far away
+# Settings of the search. Steps are in standard deviations, scaled like those of `tolerance`.
+_COARSE = 0.5  # every stage except the last ends when the minimum is at most this far away
 _OPENING = 4.0  # the longest step of a stage's first sweep, in standard deviations of the stage's start
-_NARROW = 0.05  # half-width of a stage's first brackets, as a share of that
+_NARROW = 0.05  # half-width of a stage's first brackets, as a share of `_OPENING`
 _SAFETY = 2.0  # half-width of later brackets, in relative errors of the last predictions
-_MIN_WIDTH = 0.01  # the smallest half-width of later brackets, as a share of the longest step, which is the largest
-_WIDENING, _MAX_WIDENING = 4.0, 256.0  # of the next bracket, again and again, while the last shot is at its end
-_KEPT_RISE = 1.0  # of the cost in a sweep that is still kept
-_RETREAT, _ADVANCE = 0.25, 1.4  # of the longest step: after a sweep that was not kept, and after any other
-# The slopes of unknowns with a stride are inexact: the search also ends after a sweep whose predicted steps are so
-# short, if it lowered the cost by no more.
+_MIN_WIDTH = 0.01  # smallest half-width of later brackets, as a share of the longest step; the largest is that step
+_WIDENING, _MAX_WIDENING = 4.0, 256.0  # of the next bracket, repeated while the last shot is at an end
+_KEPT_RISE = 1.0  # the largest rise of the cost in a sweep that is kept
+_RETREAT, _ADVANCE = 0.25, 1.4  # factors of the longest step, after a sweep that was not kept and after any other
+# The slopes of unknowns with a stride are inexact, so the search also ends after a sweep whose predicted steps are at
+# most this long, if it lowered the cost by at most this gain.
 _SHORT_STEP, _SMALL_GAIN = 0.3, 1e-4
-_DAMPING = 0.1  # added information, in 1/stride^2: that of unknowns with a stride misjudges the curvature
+_DAMPING = 0.1  # added information in 1/stride^2: unknowns with a stride have inexact information
 
 
 class State(NamedTuple):
     """The search of a stage before a sweep.
 
-    - `unknowns`, `model`: where it is, and the local model of the cost there. Before the first shot: `before_shots`.
+    - `unknowns`, `model`: the current point, and the local model of the cost there. Before the first shot, `model` is
+      that of `before_shots`.
     - `directions`, `brackets`: of the next sweep.
     - `spread`: the covariance of the unknowns before the stage.
-    - `growth`: how many times as wide each direction's bracket is.
+    - `growth`: the factor by which each direction's bracket is widened.
     - `trust`: the share of the longest predicted step that a sweep may go; 1: no limit.
-    - `sweeps`, `shots`: of this stage. The first shot is at the start, before any sweep.
+    - `sweeps`, `shots`: their number in this stage. The first shot is at the start, before any sweep.
     - `done`: whether the stage ended by itself.
     """
 
@@ -60,18 +61,18 @@ class IBSS(AbstractSolver[State]):
     the cost's slope along a direction decides** which side of the trial holds the minimum, and so which part of the
     bracket is dropped. The quadratic model and the secant through the last slopes **propose** where to shoot. The size
     of the slopes decides when to stop, and the cost whether a point is kept. A *sweep* is one iteration. A *stage*
-    repeats sweeps on some of the data until the minimum is near; the last stage fits all of them. The directions of a
-    sweep are the columns of L^-T, with L L^T the Fisher information at the current estimate: the cost is nearly
-    separable along them, so a sweep bisects all together. Parameters are bisected on the sum of all windows' slopes,
-    initial states on those of their own window.
+    repeats sweeps on some of the data until the minimum is near; the last stage fits all data. The directions of a
+    sweep are the columns of L^-T, with L L^T the Fisher information at the current estimate. The cost is nearly
+    separable along them, so a sweep bisects all directions in parallel. Parameters are bisected on the sum of all
+    windows' slopes, initial states on the slope of their window.
 
     - `halvings`: the shots of a sweep that narrow the brackets.
     - `max_sweeps`: the most sweeps of a stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
-      direction. These are scaled by the `misfit` of the residuals, so noise-free data are fitted to rounding errors.
+      direction. The `misfit` of the residuals scales them, so noise-free data are fitted to rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
-    - `shares`: before all data, the body rates are fitted to these shares of the flight. Errors grow with time, so the
-      cost of a long flight has other minima.
+    - `shares`: before the fit of all data, the body rates are fitted to these shares of the flight, because errors grow
+      with time and give the cost of a long flight other minima.
     """
 
     shoots: ClassVar[bool] = True
@@ -84,7 +85,7 @@ class IBSS(AbstractSolver[State]):
     shares: tuple[float, ...] = eqx.field(static=True, default=(0.1, 0.3, 1.0))
 
     def init(self, stage: Stage, before: Found) -> State:
-        """At the start, with closed brackets: the first step of the loop is one shot there, and is compiled once."""
+        """The start, with closed brackets: the first step of the loop is a shot there, so a shot is compiled once."""
         unknowns, closed = before.unknowns, jnp.zeros_like(before.unknowns)
         directions = Directions.none(unknowns)
         return State(
@@ -142,7 +143,7 @@ class IBSS(AbstractSolver[State]):
         return Found(state.unknowns, state.model, spread, state.sweeps, rollouts, state.done)
 
     def _look_around(self, stage: Stage, unknowns: WindowUnknowns, model: LocalModel) -> Directions:
-        """The directions in which the cost is nearly separable, and predicted steps; the bracket is information."""
+        """The directions along which the cost is nearly separable, and predicted steps. The bracket is information."""
         of_bracket, (windows, _) = 1 / jnp.square(stage.off / 2), unknowns.shape
         shared = of_bracket[:, : stage.unknowns.count] / windows
         has_prior, of_stride = stage.unknowns.precision > 0, _DAMPING / jnp.square(stage.unknowns.stride)
@@ -152,10 +153,11 @@ class IBSS(AbstractSolver[State]):
     def _bisect(self, stage: Stage, state: State) -> tuple[Brackets, WindowUnknowns, LocalModel, Count]:
         """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
 
-        The last shot is at what the others found, or where the minimum is near. A single one is enough if all brackets
-        are closed.
+        The last shot is at the trials that the others found, or where the minimum is near. One shot is enough if all
+        brackets are closed.
 
-        **Returns:** the brackets after the shots, the unknowns and the local model of the last, and how many they were.
+        **Returns:** the brackets after the shots, the unknowns and local model of the last shot, and the number of
+        shots.
         """
         limits, count = stage.limits(self.reach), stage.unknowns.count
         most = jnp.where((state.brackets.highest > state.brackets.lowest).any(), self.halvings + 1, 1)
@@ -167,7 +169,7 @@ class IBSS(AbstractSolver[State]):
             model = stage.local_model(unknowns)
             slope = state.directions.slopes(model.gradient, count)
             near = model.feasible.all() & self._is_near(stage, model, slope)
-            # A slope that is not finite becomes the trial: with unit information this puts the minimum at step 0.
+            # A slope that is not finite is replaced by the trial: with unit information, the minimum is then at step 0.
             brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
             return brackets, unknowns, model, shots + 1, near
 
@@ -175,25 +177,25 @@ class IBSS(AbstractSolver[State]):
         return jax.lax.while_loop(lambda carry: (carry[3] < most) & ~carry[4], shoot, first)[:4]
 
     def _judge(self, stage: Stage, state: State, unknowns: WindowUnknowns, model: LocalModel) -> tuple[Flag, Flag]:
-        """Whether the new point is kept, and whether the search has stalled. It goes back if a sweep made it worse."""
+        """Whether the new point is kept, and whether the search has stalled. A point that is worse is not kept."""
         before, gain = state.model, state.model.cost.sum() - model.cost.sum()
         feasible, was_feasible = model.feasible.all(), before.feasible.all()
         has_stride = jnp.isfinite(stage.unknowns.stride).any()
         is_short = has_stride & (state.directions.longest <= _SHORT_STEP)
         stalled = (gain <= _SMALL_GAIN) & feasible & was_feasible & is_short
-        # The cost of a trajectory that is not feasible means nothing.
+        # The cost of a trajectory that is not feasible is meaningless.
         not_worse = feasible & (model.cost.sum() <= before.cost.sum() + _KEPT_RISE)
         bad = ~_finite(unknowns, model) | (was_feasible & ~not_worse)
         return ~(bad | (stalled & (gain < 0))), stalled
 
     def _is_near(self, stage: Stage, model: LocalModel, steps: PerDirection) -> Flag:
-        """Whether steps, or slopes, which are as long, are short enough to end the stage: the last one ends finely."""
+        """Whether steps, or slopes, which have their size, are short enough to end the stage. The last ends finely."""
         misfit = stage.misfit(model.cost.sum())
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
         return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
     def _next_widths(self, stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:
-        """The half-width of the next brackets as a share of the longest step, and `State.growth`, from the errors."""
+        """The half-width of the next brackets as a share of the longest step, from its error; and `State.growth`."""
         steps = brackets.last
         error = jnp.abs(steps - brackets.predicted).max()
         longest = jnp.maximum(jnp.abs(steps).max(), stage.smallest_step)

@@ -19,23 +19,23 @@ from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, Unknowns
 
-_SETTLED = 0.1  # standard deviations: the passes end once one of them moves no parameter by more
-# The joint estimate of states, parameters and, if it is free, the initial state; and S.
+_SETTLED = 0.1  # standard deviations; the passes end once a pass moves no parameter by more
+# The joint estimate of states, parameters and, if it is free, the initial state; and the root S of its covariance.
 _Joint = tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]]
 
 
 class JointEKF(AbstractEstimator):
     """Joint extended Kalman filter: states and constant parameters from one recursion over the flight.
 
-    - `passes`: the most passes over the flight. The first linearises the model around its own running estimate: the
-      textbook filter. Each later one starts from the same prior and linearises around the trajectory of the answer
-      before: a Gauss-Newton step. They end once one changes no parameter by more than a tenth of its standard
-      deviation; else the result is `max_sweeps`. With 1 the first answer is accepted, whose covariance can be far too
-      small.
+    - `passes`: the most passes over the flight. The first pass linearises the model around its running estimate, as the
+      textbook filter does. Each later pass is a Gauss-Newton step: it starts from the same prior and linearises around
+      the trajectory of the answer before. The passes end once a pass changes no parameter by more than a tenth of its
+      standard deviation; otherwise the result is `max_sweeps`. With 1 the first answer is accepted, but its covariance
+      can be far too small.
 
     The bracket is a Gaussian prior: its center is the mean, its half-width the standard deviation. A free initial state
     has the first measurements as its prior, and is a constant part of the joint state. There is no process noise.
-    `history` is that of the last pass; `rollouts` count each unknown and the state in each pass, and `sweeps` the
+    `history` is from the last pass. `rollouts` count each unknown and the state in each pass; `sweeps` count the
     passes.
 
     Reference: Ljung 1979, IEEE Trans. Autom. Control 24(1), on the filter; Bierman 1977, Factorization Methods for
@@ -74,7 +74,7 @@ class JointEKF(AbstractEstimator):
         joint, unknowns = jnp.concatenate([start, prior.center, start[: problem.free_size]]), count + problem.free_size
         root, history = jnp.zeros((joint.size, unknowns)), jnp.zeros((rows.measured[0].size, count))
         none = (joint, root, history), jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        # The first pass is one of the loop too, so that the filter is compiled once.
+        # The first pass is in the loop too, so that the filter is compiled once.
         found = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < self.passes), again, none)
         (joint, root, history), passes, done = found
         parameters, initial_state = split(joint)

@@ -1,6 +1,6 @@
 """Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood; and output error and filter error, which use it.
 
-Output error has noise of the sensors only, filter error disturbances too (`InnovationsProblem`).
+Output error models sensor noise only, filter error disturbances too (`InnovationsProblem`).
 
 References: Marquardt 1963, SIAM J. Appl. Math. 11(2), on the damping; Ljung, System Identification, ch. 7 and 13;
 Jategaonkar, Flight Vehicle System Identification, ch. 4 and 5.
@@ -29,9 +29,9 @@ from ..shooting import (
 )
 from .solver import AbstractSolver, Found, chosen, cost_of, solve
 
-_COARSE = 1e-3  # the smallest `step_tolerance` of all stages but the last
-_FACTOR = 10.0  # by which a step is damped less after one that succeeded, and more after one that failed
-# Information that is always added about an unknown with a stride, in 1/stride^2: its own misjudges the curvature.
+_COARSE = 1e-3  # the smallest `step_tolerance` of all stages except the last
+_FACTOR = 10.0  # by which the damping falls after a step that succeeded, and rises after one that failed
+# Information in 1/stride^2 that is always added for unknowns with a stride, whose own information is inexact.
 _STRIDE_INFORMATION = 0.3
 
 
@@ -41,7 +41,7 @@ class State(NamedTuple):
     - `best`, `model`: the best unknowns so far, and the local model there.
     - `trial`: where the shot will be.
     - `damping`: of the last step, or of the first one.
-    - `shots`: how many there were.
+    - `shots`: the number of shots so far.
     - `done`: whether the stage ended by itself.
     """
 
@@ -56,18 +56,18 @@ class State(NamedTuple):
 class LevenbergMarquardt(AbstractSolver[State]):
     """Gauss-Newton steps, which are damped more after a step that failed, and less after one that succeeded.
 
-    - `step_tolerance`: a stage ends with a step that changes no unknown by more, in the unit of how far off its initial
-      guess may be. Cost and covariance are those before this step. 0: no step is short enough.
-    - `gain_tolerance`: a stage ends if hardly damped steps promise to lower the cost by less. An error of one standard
-      deviation costs 0.5.
-    - `flat`: it ends too if a step failed whose damping is more than 1, and which promised to lower the cost by less.
+    - `step_tolerance`: a stage ends with a step that moves no unknown by more than this fraction of its initial
+      uncertainty. Cost and covariance are those before this step. 0: no step is short enough.
+    - `gain_tolerance`: a stage ends if steps with little damping promise to lower the cost by less. An error of one
+      standard deviation costs 0.5.
+    - `flat`: a stage also ends if steps with a damping above 1 promise to lower the cost by less.
     - `max_steps`: the most steps of a stage.
     - `is_relative`: whether damping is relative to the information about each unknown (Marquardt). Otherwise it is
-      relative to what is known before the flight (Levenberg): such a damping hardly changes the steps of a flight with
-      much information.
+      relative to the knowledge before the flight (Levenberg), and hardly changes the steps of a flight with much
+      information.
     - `damping`: of the first step. `least_damping`: of any other.
-    - `shares`: see `AbstractProblem.stages`. The rates are fitted first, and then all channels with them: from a wide
-      bracket, a direct fit of all channels can end in another minimum.
+    - `shares`: see `AbstractProblem.stages`. The rates are fitted first, then all channels, because a direct fit of all
+      channels from a wide bracket can end in another minimum.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     """
 
@@ -119,7 +119,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
         """Whether a step ends the stage."""
         tolerance = jnp.where(stage.last, self.step_tolerance, jnp.maximum(self.step_tolerance, _COARSE))
         unit, least = self._unit(stage, model.information), self._least(stage)
-        # By how much the step should lower the cost, as if it were hardly damped.
+        # The expected reduction of the cost, as if the step were hardly damped.
         eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
         left = -(eased * model.gradient * step).sum()
         stalled = (left < self.gain_tolerance) | ((damping > 1) & (left < self.flat))
@@ -136,11 +136,11 @@ class LevenbergMarquardt(AbstractSolver[State]):
         return -(basis * slopes[:, None, :]).sum(axis=-1)
 
     def _least(self, stage: Stage) -> WindowUnknowns:
-        """The information that damps each unknown in any case."""
+        """The information that always damps each unknown."""
         return _STRIDE_INFORMATION / jnp.square(stage.stride)
 
     def _unit(self, stage: Stage, information: Float[Array, "windows n n"]) -> WindowUnknowns:
-        """The information that a damping of 1 adds; about a parameter once, as all windows share it."""
+        """The information that a damping of 1 adds. For a parameter it is divided among the windows, which share it."""
         if self.is_relative:
             diagonal = jnp.diagonal(information, axis1=1, axis2=2)
             return jnp.where(diagonal > 0, diagonal, 1.0)
@@ -150,10 +150,10 @@ class LevenbergMarquardt(AbstractSolver[State]):
 class OutputError(AbstractEstimator):
     """Levenberg-Marquardt on the weighted residuals, from the bracket's center: first the rates, then all channels.
 
-    - `tolerance`: the search ends with a step that changes no unknown by more, in half-widths of the bracket.
+    - `tolerance`: the search ends with a step that moves no unknown by more than this share of its half-width.
     - `max_steps`: for each stage.
-    - `long`: a flight of this many samples is long: the rates are fitted to its first 10 %, then to all of it. Errors
-      grow with time, so that a search of all of it from a wide bracket takes many short steps.
+    - `long`: in a flight of this many samples or more, the rates are first fitted to its first 10 %. Errors grow with
+      time, so a search on the whole flight from a wide bracket takes many short steps.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -173,13 +173,13 @@ class OutputError(AbstractEstimator):
 class FilterError(AbstractEstimator):
     """Maximum likelihood of the innovations of Kalman filters, by Gauss-Newton steps from the bracket's center.
 
-    It compares the body rates, and specific force if the model predicts it. The disturbance and the sensor's noise of
+    It compares the body rates, and specific force if the model predicts it. The disturbance and the sensor noise of
     each channel are estimated too, see `InnovationsProblem`. The bracket is a Gaussian prior, whose standard deviation
     is the bracket's half-width.
 
     - `tolerance`: the search ends with a step that promises to lower the cost by less. An error of one standard
       deviation costs 0.5.
-    - `max_steps`: of the search from one time constant of the disturbance.
+    - `max_steps`: the most steps of the search from one time constant of the disturbance.
     """
 
     looks_at: ClassVar[str] = "rates"
@@ -192,7 +192,7 @@ class FilterError(AbstractEstimator):
 
     @property
     def solver(self) -> LevenbergMarquardt:
-        """Its damping is relative, because the noise levels have no bracket."""
+        """The solver. Its damping is relative, because the noise levels have no bracket."""
         return LevenbergMarquardt(
             step_tolerance=0.0,
             gain_tolerance=self.tolerance,
@@ -207,8 +207,8 @@ class FilterError(AbstractEstimator):
     def __call__(self, problem: ShootingProblem | InnovationsProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight. Raises `ValueError` for a bracket of another length than the model's parameters.
 
-        The estimate of a shooting problem has the model's parameters alone, and the cost of a simulation; that of a
-        problem of innovations has all its unknowns and their cost.
+        The estimate for a shooting problem has the model's parameters alone, and the cost of a simulation. The estimate
+        for an `InnovationsProblem` has all unknowns, and their cost.
         """
         return in_blocks(self._identify, problem.within(bracket))
 

@@ -33,12 +33,12 @@ ESTIMATORS = Estimators(
         "ant-colony": "estimators.ant_colony:AntColony",
     },
 )
-"""The estimators by name: what the command line, studies and figures offer. A new estimator is one line here, or an
-entry point of another package in the group `jaxos4.estimators`, with the class."""
+"""The estimators by name, as command line, studies and figures offer them. A new estimator is one line here, or an
+entry point of another package in the group `jaxos4.estimators` that gives the class."""
 
 
 def make_estimator(name: str, network: "TrainedNetwork | None" = None) -> "AbstractEstimator":
-    """The estimator of that name with its default settings. If it needs a network, it has `network`, or is `network`.
+    """The estimator of this name with default settings. If it needs a network, it uses `network`, or is `network`.
 
     Raises `ValueError` for an unknown name, or if the estimator needs a network and there is none.
     """

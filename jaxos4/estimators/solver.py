@@ -1,4 +1,4 @@
-"""`AbstractSolver`: an estimator that minimises any likelihood, step by step. `solve` is the loop of all of them."""
+"""`AbstractSolver`: an estimator that minimises the cost of any likelihood step by step. `solve` is their loop."""
 
 import abc
 import functools
@@ -18,9 +18,9 @@ State = TypeVar("State")
 
 
 class Found(NamedTuple):
-    """The findings of a search in a stage, or its knowledge before the first.
+    """The findings of a search in a stage, or the knowledge before the first stage.
 
-    - `unknowns`: the best of each window, and `model`, the local model of the cost there.
+    - `unknowns`: the best unknowns of each window. `model`: the local model of the cost there.
     - `spread`: the covariance of the unknowns of each window.
     - `steps`, `rollouts`: of this stage alone, see `Estimate`; in `solve`, the sums over all stages.
     - `done`: whether the stage ended by itself.
@@ -35,11 +35,11 @@ class Found(NamedTuple):
 
 
 class AbstractSolver(AbstractEstimator, Generic[State]):
-    """An algorithm that minimises a likelihood. It knows nothing of the likelihood but what `AbstractProblem` says.
+    """An algorithm that minimises the cost of a likelihood. It uses only the members of `AbstractProblem`.
 
     - `is_local`: whether the answer depends on the start, so that the search is repeated from all starts of a problem.
-    - `shares`: the stages that it wants, see `AbstractProblem.stages`.
-    - `reach`: it does not go further than this many half-widths from the bracket's center.
+    - `shares`: the requested stages, see `AbstractProblem.stages`.
+    - `reach`: the search does not go further than this many half-widths from the bracket's center.
     """
 
     is_local: ClassVar[bool] = True
@@ -48,7 +48,7 @@ class AbstractSolver(AbstractEstimator, Generic[State]):
 
     @abc.abstractmethod
     def init(self, stage: Stage, before: Found) -> State:
-        """The first state of a stage's search: at `before.unknowns`, of the covariance `before.spread`."""
+        """The first state of a stage's search, at `before.unknowns` with the covariance `before.spread`."""
 
     @abc.abstractmethod
     def step(self, stage: Stage, state: State) -> State:
@@ -89,13 +89,13 @@ def solve(
 ) -> Estimate:
     """The estimate that a solver finds, stage by stage.
 
-    The first stage is searched from each start of the problem. Equal starts count once. A later start begins with the
-    parameters that are the best so far. The other stages are searched from the best answer of all starts.
+    The first stage is searched from each start of the problem. Equal starts count once. Later starts begin with the
+    best parameters so far. The other stages are searched from the best answer of all starts.
 
-    - `start`: where to start instead, unless it is NaN or the unknown is fixed. Shared unknowns, or those of each
-      window.
+    - `start`: where to start instead: shared unknowns, or all unknowns of each window. Values that are NaN, or of fixed
+      unknowns, are ignored.
     - `spread`: the covariance of the first unknowns of each window at the start; by default that of the initial guess.
-    - `is_close`: whether the start is so close that no stage is needed that fits a part of the data.
+    - `is_close`: whether the start is so close that stages on a part of the data are skipped.
     - `skip`: whether to return no answer, without a step. Other lanes of the batch do not wait for this one.
     """
     stages = problem.stages(solver.shares)
@@ -109,7 +109,7 @@ def solve(
         count = jnp.where((starts == starts[0]).all(), 1, starts.shape[0])
 
     def search(place: Count, best: Found) -> Found:
-        """From a start in the first stage, or from the best answer in a later one."""
+        """Searches from a start in the first stage, or from the best answer in a later stage."""
         from_start = place < count
         own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameter_count) & (place > 0)
         own &= jnp.isfinite(cost_of(best.model))
@@ -140,7 +140,7 @@ def before_search(
     spread: Float[Array, "given given"] | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Found:
-    """The knowledge before a search: the first start, how far off it may be, and nothing about the cost."""
+    """The knowledge before a search: the first start and its covariance, and nothing about the cost."""
     guess, zero = problem.initial_guess, jnp.zeros((), dtype=int)
     start, wide = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
     shapes = jax.eval_shape(stages.local_model, zero, start, start)

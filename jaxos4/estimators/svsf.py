@@ -7,8 +7,8 @@ the prediction right. The filter corrects rates and parameters element by elemen
     parameters:  |w| sat(w / psi_parameters)
 
 This is Habibi's filter for fewer measurements than states, with gamma = 0: Phi12 is the derivative of the rates with
-respect to the parameters, and Phi22 = 1. Here Phi12 is that of a prediction through all corrections before it; in
-Habibi's paper it is that of one step alone, whose errors are small compared with the noise.
+respect to the parameters, and Phi22 = 1. Here Phi12 takes the derivative through all earlier corrections. In Habibi's
+paper it is the derivative of one step alone, whose errors are small compared with the noise.
 """
 
 import functools
@@ -52,16 +52,16 @@ class SVSF(AbstractEstimator):
     - `rates_layer`: boundary layer of the rates, in multiples of the problem's sigma.
     - `parameter_layer`: boundary layer of the parameters, in multiples of the noise of w from one sample.
     - `damping`: of the pseudo-inverse, in multiples of a parameter's root mean square influence. Phi12 maps 3 errors
-      onto more parameters, and passes through 0: without damping w is mostly noise.
+      onto more parameters, and passes through 0, so that without damping w is mostly noise.
     - `equilibration`: the pseudo-inverse has least norm in half-widths, multiplied by up to this factor for parameters
       with less influence than the greatest. With 1, the gyroscopic terms hardly move.
     - `passes`: number of passes over the flight. Each begins with the parameters of the pass before (iterative SVSF).
 
-    The answer is the mean of the parameters over the second half of the last pass, whose parameters are the `history`.
-    Only the body rates are used. A free initial state is fitted to the parameters at the end.
+    The answer is the mean of the parameters over the second half of the last pass. `history` holds the parameters of
+    that pass. Only the body rates are used. A free initial state is fitted at the end, with these parameters.
 
-    The method gives no covariance. Ours follows the errors through the slope of each correction (in the manner of
-    Gadsden and Habibi 2010). Only its size is right, because all passes see the same noise. A pass counts as one
+    The method gives no covariance. Ours propagates the errors through the slope of each correction (in the manner of
+    Gadsden and Habibi 2010). Only its magnitude is right, because all passes see the same noise. A pass counts as one
     rollout for each rate and parameter, and one for the state.
 
     Reference: Habibi 2007, Proc. IEEE 95(5), 1026-1059; Al-Shabi and Habibi 2011, ISRN Signal Processing 725108, for
@@ -137,7 +137,7 @@ class SVSF(AbstractEstimator):
         valid = ~jnp.isnan(measured)
         error = jnp.where(valid, measured - rates, 0.0)
 
-        # The pseudo-inverse has least norm in units in which every parameter has had the same influence so far.
+        # The pseudo-inverse has least norm in units in which all parameters had the same influence so far.
         energy = energy + jnp.square(jnp.where(valid[:, None], influence, 0.0)).sum(axis=0)
         most, samples = energy.max(), before.samples + 1
         weakness = jnp.sqrt(most / jnp.where(energy > 0, energy, 1.0))

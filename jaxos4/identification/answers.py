@@ -1,4 +1,4 @@
-"""`Answer`: an estimate with intervals; its parameters, and the moments of inertia of a vehicle, as tables."""
+"""`Answer`: an estimate with intervals, and tables of its parameters and moments of inertia."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -29,26 +29,26 @@ UNIT = "kg m^2"
 NEGATIVE_NOTE = "negative, which is impossible; set to 0"
 
 
-SCALE_ERROR = 0.01  # share to which an accelerometer's scale is known, with what forward flight adds to the lift
-GUESSED_DRAG = 0.4  # standard deviation of a guess, as a share: published quadrotors are within it, with exceptions
-# A thrust that differs from the airframe's by more than this share shows that its coefficients were not measured
-# together, so that their ratio may differ as much.
+SCALE_ERROR = 0.01  # relative error of an accelerometer's scale, including the additional lift in forward flight
+GUESSED_DRAG = 0.4  # relative standard deviation of a guess: nearly all published quadrotors are within it
+# If the thrust differs from the airframe's by more than this share, the airframe's coefficients were not measured
+# together, and their ratio may be wrong by as much.
 OTHER_THRUST = 0.1
 UNKNOWN = 1e3  # half-widths; standard deviation of an alpha that was not estimated
-NOTED = 1.05  # the least factor of an interval that is noted, with one decimal
+NOTED = 1.05  # smallest widening factor of an interval that is reported, with one decimal
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Answer:
-    """An estimate of the parameters, with the noise that belongs to them; an `OS4Answer` or a `VehicleAnswer`.
+    """An estimate of the parameters and of the sensors' noise: an `OS4Answer` or a `VehicleAnswer`.
 
-    - `problem`: the flight and its model, with the noise levels of the sensors that were found.
-    - `estimate`: its covariance is that of the intervals.
-    - `bound`: standard deviations of the parameters if the model were right: the Cramer-Rao bound.
-    - `rollouts`: of all searches together.
+    - `problem`: the flight and its model, with the estimated noise levels of the sensors.
+    - `estimate`: the intervals follow from its covariance.
+    - `bound`: the Cramer-Rao bound: standard deviations of the parameters if the model were right.
+    - `rollouts`: simulated flights in all searches together.
     - `fixed`: the parameters that are not estimated.
-    - `negative`: value and standard deviation of the parameters that came out negative, and so are 0.
-    - `profiled`: by which factor the profile made an interval longer, by parameter.
+    - `negative`: value and standard deviation of the parameters that came out negative and were set to 0.
+    - `profiled`: the factor by which the profile widened an interval, by parameter.
     """
 
     problem: ShootingProblem
@@ -66,13 +66,13 @@ class Answer:
 
     @property
     def free(self) -> list[int]:
-        """The places of the parameters that are estimated."""
+        """The indices of the parameters that are estimated."""
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.fixed]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OS4Answer(Answer):
-    """The answer of a flight of an OS4.
+    """The answer for one flight of an OS4.
 
     - `evaluation`, `diagnostics`: the flight simulated at the estimate, and its residuals; `None` without an answer.
     """
@@ -83,11 +83,11 @@ class OS4Answer(Answer):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VehicleAnswer(Answer):
-    """The answer of a vehicle.
+    """The answer for a vehicle.
 
     - `optimum`: where the search ended.
     - `disturbances`: by channel.
-    - `widened`: by which factor the jackknife made an interval longer, by parameter.
+    - `widened`: the factor by which the jackknife widened an interval, by parameter.
     """
 
     optimum: Optimum
@@ -96,7 +96,7 @@ class VehicleAnswer(Answer):
 
 
 def shared_fields(data: Data, answer: Answer, estimator: str) -> dict[str, Any]:
-    """The fields of a result that an OS4 and a vehicle fill in the same way. `estimator`: its name."""
+    """The fields that the results of an OS4 and of a vehicle share. `estimator`: the estimator's name."""
     free = answer.free
     covariance = np.asarray(answer.estimate.covariance)[np.ix_(free, free)]
     return {
@@ -114,7 +114,7 @@ def shared_fields(data: Data, answer: Answer, estimator: str) -> dict[str, Any]:
 def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {}) -> dict[str, ParameterEstimate]:
     """Estimates by parameter name, without those that are fixed.
 
-    The rule of `jaxos4.bracket.is_identifiable` decides which have an estimate. The others have a note instead.
+    Parameters that are not identifiable (`jaxos4.bracket.is_identifiable`) have a note instead of an estimate.
 
     **Arguments:** `prior`: how the estimator uses the bracket. `missing`: why a parameter is not identifiable, by name.
     """
@@ -162,10 +162,10 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
 
 
 def dominated(answer: VehicleAnswer) -> dict[str, str]:
-    """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
+    """The axes on which the disturbance is larger than the effect of the rotors, with the figures in words.
 
-    Yaw is one of them too if the flights say nothing of alpha8. Roll without alpha3, and pitch without alpha6, are not
-    listed: their inertias are missing anyway.
+    Yaw is also listed if alpha8 is not identifiable. Roll without alpha3, and pitch without alpha6, are not listed,
+    because their inertias are missing anyway.
     """
     omega, mixer = np.asarray(answer.problem.flight.omega, dtype=float), np.asarray(answer.problem.model.airframe.mixer)
     torques = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0)
@@ -184,7 +184,7 @@ def dominated(answer: VehicleAnswer) -> dict[str, str]:
 
 
 def thrust_excess(answer: Answer) -> float:
-    """By which share the thrust exceeds that of the airframe at the same speeds; 0 if the logs do not show it."""
+    """The share by which thrust exceeds the airframe's at the same rotor speeds; 0 if the logs do not show it."""
     model, values = answer.problem.model, np.asarray(answer.estimate.parameters)
     if isinstance(model, FlightModel) and follows_commands(model.terms):
         return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
@@ -193,14 +193,14 @@ def thrust_excess(answer: Answer) -> float:
 
 
 def drag_error(answer: Answer) -> float:
-    """The standard deviation of the ratio of drag to thrust, as a share, by what is known of the airframe."""
+    """The relative standard deviation of the ratio of drag to thrust, from the airframe and the fitted thrust."""
     return ratio_error(answer.problem.model.airframe, thrust_excess(answer))
 
 
 def ratio_error(airframe: Airframe, excess: float) -> float:
-    """The standard deviation of an airframe's ratio of drag to thrust, as a share.
+    """The relative standard deviation of an airframe's ratio of drag to thrust.
 
-    `excess`: by which share the thrust exceeds the airframe's.
+    `excess`: the share by which the thrust exceeds the airframe's.
     """
     if airframe.guesses_drag:
         return GUESSED_DRAG
@@ -208,20 +208,20 @@ def ratio_error(airframe: Airframe, excess: float) -> float:
 
 
 def vehicle_constants(answer: Answer) -> RigidBody:
-    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated."""
+    """Ix, Iy and Iz of a vehicle, as far as alpha3, alpha6 and alpha8 were estimated."""
     model, free, values = answer.problem.model, answer.free, np.asarray(answer.estimate.parameters)
     known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), answer.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
     gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
     for gain in gains:
-        # Torques exceed those of the airframe by this factor, also if it is hardly known.
+        # Torques exceed the airframe's by this factor, even if the factor is hardly known.
         for place in INVERSES:
             alpha[place] /= values[gain]
             slopes[place, place], slopes[place, gain] = 1 / values[gain], -alpha[place] / values[gain]
     slopes[~known] = 0.0
     unknown = np.where(known, 0.0, (UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = slopes @ np.asarray(answer.estimate.covariance) @ slopes.T + np.diag(unknown)
-    # What no likelihood sees makes all moments of inertia wrong by one factor.
+    # No likelihood shows an error of the accelerometer's scale, which makes all inertias wrong by one factor.
     scale = SCALE_ERROR * bool(gains)
     shared = scale * np.where(np.isin(np.arange(8), INVERSES), alpha, 0.0)
     covariance += shared[:, None] * shared

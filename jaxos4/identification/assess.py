@@ -20,11 +20,11 @@ from .problem import FlightSettings, Intervals, bracket_of, os4_problem
 class ParameterInformation(msgspec.Struct, frozen=True):
     """The information of a flight about one parameter.
 
-    - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation; `None`: infinite.
-    - `others_known`: the same if all other parameters were known.
-    - `half_width`: of the bracket.
+    - `bound`: the Cramer-Rao bound at the estimated noise levels, as a standard deviation; `None`: infinite.
+    - `others_known`: the same bound if all other parameters were known.
+    - `half_width`: half-width of the bracket.
     - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise.
-    - `unit`: of the first three.
+    - `unit`: the unit of the first three fields.
     - `note`: why the parameter is not identifiable, or an empty string.
     """
 
@@ -41,7 +41,7 @@ class FlightInformation(msgspec.Struct, frozen=True, eq=False):
 
     - `flight`: its name.
     - `fitted`: whether the model could be fitted; otherwise all numbers hold at the bracket's centre.
-    - `sigma`: the noise levels that were found, by channel.
+    - `sigma`: the estimated noise levels, by channel.
     - `parameters`: by name.
     - `identifiability`: the same as arrays.
     """
@@ -53,7 +53,7 @@ class FlightInformation(msgspec.Struct, frozen=True, eq=False):
     identifiability: Identifiability
 
     def to_dict(self) -> dict[str, Any]:
-        """Dictionaries, lists, numbers and strings: what `jaxos4 identifiability` writes as JSON.
+        """Dictionaries, lists, numbers and strings, which `jaxos4 identifiability` writes as JSON.
 
         `eigenvalues`, `directions`: see `jaxos4.Identifiability`; a direction is a row. `None` without a trajectory.
         """
@@ -74,7 +74,7 @@ def assess(
     window: float | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> FlightInformation:
-    """Find the noise levels of a flight, and which parameters it can identify at these. Arguments as of `identify`.
+    """Estimate a flight's noise levels, and find the parameters that it can identify. Arguments as in `identify`.
 
     **Raises:** `InputError`, one line, for arguments and flights that cannot be used.
     """

@@ -32,10 +32,10 @@ from .quantities import vehicle_quantities
 from .results import PredictionSkill, RateSkill, RigidBody, SampleTime, VehicleIdentification
 from .verdict import judge, result_of
 
-# Predictions that a result keeps: those of four minutes, 200 kB of a page.
+# Predictions that a result keeps. They cover four minutes and take 200 kB of a page.
 _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
 REGRESSION = EquationError(memory=0.9)
-"""For comparison. This memory is the best on real flights."""
+"""The regression with which predictions are compared. This memory is the best on real flights."""
 
 
 def judge_vehicle(
@@ -43,7 +43,7 @@ def judge_vehicle(
 ) -> VehicleIdentification:
     """The result of a vehicle, checked against the airframe, other sample times, and measurements that were not fitted.
 
-    `sample_times`: that of the answer is among them. `estimator`: its name.
+    `sample_times`: all that were fitted, including the answer's. `estimator`: the estimator's name.
     """
     progress("checking the answer")
     search, data = str(result_names(answer.estimate.result)), answer.optimum.data
@@ -71,7 +71,7 @@ def judge_vehicle(
         notes = [*notes, f"{hardly}; choose another with `begin`, `end` or `validate`"]
     table, body = parameter_table(answer, GAUSSIAN_PRIOR), vehicle_constants(answer)
     if YAW.motion in dominated(answer):
-        # Vehicles hardly yaw. The other axes do not need it.
+        # Vehicles hardly yaw, and the other axes do not need Iz.
         body = RigidBody({name: row for name, row in body.constants.items() if name != YAW.inertia})
         said = "not identified: the disturbance is larger"
         of_yaw = {YAW.coupling, YAW.inverse} & table.keys()
@@ -101,7 +101,7 @@ def judge_vehicle(
 
 
 def _still_axes(answer: VehicleAnswer, predicted: Predictions) -> tuple[str, ...]:
-    """The axes about which the held-out part hardly turns, or about which it was not measured."""
+    """The axes about which the held-out part hardly turns, or whose rate was not measured there."""
     still = []
     for axis, measured in zip(AXES, np.moveaxis(predicted.measured, 2, 0), strict=True):
         noise = answer.disturbances[axis.rate].sensor if axis.rate in answer.disturbances else 0.0
@@ -112,18 +112,18 @@ def _still_axes(answer: VehicleAnswer, predicted: Predictions) -> tuple[str, ...
 
 
 def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predictions, Predictions, PredictionSkill]:
-    """Predict the rates of measurements that were not fitted, by the answer and by a regression with the same terms.
+    """Predict held-out body rates, by the answer and by a regression with the same terms.
 
-    The answer, with the noise of its filters, predicts the disturbance too, from the measurements before each start.
+    The answer's filters predict the disturbance too, from the measurements before each start.
 
-    **Returns:** its predictions at `HORIZONS`; those between start and end, as trajectories; and the skill.
+    **Returns:** the answer's predictions at `HORIZONS`; its predictions in between, as trajectories; and the skill.
     """
     data, problem, names = answer.optimum.data, held_out.problem, answer.problem.unknowns.names
     values = np.asarray(answer.estimate.parameters)[: len(names)]
 
     def predicted_by(values: np.ndarray, noise: LogNoise | None, horizons: tuple[float, ...] = HORIZONS) -> Predictions:
         parameters = values
-        if held_out.recording is not None:  # the mean of those of which each fitted recording has its own
+        if held_out.recording is not None:  # average the parameters that differ between the fitted recordings
             shared = np.array([without_recording(name) for name in names])
             parameters = np.array([values[shared == name].mean() for name in problem.unknowns.names])
         known = None
@@ -144,7 +144,7 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
 
 
 def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
-    """The problem with all measurements: those that were fitted, and those that were held out of the same flight."""
+    """The problem with all measurements of the held-out flight, including those that were fitted."""
     if held_out.recording is not None:
         return held_out.problem
     own, others = np.asarray(held_out.problem.flight.states), np.asarray(data.problem.flight.states)
@@ -157,8 +157,8 @@ def _disturbances(
 ) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
     """The disturbance of each body rate [rad/s^2] and its innovation [rad/s; NaN: not measured] at each sample.
 
-    Filters know the disturbance from the measurements until the sample. An innovation is a measured rate less its
-    prediction from the sample before. The model is evaluated at the measured rates.
+    Filters estimate the disturbance from the measurements up to each sample. An innovation is a measured rate minus
+    its prediction from the sample before. The model is evaluated at the measured rates.
     """
     samples = problem.flight.time.shape[0]
     problem = with_room(problem, max(samples, data.capacity))
@@ -189,7 +189,7 @@ def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tupl
     torques = omega**2 @ np.asarray(answer.problem.model.airframe.mixer)[:3].T
     crossed = residual_correlations(innovation, torques)
     if (parts := optimum.estimate.parts) is not None:
-        # Of the innovations of the likelihood itself, which is exact for means.
+        # The innovations of the likelihood itself are exact for means.
         products = np.asarray(parts.products).sum(axis=0)[:3]
         crossed = msgspec.structs.replace(crossed, own=products[:, 1:] / np.maximum(products[:, :1], 1.0))
     return traces.thinned(), crossed

@@ -1,4 +1,4 @@
-"""`Data`: what is known of flights before a search, with its provenance."""
+"""`Data`: flights and their likelihood, prepared for a search, with their provenance."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ def silent(stage: str) -> None:
 
 
 class Clock(NamedTuple):
-    """The number of the log of each sample, and the time of the sample in its log [s]."""
+    """For each sample, the number of its log and its time in that log [s]."""
 
     log: Int[np.ndarray, " samples"] = np.zeros(0, int)
     time: Float[np.ndarray, " samples"] = np.zeros(0)
@@ -37,7 +37,7 @@ class HeldOut(NamedTuple):
     """Measurements that are not fitted.
 
     - `problem`: the flight and its model.
-    - `recording`, `clock`: name and times of the other recording that it is; `None`: it is a part of the fitted ones.
+    - `recording`, `clock`: name and times of another recording; `None`: a part of the fitted recordings was held out.
     """
 
     problem: ShootingProblem
@@ -48,11 +48,11 @@ class HeldOut(NamedTuple):
 class Provenance(msgspec.Struct, frozen=True, kw_only=True):
     """Inputs, settings and versions of an identification. Fields that do not apply are not written.
 
-    - `flight`: the name of the flight of an OS4; `flights`, `validate`: of a vehicle's recordings.
-    - `airframe`: its name or file; `terms`: of the vehicle's model; `battery_voltage`: its usual one [V].
-    - `channels`, `initial_state`, `windows`, `samples`: of the problem of a flight.
-    - `sample_time`: of the fitted data [s]. `fitted_seconds`, `tested_seconds`: how long these last [s].
-    - `network`: where a network is from, and how it was trained.
+    - `flight`: the name of an OS4's flight; `flights`, `validate`: the names of a vehicle's recordings.
+    - `airframe`: its name or file; `terms`: of the vehicle's model; `battery_voltage`: the usual voltage [V].
+    - `channels`, `initial_state`, `windows`, `samples`: of an OS4's `ShootingProblem`.
+    - `sample_time`: of the fitted data [s]. `fitted_seconds`, `tested_seconds`: duration of fitted and test data [s].
+    - `network`: the origin of a network, and how it was trained.
     - `notes`: about the data. `command`: the command line, if there was one.
     - `version`, `jax`, `device`, `precision`: of the computation.
     """
@@ -81,14 +81,14 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclasses.dataclass(frozen=True)
 class Data(Generic[L]):
-    """Flights as they are fitted, the measurements that test the answer, and what is known of both.
+    """Flights as they are fitted, the measurements that test the answer, and facts about both.
 
-    - `likelihood`: with its bracket; that of a vehicle is padded.
+    - `likelihood`: the likelihood with its bracket; padded for a vehicle.
     - `problem`: the flight and its model.
-    - `clock`: of each sample of a vehicle's logs; empty for an OS4.
-    - `provenance`: data, settings and versions. `seconds`: how long the fitted measurements of a vehicle last [s].
-    - `held_out`: what is not fitted, if there is anything.
-    - `findings`: what the logs show that concerns moments of inertia. `log_step`: the longest sample of the logs [s].
+    - `clock`: log and time of each sample for a vehicle; empty for an OS4.
+    - `provenance`: data, settings and versions. `seconds`: duration of a vehicle's fitted measurements [s].
+    - `held_out`: the measurements that are not fitted, if any.
+    - `findings`: faults in the logs that concern moments of inertia. `log_step`: the longest sample of the logs [s].
     - `motor_step`: the longest time between new values of the motors in the logs [s].
     - `vibrates`: the body rates that vibrate, each with its frequency [Hz].
     - `follows_commands`: whether rotor speeds are computed from commands.
@@ -108,7 +108,7 @@ class Data(Generic[L]):
 
     @property
     def hides_answers(self) -> bool:
-        """Whether samples hold answers that are commands, so that feedthroughs explain nearly all innovations."""
+        """Whether samples hold the controller's answers as commands: feedthroughs then explain most innovations."""
         return self.follows_commands and bool(getattr(self.likelihood, "answers_within", False))
 
     @property

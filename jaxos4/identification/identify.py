@@ -1,7 +1,7 @@
 """`jaxos4.identify`: from recorded flights to parameters with intervals.
 
-Data with a likelihood are prepared, the likelihood is fitted, and the answer is judged. An OS4 does all of this in
-os4.py; a vehicle in vehicle.py, sample_time.py and checks.py.
+There are three steps: prepare data with a likelihood, fit the likelihood, and judge the answer. Those for an OS4 are in
+os4.py, those for a vehicle in vehicle.py, sample_time.py and checks.py.
 """
 
 import dataclasses
@@ -54,14 +54,14 @@ def identify(
 
     - `flights`: the path of a log, a `Flight`, a `Recording` (a flight with a name), or several for a vehicle.
     - `subject`: a model in alpha_1..8, such as `PublishedOS4()`, or the `Airframe` of a real vehicle.
-    - `settings`: how to look at the flights: `FlightSettings` for a model, `VehicleSettings` for an airframe.
+    - `settings`: `FlightSettings` for a model, `VehicleSettings` for an airframe.
     - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
-      `"filter-error"` for a vehicle, which flies in closed loop. Others for a vehicle search the same likelihood,
-      for example `"ibss"`.
+      `"filter-error"` for a vehicle, which flies in closed loop. The other estimators of a vehicle, such as `"ibss"`,
+      search the same likelihood.
     - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
     - `network`: for a model, a trained network or its file; without it, an estimator that needs a network trains one.
     - `validate`: another flight or path, which is not fitted but predicted.
-    - `seed`: for training a network.
+    - `seed`: random seed for training a network.
     - `progress`: called with the name of each stage.
 
     **Returns:** an `OS4Identification` or a `VehicleIdentification`. Check its `result`.
@@ -102,7 +102,7 @@ def _settings(kind: type[S], settings: Settings | None) -> S:
 
 
 def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> Settings:
-    """The settings for a subject, from options by name; those that were not given are `None`.
+    """The settings for a subject, from options by name. An option that was not given is `None`.
 
     **Raises:** `InputError` for an option that does not fit the subject.
     """

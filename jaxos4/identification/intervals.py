@@ -1,15 +1,15 @@
-"""The correction of a vehicle's intervals: for a wrong model, and for a cost that is not quadratic.
+"""Corrects a vehicle's intervals for a wrong model, and for a cost that is not quadratic.
 
-The covariance of a search assumes that the model is right and the cost quadratic. Standard deviations are multiplied by
-two factors, each of which is at least 1:
+The covariance of a search assumes that the model is right and the cost quadratic. Standard deviations are therefore
+multiplied by two factors, which are at least 1:
 
-- **jackknife**: if parts of the flights give different answers, the model lacks something.
-- **profile**: under a controller, an alpha can be exchanged for strength and time constant of the disturbance. So the
-  cost is flat above an alpha that came out too small. The profile needs no covariance: a 95 % interval ends where the
-  least cost is higher by 1.96^2/2, with all other unknowns fitted again. Only the upper end of poorly known moments of
-  inertia is looked for, because the upper side is longer.
+- **jackknife**: if parts of the flights give different answers, the model lacks an effect.
+- **profile**: under a controller, strength and time constant of the disturbance can compensate for a wrong alpha, so
+  the cost is flat above an alpha that came out too small. The profile needs no covariance: a 95 % interval ends where
+  the cost, minimised over all other unknowns, has risen by 1.96^2/2. Only the upper ends for poorly known moments of
+  inertia are computed, because the upper side is longer.
 
-A likelihood can have several maxima. If the cost is lower at an end than at the optimum, the search starts there again.
+A likelihood can have several maxima. If the cost at an end is lower than at the optimum, the search restarts there.
 """
 
 import dataclasses
@@ -35,22 +35,22 @@ PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included i
 _NOMINAL_NOTE = "at the usual value, which these flights do not contradict"
 
 
-MAX_PARTS = 20  # of flights that are compared
+MAX_PARTS = 20  # most parts of the flights that are compared
 MIN_PARTS = 4  # fewer cannot show a disagreement
-CHANCE = 0.05  # probability that parts of a flight that the model explains are taken to disagree
-WELL_KNOWN = 0.1  # share of a value; with a smaller standard deviation, the cost is nearly quadratic in the interval
+CHANCE = 0.05  # probability that parts seem to disagree although the model is right
+WELL_KNOWN = 0.1  # relative standard deviation; if it is smaller, the cost is nearly quadratic in the interval
 MAX_FITS = 3  # for one end of an interval
 CLOSE = 0.1  # fits end if the root of twice the rise of the cost is this close to 1.96
-MIN_SLOPE = 0.1  # of this root for each standard deviation; it is 1 if the cost is quadratic
-PROFILE_TOLERANCE = 0.04  # of a fit, one or two steps; a cost that is too large by this moves an end by 1 %
-MAX_MINIMA = 3  # whose ends are looked at
-_CLEAR = 1e-5  # the least share of a scaled unknown that the others do not explain, as a root
+MIN_SLOPE = 0.1  # of this root per standard deviation; it is 1 if the cost is quadratic
+PROFILE_TOLERANCE = 0.04  # of a fit, which takes one or two steps; this error of the cost moves an end by 1 %
+MAX_MINIMA = 3  # most minima whose ends are computed
+_CLEAR = 1e-5  # smallest pivot of the Cholesky factor (of scaled unknowns) that counts as regular
 
 
 def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAnswer:
-    """The answer of a search: its intervals corrected, and without the parameters that are not identifiable.
+    """The answer of a search, with corrected intervals and without the parameters that are not identifiable.
 
-    A parameter about which the flights say less than the bracket is not estimated.
+    A parameter is not identifiable if the flights are less informative about it than its bracket.
 
     `profile`: the factors of the profile, by parameter.
     """
@@ -89,7 +89,7 @@ def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAns
 def at_lowest(answer: VehicleAnswer, estimator: AbstractEstimator, *, progress: Progress = silent) -> VehicleAnswer:
     """Profiles the likelihood, starts again at any lower minimum, and widens the intervals accordingly.
 
-    A search that did not converge has no profile. `answer`: by `corrected`, of a search by the `estimator`.
+    A search that did not converge has no profile. `answer`: from `corrected`, found by this `estimator`.
     """
     optimum, data = answer.optimum, answer.optimum.data
     for left in reversed(range(MAX_MINIMA)):
@@ -111,7 +111,7 @@ def at_lowest(answer: VehicleAnswer, estimator: AbstractEstimator, *, progress: 
             break
         progress("fitting again where the cost is lower")
         counted = optimum.likelihood.noise_feedthrough
-        same = data.likelihood.with_noise_feedthrough(counted)  # costs compare in the same likelihood only
+        same = data.likelihood.with_noise_feedthrough(counted)  # costs are comparable only within one likelihood
         other = search(estimator, dataclasses.replace(data, likelihood=same), start=lower, progress=progress)
         rollouts = optimum.rollouts + other.rollouts
         is_lower = has_answer(other.estimate.result) and other.cost < optimum.cost
@@ -124,15 +124,15 @@ def at_lowest(answer: VehicleAnswer, estimator: AbstractEstimator, *, progress: 
 
 
 def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
-    """The end of the interval of one parameter by its profile likelihood.
+    """The upper end of one parameter's interval by its profile likelihood.
 
-    If no fit at an end succeeds, the end is that of the covariance. If a later fit fails, the end is extrapolated from
-    the fits before it. The search for the end is over where the cost is lower than at the optimum.
+    If the first fit fails, the end follows from the covariance. If a later fit fails, the end is extrapolated from the
+    fits before it. The search for the end stops where the cost is lower than at the optimum.
 
     **Returns:** the end in standard deviations above the optimum, and the last fit at an end.
     """
     solver, covariance = FilterError(tolerance=PROFILE_TOLERANCE), np.asarray(optimum.estimate.covariance)
-    # How the minimum moves with this parameter, in steps of its standard deviation.
+    # How all unknowns move if this parameter moves by one standard deviation.
     along = covariance[:, place] / np.sqrt(covariance[place, place])
     unknowns, at, root, end, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
     for _ in range(MAX_FITS):
@@ -153,10 +153,10 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
 def consequences(
     answer: VehicleAnswer, constants: Mapping[str, Constant], name: str, value: float
 ) -> dict[str, Move | None]:
-    """The change of each quantity if a parameter is fixed at a value, and all others are fitted again.
+    """The change of each quantity if a parameter is fixed at a value and all others are fitted again.
 
-    Not by the covariance: under a controller the cost is flat, and an inertia moves two to three times as far. Nothing
-    moves if the search did not find this parameter. `None`: there is no such fit.
+    The covariance does not show it: under a controller the cost is flat, and an inertia moves two to three times as
+    far. Nothing moves if the search did not estimate this parameter. `None`: the fit failed.
     """
     model, optimum = answer.problem.model, answer.optimum
     own, values = optimum.likelihood.problem.unknowns, optimum.values
@@ -185,11 +185,11 @@ def consequences(
 def _widening(
     optimum: Optimum, free: Int[np.ndarray, " free"], recording: Int[np.ndarray, " samples"]
 ) -> Float[np.ndarray, " free"]:
-    """The factors of the jackknife for the parameters in the places `free`. `recording`: of each sample."""
+    """The jackknife's factors for the unknowns with the indices `free`. `recording`: of each sample."""
     index, owned = map(np.asarray, optimum.likelihood.segmentation[:2])
     middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
     segments = optimum.by_segment
-    # In a segment of padding nothing was measured.
+    # Padded segments hold no measurements.
     used = np.asarray(segments.information).any(axis=(1, 2))
     number = recording[np.minimum(middle, recording.size - 1)][used]
     gradient = np.asarray(segments.gradient)[used][:, free]
@@ -208,9 +208,9 @@ def parts_of(segments: int, recording: Int[np.ndarray, " segments"]) -> list[Int
 def _solved(
     information: Float[np.ndarray, "unknowns unknowns"], slope: Float[np.ndarray, " unknowns"]
 ) -> Float[np.ndarray, " unknowns"]:
-    """The Gauss-Newton step; the shortest, if the information (of scaled unknowns) does not determine it.
+    """The Gauss-Newton step, or the shortest one if the information (of scaled unknowns) is singular.
 
-    The shortest takes fifty times as long: minutes for fifty logs.
+    The shortest step takes fifty times as long to compute: minutes for fifty logs.
     """
     try:
         clear = float(np.linalg.cholesky(information).diagonal().min()) > _CLEAR
@@ -225,18 +225,18 @@ def disagreement(
     prior: Float[np.ndarray, "unknowns unknowns"],
     part: Int[np.ndarray, " segments"],
 ) -> Float[np.ndarray, " unknowns"]:
-    """By how much parts disagree: the jackknife's standard error over the likelihood's; at least 1.
+    """The disagreement of parts: the jackknife's standard error over the likelihood's; at least 1.
 
     The standard errors of a likelihood assume that the model is right. If it is not, parts of a flight give different
-    answers. The jackknife leaves out one part at a time; each answer follows from one Gauss-Newton step, because the
-    search has computed the gradient and the information of each part. 1 if the disagreement could be chance: it happens
-    by chance to one parameter in twenty.
+    answers. The jackknife leaves out one part at a time. One Gauss-Newton step gives the answer without that part,
+    because the search has computed the gradient and the information of each part. The result is 1 if the disagreement
+    could be chance: only one parameter in twenty exceeds this threshold by chance.
 
     **Arguments:**
 
     - `gradient`, `information`: of the negative log-likelihood of each segment, at the estimate from all segments.
     - `prior`: the information of the prior.
-    - `part`: the number of the part of each segment.
+    - `part`: the part to which each segment belongs.
 
     Reference: Efron and Tibshirani 1993, An Introduction to the Bootstrap, ch. 11.
     """

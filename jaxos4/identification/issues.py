@@ -32,12 +32,12 @@ from .results import (
 from .sample_time import is_white, moved
 from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_BODY, Issue, Move, Moves
 
-# s; fitted measurements that last less give moments of inertia a reservation; those that last less than half of it do
-# not identify them. Segments last 1.25 s, and the jackknife compares at least four parts.
+# s; with less fitted data, moments of inertia have a reservation; with less than half of it, they are not identified.
+# Segments last 1.25 s, and the jackknife compares at least four parts.
 MIN_SECONDS = 10.0
-VIBRATION = 0.4  # innovations that correlate more bias filter error more than its intervals say
-MAX_SAMPLE = 0.008  # s; longer samples would hide the motion with the vibration
-NO_SKILL = 2.0  # standard errors below 0 of the skill at the shortest horizon: the inertia is not identified
+VIBRATION = 0.4  # if innovations correlate more, filter error is biased by more than its intervals say
+MAX_SAMPLE = 0.008  # s; longer samples would hide the motion along with the vibration
+NO_SKILL = 2.0  # standard errors; an inertia is not identified if the skill at the shortest horizon is so far below 0
 _NOT_LOWEST = (
     "the likelihood has several maxima, and the search did not find the highest",
     "fly more roll, pitch and yaw, or choose another part with `begin` and `end`",
@@ -47,8 +47,8 @@ _NOT_LOWEST = (
 def issues_of_os4(data: Data, found: OS4Identification, fit: Mapping[str, ChannelFit]) -> list[Issue]:
     """The issues about the alphas of an OS4.
 
-    **Arguments:** `found`: with the result code of the search. `fit`: of the channels whose residuals are white if the
-    model is right; see `coloured`.
+    **Arguments:** `found`: the result, with the code of the search. `fit`: the fit of the channels whose residuals are
+    white if the model is right; see `coloured`.
     """
     search, table = found.result, found.parameters
     every = (*table, RIGID_BODY)
@@ -63,7 +63,7 @@ def issues_of_os4(data: Data, found: OS4Identification, fit: Mapping[str, Channe
 
 
 def coloured(fit: Mapping[str, ChannelFit], quantities: Iterable[str]) -> Iterator[Issue]:
-    """Residuals that are not white. A reservation, and no refusal: the noise of the sensors may be coloured."""
+    """Residuals that are not white: only a reservation, because the sensors' noise may be coloured."""
     channels = {name: row.correlation for name, row in fit.items() if row.correlation > COLOURED}
     if channels:
         yield Issue(
@@ -86,14 +86,14 @@ def issues_of_vehicle(
 ) -> list[Issue]:
     """The issues about the estimate of a vehicle.
 
-    **Arguments:** `found`: parameters, the moments of inertia that are judged, the skill of predictions, and the result
-    code of the search. `quantities`: the names of all. `still`: see `issues_of_predictions`.
+    **Arguments:** `found`: parameters, moments of inertia, the skill of predictions, and the result code of the search.
+    `quantities`: the names of all quantities. `still`: see `issues_of_predictions`.
     """
     search, constants, weak = found.result, found.rigid_body.constants, dominated(answer)
     optimum, data, judged = answer.optimum, answer.optimum.data, found.parameters
     if YAW.motion in weak:
         judged = {name: row for name, row in judged.items() if name not in (YAW.coupling, YAW.inverse)}
-    # What is known of a fixed parameter is its bracket.
+    # A fixed parameter is known by its bracket only.
     widths = dict(zip(optimum.unknowns.names, np.asarray(optimum.unknowns.half_width).tolist(), strict=True))
     fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | dict(answer.negative)
     follow = partial(consequences, answer, constants)
@@ -118,7 +118,7 @@ def issues_of_vehicle(
 
 
 def issues_of_log(findings: Sequence[Finding], quantities: Iterable[str] | None = None) -> Iterator[Issue]:
-    """The findings in the logs, as contradictions or as reservations. `quantities`: by default those of each."""
+    """The findings in the logs, as contradictions or reservations. `quantities`: by default those of each finding."""
     for finding in findings:
         severity = CONTRADICTION if finding.contradicted else RESERVATION
         concerned = finding.quantities if quantities is None else quantities
@@ -133,7 +133,7 @@ def _issues_of_search(search: str, quantities: Iterable[str]) -> Iterator[Issue]
 
 
 def _issues_of_limits(answer: Answer) -> Iterator[Issue]:
-    """Parameters that a search ended at their limit with, and the quantities that depend on them."""
+    """Parameters that ended at their limit, and the quantities that depend on them."""
     model, own, values = answer.problem.model, answer.problem.unknowns, np.asarray(answer.estimate.parameters)
     off = np.abs(values[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
     for i in (place for place in answer.free if off[place] > 0.99 * REACH):
@@ -143,7 +143,7 @@ def _issues_of_limits(answer: Answer) -> Iterator[Issue]:
 
 
 def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
-    """The quantities that depend on a parameter directly: by what it acts on."""
+    """The quantities that depend directly on a parameter."""
     (parameter,) = (each for each in model.parameters if each.name == name)
     own = tuple(quantity for quantity, names in model.quantities.items() if name in names)
     if parameter.in_forcing or parameter.scales_torque:
@@ -155,7 +155,7 @@ def model_quantities(model: AbstractModel, name: str) -> tuple[str, ...]:
 
 
 def few_parts(seconds: float) -> Iterator[Issue]:
-    """Measurements that last too few `seconds` to compare parts: nothing shows whether intervals are too narrow."""
+    """Fitted data of too few `seconds` to compare parts, which would show whether intervals are too narrow."""
     if seconds < MIN_SECONDS:
         severity = "unidentifiable" if 2 * seconds < MIN_SECONDS else RESERVATION
         cause = f"only {seconds:.1f} s were fitted, too few to compare parts of the flight: intervals may be too narrow"
@@ -163,28 +163,28 @@ def few_parts(seconds: float) -> Iterator[Issue]:
 
 
 def stronger_or_weaker(response: FrequencyResponse, constants: Mapping[str, Constant]) -> Iterator[Issue]:
-    """An axis that clearly answers the rotors more or less strongly than the model, by its frequency response.
+    """Axes whose measured frequency response is clearly stronger or weaker than the model's.
 
-    A reservation, and no refusal, because the frequency response has two to three times the error of the fit.
+    Only a reservation, because the frequency response has two to three times the error of the fit.
     """
     for axis, found in zip(AXES, response, strict=True):
         agreement, row = found.agreement(), constants.get(axis.inertia)
         if row is not None and agreement.excludes_one(MAX_SHARE):
             ratio, (low, high) = agreement.ratio, agreement.interval
-            # Beyond twice, the inertia would move by more than what is left of it.
+            # Above a ratio of 2, the inertia would move by more than its corrected value: the share exceeds 1.
             share = ratio - 1 if ratio > 2 else abs(1 / ratio - 1)
             verb = f"{axis.motion}es" if axis == PITCH else f"{axis.motion}s"
             yield Issue(
                 RESERVATION,
                 f"from {agreement.low:g} to {agreement.high:g} Hz, the vehicle {verb} {_compared(ratio)} the "
                 f"model (95 %: {low:.2f} to {high:.2f} times)",
-                f"fly more {axis.motion}, or look at its frequency response for what the model lacks",
+                f"fly more {axis.motion}, or look at its frequency response for effects that the model lacks",
                 {axis.inertia: Move(share, share * row.estimate / row.std)},
             )
 
 
 def _compared(ratio: float) -> str:
-    """How strong a motion is that is `ratio` times that of the model."""
+    """Compares a motion with the model's, in words. `ratio`: of their amplitudes."""
     if 0.5 <= ratio <= 2:
         return f"{100 * abs(ratio - 1):.0f} % {'more' if ratio > 1 else 'less'} strongly than"
     return f"{ratio:.2g} times as strongly as"
@@ -221,7 +221,7 @@ def _issues_of_sample_time(
 
 
 def _correlated(row: SampleTime, moves: Mapping[str, Move]) -> Iterator[Issue]:
-    """Innovations that are less correlated than by vibration, and yet not white."""
+    """Innovations that are not white, but less correlated than by vibration."""
     if not is_white(row) and abs(row.correlation) <= VIBRATION:
         cause = f"innovations of the body rates correlate by {row.correlation:.2g} at {1e3 * row.sample_time:.3g} ms"
         yield Issue(RESERVATION, cause, "log faster, or before the filters of the gyro", moves)
@@ -233,10 +233,10 @@ def vibration(
     moves: Mapping[str, Move] = {},
     vibrates: Mapping[str, float] = {},
 ) -> Iterator[Issue]:
-    """A gyro whose noise is not white: the controller answers it, and filter error is biased.
+    """A gyro whose noise is not white: the controller answers the noise, which biases filter error.
 
-    **Arguments:** `sample_time`: of the fitted data [s]. `moves`: of the moments of inertia to another sample time.
-    `vibrates`: the rates that vibrate, each with its frequency [Hz].
+    **Arguments:** `sample_time`: of the fitted data [s]. `moves`: how far the moments of inertia move to another sample
+    time. `vibrates`: the rates that vibrate, with their frequencies [Hz].
     """
     longer = f"average to longer samples by `sample_time` {2 * sample_time:g}, or " * (2 * sample_time <= MAX_SAMPLE)
     for axis in AXES:
@@ -275,7 +275,7 @@ def issues_of_predictions(skill: PredictionSkill | None, still: Sequence[str] = 
             continue
         poor.append(axis.motion)
         named.append(f"{axis.rate} {values[place]:.2g} at {skill.horizons[place]:.2g} s")
-        # Far ahead, what nobody can foresee is larger than what the rotors do. That says nothing of the inertia.
+        # Far ahead, unpredictable gusts outweigh the rotors. That says nothing about the inertia.
         near |= not values[0] > 0
         if values[0] + NO_SKILL * (own.std[0] or 0.0) < 0:
             moves[axis.inertia] = None

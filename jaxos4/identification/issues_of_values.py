@@ -1,4 +1,4 @@
-"""Issues of estimated values: physics or the airframe forbids them; Iz rests on a drag coefficient that few measure."""
+"""Issues of values that physics or the airframe forbids, and of an Iz without a measured drag coefficient."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -20,26 +20,26 @@ Estimated = Mapping[str, tuple[float, float]]
 Consequences = Callable[[str, float], Mapping[str, Move | None]]
 """The changes of quantities if a parameter has another value; see `consequences`."""
 
-# The squared radius of gyration, as a share of that of all mass at the rotors; the second is that of a heavy centre.
+# Limits of the squared radius of gyration, relative to all mass at the rotors. The lower one allows a heavy centre.
 HEAVIEST, LIGHTEST = 1.5, 0.01
-COUPLING = 0.25  # of alpha1, alpha4 and alpha7: aerodynamic moments may look like a gyroscopic coupling of this size
-MAX_DELAY = 0.04  # s; a longer delay of rotors is an error of clocks
+COUPLING = 0.25  # of alpha1, alpha4 and alpha7: aerodynamic moments may mimic a gyroscopic coupling of this size
+MAX_DELAY = 0.04  # s; a longer delay of rotors is a clock error
 ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
-_FLAT = 0.6  # Iz over Ix + Iy of a vehicle with its rotors in a plane is rarely smaller; of a lamina it is 1
+_FLAT = 0.6  # Iz / (Ix + Iy) is rarely smaller if the rotors lie in a plane; for a lamina it is 1
 MEASURE = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
 
 
 def issues_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) -> Iterator[Issue]:
-    """The alphas of an OS4 that no rigid body has.
+    """Alphas of an OS4 that no rigid body can have.
 
-    They contradict the rigid body. Only an alpha outside its bracket is contradicted itself: the bracket says which
-    values the alphas of this flight can have.
+    They contradict the rigid body. An alpha itself is contradicted only if it is outside its bracket, which bounds its
+    possible values.
     """
     gyro, moves = "check the scale, the axes and the signs of the gyro, and the time stamps", {RIGID_BODY: None}
     for name in (axis.coupling for axis in AXES):
         row = table[name]
         if row.estimate is not None and row.std is not None and abs(row.estimate) - SIGNIFICANT * row.std > 1:
-            cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as that of every rigid body"
+            cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as in every rigid body"
             yield Issue(CONTRADICTION, cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket))
     rotor, largest = body.constants.get("J_R"), body.constants.get(YAW.inertia)
     if rotor is not None and largest is not None:
@@ -51,7 +51,7 @@ def issues_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) ->
             yield Issue(CONTRADICTION, cause, remedy, moves)
     if body.consistency_p is not None and body.consistency_p < IMPROBABLE:
         cause = f"the alphas are not those of one rigid body (p = {body.consistency_p:.1g})"
-        yield Issue(CONTRADICTION, cause, f"use the alphas alone; if they should be of a rigid body, {gyro}", moves)
+        yield Issue(CONTRADICTION, cause, f"use the alphas alone; if the body is rigid, {gyro}", moves)
     elif body.is_rigid_body is False:
         cause = "one moment of inertia exceeds the sum of the other two, which no rigid body allows"
         yield Issue(CONTRADICTION, cause, "check `rotor_positions` and `drag_coefficient`", moves)
@@ -70,9 +70,9 @@ def issues_of_values(
     """The issues about the parameters and moments of inertia of a vehicle.
 
     `fixed`: parameters that are not estimated. `log_step`: the longest sample of the logs [s]; `motor_step`: the
-    longest between new values of motors. `follow`: how far the quantities move if a parameter has another value.
+    longest time between new motor values [s]. `follow`: how far quantities move if a parameter has another value.
 
-    The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
+    Parameters are judged by their Cramer-Rao bounds, because standard deviations are large if the model is wrong.
     """
     estimated, stds = {}, {}
     for name, row in parameters.items():
@@ -94,7 +94,7 @@ def _odd_motors(
     wrong: Mapping[Parameter, Issue],
     follow: Consequences,
 ) -> Iterator[Issue]:
-    """Parameters of the motors outside their brackets: what is unusual of a motor may be a fault of the model."""
+    """Motor parameters outside their brackets: an unusual value may be a fault of the model."""
     for parameter in (each for each in model.parameters if each.in_forcing and each not in wrong):
         row = parameters.get(parameter.name)
         if row is not None and row.is_outside_bracket and row.estimate is not None and isinstance(row.bracket, tuple):
@@ -117,7 +117,7 @@ def contradicted(
 ) -> Iterator[tuple[Parameter, Issue]]:
     """The parameters whose values physics or the airframe forbid. `motor_step`: see `issues_of_values`.
 
-    The issue moves other quantities as if the parameter had the value expected from the airframe.
+    The issue moves the other quantities as far as they would move if the parameter had its expected value.
     """
     owner = {name: quantity for quantity, names in model.quantities.items() for name in names}
     for parameter, usual in zip(model.parameters, np.asarray(model.alpha).tolist(), strict=True):
@@ -167,9 +167,9 @@ def _impossible_inertias(constants: Mapping[str, Constant], airframe: Airframe) 
 
 
 def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) -> Iterator[Issue]:
-    """Roll and pitch must answer the rotors, and no axis with the opposite sign; else nothing was identified.
+    """Axes that do not answer the rotors, or with the opposite sign: nothing was identified about them.
 
-    If none has, gyroscopic couplings must be those of a rigid body with these inertias.
+    If all signs are right, the gyroscopic couplings must fit a rigid body with these inertias.
     """
     opposite = False
     for axis in AXES:
@@ -213,7 +213,7 @@ def _turns(estimated: Estimated, stds: Mapping[str, float], airframe: Airframe) 
 
 
 def _p_value(model: CorrectedOS4, alpha: np.ndarray, variance: np.ndarray, unknown: list[int]) -> float:
-    """The probability that alphas of a rigid body disagree this much or more. `unknown`: places that do not count."""
+    """The probability that alphas of a rigid body disagree this much or more. `unknown`: indices to ignore."""
     variance = variance.copy()
     variance[unknown] = np.inf
     variance = np.where(np.isfinite(variance), variance, (1e3 * np.asarray(model.half_width)) ** 2)
@@ -221,7 +221,7 @@ def _p_value(model: CorrectedOS4, alpha: np.ndarray, variance: np.ndarray, unkno
 
 
 def _unseen(estimated: Estimated, log_step: float, follow: Consequences) -> Iterator[Issue]:
-    """A lag or delay of the rotors that the log is too slow to show. `log_step`: its longest sample [s]."""
+    """A lag that the log is too slow to show, or a delay longer than any rotor's. `log_step`: longest sample [s]."""
     lag, error = estimated.get("rotor_lag", (np.inf, 0.0))
     if -SIGNIFICANT * error <= lag < log_step - SIGNIFICANT * error:
         yield Issue(
@@ -247,26 +247,26 @@ def issues_of_iz(
     """The issues about Iz. `table`: of the parameters. `constants`: the moments of inertia that are judged."""
     if YAW.inertia in constants:
         yield from _drag(answer)
-        # All of these would be one fault: a wrong drag coefficient.
+        # All of these signs would have one cause, a wrong drag coefficient, so only the largest counts.
         signs = [*_flat(constants), *_rotor_inertia(table, constants[YAW.inertia])]
         yield from sorted(signs, key=lambda issue: issue.share_of(YAW.inertia))[-1:]
 
 
 def _drag(answer: Answer) -> Iterator[Issue]:
-    """A ratio of drag to thrust that nobody measured: Iz is proportional to it."""
+    """An unmeasured ratio of drag to thrust, to which Iz is proportional."""
     excess, moves = thrust_excess(answer), {YAW.inertia: None}
     if answer.problem.model.airframe.guesses_drag:
         yield Issue("unidentifiable", "`drag_coefficient` is a guess, to which Iz is proportional", MEASURE, moves)
     elif drag_error(answer):
         cause = (
             f"the rotors give {100 * abs(excess):.0f} % {'more' if excess > 0 else 'less'} thrust than the airframe "
-            "says, so that the ratio of drag to thrust, to which Iz is proportional, may be off as much"
+            "says, so that the ratio of drag to thrust, to which Iz is proportional, may be off by as much"
         )
         yield Issue("unidentifiable", cause, MEASURE, moves)
 
 
 def _flat(constants: Mapping[str, Constant]) -> Iterator[Issue]:
-    """An Iz that is too small beside Ix + Iy for a flat vehicle."""
+    """An Iz that is too small for a flat vehicle, compared with Ix + Iy."""
     if not {ROLL.inertia, PITCH.inertia} <= constants.keys():
         return
     x, y, z = (constants[axis.inertia] for axis in (ROLL, PITCH, YAW))
@@ -282,9 +282,10 @@ def _flat(constants: Mapping[str, Constant]) -> Iterator[Issue]:
 
 
 def _rotor_inertia(table: Mapping[str, ParameterEstimate], iz: Constant) -> Iterator[Issue]:
-    """The moments of inertia of a rotor by its reaction in yaw and by its gyroscopic torque in roll and pitch.
+    """A difference between the rotors' inertia from their gyroscopic torques and from their reaction in yaw.
 
-    With the reaction J_R / Iz, and alpha2 = J_R / Ix beside alpha3 = 1 / Ix, the two agree if Iz is right.
+    The first is alpha2 / alpha3, with alpha2 = J_R / Ix and alpha3 = 1 / Ix. The second is the reaction, J_R / Iz,
+    over alpha8. They agree if Iz is right.
     """
     by_yaw = _quotient(table, "rotor_reaction", YAW.inverse)
     for gyroscopic, axis in (("alpha2", ROLL), ("alpha5", PITCH)):
@@ -295,15 +296,15 @@ def _rotor_inertia(table: Mapping[str, ParameterEstimate], iz: Constant) -> Iter
         if abs(off) > SIGNIFICANT * math.hypot(by_axis[1], by_yaw[1]):
             yield Issue(
                 RESERVATION,
-                f"by {axis.motion}, the inertia of the rotors is {by_axis[0] / by_yaw[0]:.2g} times that by their "
-                "reaction in yaw",
+                f"the inertia of the rotors from {axis.motion} is {by_axis[0] / by_yaw[0]:.2g} times the one from "
+                "their reaction in yaw",
                 f"fly more yaw; if `drag_coefficient` is uncertain, {MEASURE}",
                 {YAW.inertia: Move(abs(off) / by_yaw[0], abs(off) / by_yaw[0] * iz.estimate / iz.std)},
             )
 
 
 def _quotient(table: Mapping[str, ParameterEstimate], name: str, inverse: str) -> tuple[float, float] | None:
-    """One parameter over another, if both are positive and no bracket gives more than a share of what is known."""
+    """The ratio of two parameters and its error, if both are positive and hardly rest on their brackets."""
     rows = [table.get(name), table.get(inverse)]
     values, squares = [], 0.0
     for row in rows:

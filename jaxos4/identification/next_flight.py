@@ -1,4 +1,4 @@
-"""What to fly next: for each quantity that is not known well enough, which motion and how long, or the remedy."""
+"""Advice for the next flight: which motion to fly and how long, or the remedy, for each poorly known quantity."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,10 +16,10 @@ _REPEAT = "nothing is missing; repeat the flight and compare the results with `j
 
 
 def next_flight(results: Sequence[Identification], spreads: Mapping[str, float]) -> str:
-    """What to fly next, in one line, for one result or for the mean of several.
+    """Advice for the next flight, in one line, for one result or for the mean of several.
 
-    `spreads`: half of the 95 % interval of each moment of inertia, as a share of it. A reservation about another
-    quantity of a vehicle is no reason to fly.
+    `spreads`: the relative half-width of the 95 % interval of each moment of inertia. Reservations about a vehicle's
+    other quantities are no reason to fly.
     """
     counted = {
         name: [each for each in results if name in each.verdicts and each.verdicts[name].status == status]
@@ -48,7 +48,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
 
 
 def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:
-    """The status of each quantity that a result judges; see `pooled_status`."""
+    """The status of each quantity that any of the results judges; see `pooled_status`."""
     names = dict.fromkeys(name for each in results for name in each.verdicts)
     return {
         name: pooled_status(each.verdicts[name].status for each in results if name in each.verdicts) for name in names
@@ -56,17 +56,17 @@ def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:
 
 
 def spreads_of(found: Identification) -> dict[str, float]:
-    """Half of the 95 % interval of each moment of inertia of a result, as a share of it."""
+    """The relative half-width of the 95 % interval of each moment of inertia of a result."""
     constants = found.rigid_body.constants if found.is_vehicle else {}
     return {name: NINETY_FIVE * row.std / abs(row.estimate) for name, row in constants.items() if row.estimate}
 
 
 def _more(motion: str, spread: float, seconds: float) -> str:
-    """How much more of a motion an interval needs, which falls with the root of the time and with the amplitude.
+    """How much more of a motion to fly: intervals shrink with the root of the time and with the amplitude.
 
-    `seconds`: how long was fitted until now [s].
+    `seconds`: duration of the data fitted so far [s].
     """
-    lacking = (spread / UNCERTAIN) ** 2 - 1  # information, in multiples of that of the flights until now
+    lacking = (spread / UNCERTAIN) ** 2 - 1  # missing information, in multiples of the flights' so far
     if not seconds:
         return f"more {motion}"
     if seconds * lacking <= _MOST:
@@ -79,7 +79,7 @@ def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
     for found in results:
         verdict = found.verdicts[name]
         issues = [each for each in found.issues if each.status_left(name) != IDENTIFIED]
-        # A verdict has the reasons of its own status alone.
+        # A verdict holds only the reasons for its status.
         yield from (each.remedy for each in issues if any(each.cause in said for said in verdict.reasons))
         for said in verdict.reasons:
             cause, _, remedy = said.rpartition("; ")

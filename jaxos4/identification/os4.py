@@ -1,4 +1,4 @@
-"""A flight of an OS4: its data, its parameters with the noise of the sensors that belongs to them, and their checks."""
+"""Identification of an OS4: prepare one flight, estimate parameters and sensor noise, and judge the answer."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -48,8 +48,8 @@ from .quantities import os4_quantities
 from .results import COLOURED, ChannelFit, Constant, OS4Identification, ParameterEstimate, RigidBody, Validation
 from .verdict import CONTRADICTED, judge, result_of
 
-MAX_PASSES = 3  # in which noise levels are found from residuals, before the last estimate
-SETTLED = 0.2  # largest change of a noise level; weights this close to the right ones cost under 1 % of the efficiency
+MAX_PASSES = 3  # that estimate noise levels from residuals, before the last estimate
+SETTLED = 0.2  # relative change of a noise level that ends the passes; such weights cost under 1 % of the efficiency
 
 
 def prepare_os4(
@@ -64,7 +64,7 @@ def prepare_os4(
     seed: int,
     progress: Progress,
 ) -> tuple[Data[ShootingProblem], str, AbstractEstimator]:
-    """The data of one flight, and the name and the estimator that searches it. Arguments as of `identify`."""
+    """The data of one flight, and the name and object of its estimator. Arguments as in `identify`."""
     recording, *others = recordings
     if others:
         raise InputError(
@@ -152,8 +152,8 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
     """Estimate the parameters and the noise levels of one flight.
 
     The noise levels follow from the residuals, and the fit is repeated with them. The covariance of an estimator that
-    shoots is the Cramer-Rao bound, or `robust_covariance` if residuals are coloured. The other estimators have their
-    own, and estimate once more with the last noise levels.
+    shoots is the Cramer-Rao bound, or `robust_covariance` if residuals are coloured. The other estimators give their
+    own covariance, and estimate once more with the last noise levels.
     """
 
     def search(weighted: ShootingProblem, number: int) -> Estimate:
@@ -189,7 +189,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
 
 
 def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name: str) -> OS4Identification:
-    """The result of the flight of an OS4 that an estimator of this name searched: rigid body, issues and verdicts."""
+    """The result for an OS4, with rigid body, issues and verdicts. `name`: the estimator's name."""
     search, flown = str(result_names(answer.estimate.result)), answer.evaluation
     found = OS4Identification(
         model=class_name(answer.problem.model, MODELS),
@@ -212,7 +212,7 @@ def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name:
     # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
     issues = issues_of_os4(data, found, found.fit if estimator.shoots else {})
     verdicts = judge(os4_quantities(found.parameters, found.rigid_body), issues)
-    # Alphas were asked, and not the rigid body. What an OS4 flight does not show is no fault of the answer.
+    # Only the alphas were requested. An alpha that the flight does not show is no fault of the answer.
     wrong = [name for name in found.parameters if verdicts[name].status == CONTRADICTED]
     result = result_of(verdicts, issues, search, wrong if search == "successful" else found.parameters)
     return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
@@ -242,7 +242,7 @@ def _rigid_body(answer: Answer) -> RigidBody:
 
 
 def _validate_on(answer: Answer, held_out: HeldOut) -> Validation:
-    """The fit of the parameters to another flight, of which only the initial state is estimated."""
+    """The fit of the parameters to another flight; only its initial state is estimated."""
     other, name = eqx.tree_at(lambda p: p.sigma, held_out.problem, answer.problem.sigma), held_out.recording or ""
     start, cost, feasible, _ = eqx.filter_jit(fit_start)(padded(other), answer.estimate.parameters)
     if not bool(feasible):

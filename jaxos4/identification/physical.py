@@ -1,4 +1,4 @@
-"""The physical quantities of a result in one table: what terminals, pages and comparisons show first."""
+"""The physical quantities of a result in one table, which terminals, pages and comparisons show first."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from .results import Constant, Identification, RigidBody
 from .verdict import RIGID_BODY, Verdict
 
 CENTER = "center of mass"
-_ORDER = ("thrust", "motors", CENTER, "damping", "drag")  # of a vehicle's verdicts, behind the moments of inertia
+_ORDER = ("thrust", "motors", CENTER, "damping", "drag")  # of a vehicle's quantities, after the moments of inertia
 
 
 class PhysicalQuantity(NamedTuple):
@@ -20,8 +20,8 @@ class PhysicalQuantity(NamedTuple):
 
     - `name`: in words, such as `"rotor lag"`. `unit`: of all numbers; `"1"` without one.
     - `value`, `std`: the estimate and its standard deviation. `ci95`: its 95 % interval.
-    - `condition`: what must be right for it, in words; empty if nothing is named.
-    - `judged`: the name of its verdict. `verdict`: that; `None` without one.
+    - `condition`: the condition under which it holds, in words; may be empty.
+    - `judged`: the name of its verdict. `verdict`: the verdict; `None` without one.
     """
 
     name: str
@@ -35,7 +35,7 @@ class PhysicalQuantity(NamedTuple):
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing refuses it."""
+        """Whether no verdict refuses it."""
         return self.verdict is None or self.verdict.trusted
 
 

@@ -1,4 +1,4 @@
-"""From a recorded flight and a model to the problem that estimators solve."""
+"""Makes the problem that estimators solve, from a recorded flight and a model."""
 
 import dataclasses
 import math
@@ -73,7 +73,7 @@ def _interval(name: str, value: Any) -> list[float]:
 def os4_problem(
     recording: Recording, model: AbstractModel, bracket: Bracket, settings: FlightSettings
 ) -> ShootingProblem:
-    """The problem of explaining one flight by a model, at the standard sensors' noise.
+    """The shooting problem of one flight and a model, with the noise of standard sensors.
 
     **Raises:** `InputError`, one line, for arguments out of range and flights that measured too little.
     """
@@ -148,10 +148,10 @@ def train_network(
     initial_state: str = "free",
     seed: int = 0,
 ) -> TrainedNetwork:
-    """Train a network that identifies any flight with the inputs of this one. Arguments as of `identify`.
+    """Train a network that identifies any flight with the inputs of this one. Arguments as in `identify`.
 
     - `settings`: of the training, except the channels.
-    - `channels`: what the network looks at; by default the rates, and the attitude if a rate was not measured.
+    - `channels`: the network's inputs; by default the rates, and the attitude if a rate was not measured.
     """
     where, own = bracket_of(bracket, model), FlightSettings(channels=channels, initial_state=initial_state)
     problem = os4_problem(recording, model, where, own)

@@ -1,4 +1,4 @@
-"""The quantities that get a verdict: of a vehicle, and of an OS4."""
+"""The quantities of a vehicle and of an OS4 that get a verdict."""
 
 from collections.abc import Iterator, Sequence
 
@@ -24,7 +24,7 @@ def vehicle_quantities(
 ) -> dict[str, Quantity]:
     """Moments of inertia, the quantities of the terms, and predictions.
 
-    **Arguments:** `table` and `constants` of the answer, and the `skill` about all axes but those that stand `still`.
+    **Arguments:** `table`, `constants`: of the answer. `skill`: of its predictions. `still`: axes without predictions.
     """
     model, own, found = answer.problem.model, answer.problem.unknowns, {}
     shares = dict(zip(own.names, np.square(answer.bound / np.asarray(own.half_width)).tolist(), strict=True))
@@ -81,7 +81,7 @@ def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str,
             check = "check the airframe, or " if name in (*PARAMETER_NAMES, *of_airframe) else ""
             found.append(f"{name} is outside its bracket; {check}give a wider `bracket`")
     resting = (name for name in rows if shares[name] > MAX_PRIOR)
-    return *found, *(f"{name} rests on its bracket for {100 * shares[name]:.0f} %" for name in resting)
+    return *found, *(f"{100 * shares[name]:.0f} % of the information about {name} is its bracket" for name in resting)
 
 
 def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> Quantity:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 VEHICLE_MODEL = "flight"  # the name of the model of a vehicle, in files and on the command line
 APART = {"rigid_body", "airframe", "estimate", "problem"}  # fields that a file holds in another form, or not at all
-LATE = 0.005  # s; with a `rotor_delay` below minus this, motors are recorded late
+LATE = 0.005  # s; a `rotor_delay` below minus this means that motors are recorded late
 
 
 class ParameterEstimate(msgspec.Struct, frozen=True):
@@ -33,9 +33,9 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
 
     - `estimate`, `ci95`: the estimate and its 95 % interval; `None` if the parameter is not identifiable.
     - `std`: standard deviation of the estimate; `None` if it is not finite.
-    - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation.
-    - `unit`: of all these. `note`: a warning, or an empty string.
-    - `bracket`: where the parameter was searched; of a vehicle, a prior with this centre and half-width.
+    - `bound`: the Cramer-Rao bound at the estimated noise levels, as a standard deviation.
+    - `unit`: the unit of these fields. `note`: a warning, or an empty string.
+    - `bracket`: where the parameter was searched; for a vehicle, a prior with this centre and half-width.
     - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise. Only for one
       flight of an OS4.
     """
@@ -59,7 +59,7 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
 
 
 class Constant(msgspec.Struct, frozen=True):
-    """A physical constant that follows from the parameters. `note`: what of the airframe must be right (vehicle)."""
+    """A physical constant that follows from the parameters. `note`: its condition on the airframe (vehicle only)."""
 
     estimate: float
     std: NotNegative
@@ -70,7 +70,7 @@ class Constant(msgspec.Struct, frozen=True):
 class RigidBody(msgspec.Struct, frozen=True):
     """The moments of inertia that explain alpha_1..8 best.
 
-    - `constants`: those of Ix, Iy, Iz and J_R that are identifiable.
+    - `constants`: Ix, Iy, Iz and J_R, as far as they are identifiable.
     - `consistency_p`: the probability that the alphas of a rigid body disagree this much or more; `None`: not tested.
     - `is_rigid_body`: whether no moment of inertia exceeds the sum of the other two; `None`: not tested.
     """
@@ -104,7 +104,7 @@ class ChannelFit(msgspec.Struct, frozen=True):
 
 
 class Validation(msgspec.Struct, frozen=True):
-    """The fit of the model to a flight that was not fitted; `None` if its trajectory diverges."""
+    """The fit of the model to another flight. `cost` and `fit` are `None` if its trajectory diverges."""
 
     flight: str
     cost: float | None
@@ -130,7 +130,7 @@ class RateSkill(msgspec.Struct, frozen=True):
 
 
 class Disturbance(msgspec.Struct, frozen=True):
-    """The disturbance of a channel: all that acts on it besides the model.
+    """The disturbance of a channel: everything that acts on it besides the model.
 
     - `strength`: standard deviation, in `unit`. `time_constant`: of the Ornstein-Uhlenbeck process [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
@@ -154,7 +154,7 @@ class Disturbance(msgspec.Struct, frozen=True):
 class SampleTime(msgspec.Struct, frozen=True):
     """The moments of inertia of a vehicle at one sample time [s].
 
-    - `correlation`: the largest of the innovations of a body rate. `samples`: how many innovations of a rate count.
+    - `correlation`: the largest correlation of a body rate's innovations. `samples`: their number for each rate.
     """
 
     sample_time: Positive
@@ -174,15 +174,15 @@ class PredictionSkill(msgspec.Struct, frozen=True):
 
 
 class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """The parameters of a quadrotor, with what a user needs to judge them.
+    """The parameters of a quadrotor, and the evidence by which to judge them.
 
     Made by `jaxos4.identify`, or read from a file by `jaxos4.read_result`; either is an `OS4Identification` or a
     `VehicleIdentification`.
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
-    - `rollouts`: simulated flights of all searches; of a vehicle, of those at the chosen sample time by its estimator.
-    - `cost`: 1/2 |W (y - x)|^2 at the estimate; of a vehicle the negative log-likelihood. `None` without one.
+    - `rollouts`: simulated flights in all searches; for a vehicle, in its estimator's at the chosen sample time.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate; for a vehicle, the negative log-likelihood. `None` if not finite.
     - `seconds`: computing time [s].
     - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
@@ -191,8 +191,8 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `provenance`: inputs, settings, versions, and notes about the data.
     - `covariance`: of `parameters`; `None` without an answer.
     - `airframe`: the constants that were not estimated.
-    - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the noise levels
-      that were found. Files do not hold them: `None` if the result was read from one.
+    - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the estimated
+      noise levels. Files do not hold them: `None` if the result was read from one.
     - `traces`: signals of the fitted flights, at most 1,200 samples. `correlations`: of the residuals. `None` without
       an answer.
     """
@@ -256,7 +256,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return sample_vehicles(self, samples, key=key)
 
     def to_dict(self) -> dict[str, Any]:
-        """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON.
+        """Dictionaries, lists, numbers and strings, which `jaxos4 estimate` writes as JSON.
 
         `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`.
         """
@@ -289,7 +289,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return Plots(self)
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Constants, parameters and held parameters as a pandas DataFrame, one row each by name.
+        """Constants, parameters and fixed parameters (`held`) as a pandas DataFrame, in rows by name.
 
         Columns: `kind`, `unit`, `estimate`, `std`, `low` and `high` (the 95 % interval), `bound`, `note`.
 
@@ -328,7 +328,7 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False)
     - `held`: parameters that were not estimated.
     - `noise`: standard deviation of the sensors' noise by channel.
     - `disturbances`: the accelerations that the model lacks, by channel.
-    - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
+    - `widened`: the factor by which an interval was widened because parts of the flights disagree, by parameter.
     - `sample_times`: the moments of inertia at each sample time that belongs to the answer; empty if only one does.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
     - `predictions`: the predictions themselves, at most 1,200 starts. `trajectories`: the same every 20 ms, at most 40.

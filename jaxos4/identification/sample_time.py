@@ -1,11 +1,11 @@
-"""The fit of a vehicle at the shortest sample time at which the answer does not depend on it.
+"""Fits a vehicle at the shortest sample time that does not influence the answer.
 
 Short samples contain the vibration of the sensors. Long samples hide motion. The flight is fitted at several sample
 times. A sample time that the user gives is fitted in the same way, and longer ones beside it.
 
-The rule: the shortest sample time at which the innovations of the body rates are nearly white, and the moments of
-inertia are those of the next longer samples with an answer, within two standard deviations, and known nearly as well.
-If there is none: the shortest with white innovations. If there is none either: the least correlated.
+The rule takes the shortest sample time at which the innovations of the body rates are nearly white, and the moments of
+inertia agree with those at the next longer sample time within two standard deviations and are known nearly as well. If
+there is none, it takes the shortest with nearly white innovations, or else the one with the least correlated ones.
 """
 
 import dataclasses
@@ -35,12 +35,12 @@ DEFAULT = "filter-error"
 """The estimator of a vehicle, which flies in closed loop."""
 
 TOLERANCE = 1e-3  # of `FilterError`: it stops within 0.05 standard deviations of the minimum
-WHITE = 0.06  # largest correlation of innovations that count as white, besides chance
-CHANCE = 3.0  # standard errors of a correlation, of which the largest of 24 (3 rates, 8 lags) is compared
-AGREE = 2.0  # standard deviations between two answers that agree
-DISCRETE = 0.03  # share of a value that errors of discretisation add to it
-WIDER = 1.5  # intervals longer by this factor than those of samples twice as long agree with anything
-NEAR_LIMIT = 0.95  # share of the way to its limit from which on an unknown is no start for another search
+WHITE = 0.06  # largest correlation of innovations that count as white, in addition to chance
+CHANCE = 3.0  # standard errors of a correlation; the largest of 24 (3 rates, 8 lags) is compared
+AGREE = 2.0  # most standard deviations between two answers that agree
+DISCRETE = 0.03  # relative error of discretisation
+WIDER = 1.5  # intervals wider than at twice the sample time by this factor would agree with anything
+NEAR_LIMIT = 0.95  # share of the way to its limit; an unknown beyond it starts no other search
 
 
 def vehicle_estimator(estimator: str | AbstractEstimator, network: GivenNetwork) -> str:
@@ -67,10 +67,10 @@ def fit_vehicle(
 ) -> tuple[VehicleAnswer, tuple[SampleTime, ...]]:
     """The parameters and the disturbances at the chosen sample time.
 
-    `FilterError` searches at all sample times, and another estimator then at the chosen one.
+    `FilterError` searches at all sample times. Any other estimator then searches at the chosen one.
 
-    **Arguments:** `several`: the data, the shortest sample time first. `choose`: whether a sample time is to be chosen;
-    otherwise it is the first. `seed`: for training a network.
+    **Arguments:** `several`: the data, the shortest sample time first. `choose`: whether to choose a sample time;
+    otherwise the first is used. `seed`: random seed for training a network.
 
     **Returns:** the answer, and a row for each sample time that belongs to it.
     """
@@ -86,14 +86,14 @@ def fit_vehicle(
         answer = corrected(search(solver, data, progress=progress))
     answer = at_lowest(answer, solver, progress=progress)
     rows[place : place + 1] = [sample_time_of(answer)]
-    # After a restart, the other sample times have the minimum that was left.
+    # After a restart, the rows of the other sample times belong to the abandoned minimum.
     return answer, (rows[place],) if answer.optimum.restarts else tuple(rows)
 
 
 def _with_estimator(
     data: Data[InnovationsProblem], estimator: str | AbstractEstimator, *, seed: int, progress: Progress
 ) -> tuple[Data[InnovationsProblem], AbstractEstimator]:
-    """The estimator, with a network that is trained for the data if it needs one; the data, with a note on that."""
+    """The data, with a note if a network was trained for them, and the estimator, with that network."""
     if not isinstance(estimator, str):
         return data, estimator
     if not ESTIMATORS[estimator].needs_network:
@@ -116,10 +116,11 @@ def fit_sample_times(
 ) -> tuple[list[VehicleAnswer], list[SampleTime]]:
     """The answers at the sample times that can be compared, the shortest first, and a row for each.
 
-    Samples of commands that hold the controller's answers are another kind: feedthroughs hide nearly all that they
-    show. They are fitted only if no others have white innovations, and the kind with the least correlated is returned.
+    Samples that hold the controller's answers as commands are a kind of their own: feedthroughs explain most of their
+    innovations. They are fitted only if the other kind has no white innovations. The kind with the least correlated
+    innovations is returned.
 
-    `choose`: whether the sample time is to be chosen; otherwise the kind of the first counts.
+    `choose`: whether to choose the sample time; otherwise only the kind of the first is fitted.
     """
     kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
     answers, rows = [], []
@@ -146,8 +147,8 @@ def search_sample_times(
 ) -> list[Optimum]:
     """The optimum at each sample time.
 
-    The search for all parameters starts at the answer of the sample time before, if that is a minimum. It starts at the
-    bracket's centre where feedthroughs are no longer estimated.
+    Each search starts at the answer for the next longer sample time, if that is a minimum. It starts at the bracket's
+    centre where feedthroughs are no longer estimated.
 
     **Arguments:** `several`: one flight at several sample times, each twice the one before.
     """
@@ -164,7 +165,7 @@ def search_sample_times(
 
 
 def start_of(likelihood: InnovationsProblem, found: Estimate) -> Float[np.ndarray, " unknowns"] | None:
-    """The start of a search, by the estimate for longer samples; `None` if that is no minimum."""
+    """The start of a search from the estimate for longer samples; `None` if that is no minimum."""
     own, start = likelihood.problem.unknowns, np.asarray(found.parameters)
     off = np.abs(start[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
     # Near a limit, the answer may be another minimum.
@@ -173,7 +174,7 @@ def start_of(likelihood: InnovationsProblem, found: Estimate) -> Float[np.ndarra
 
 
 def chosen_place(rows: Sequence[SampleTime]) -> int:
-    """The place of the sample time that the rule chooses. `rows`: the shortest sample time first."""
+    """The index of the sample time that the rule chooses. `rows`: the shortest sample time first."""
     answered = [i for i, row in enumerate(rows) if row.constants] or [0]
     longer = dict(itertools.pairwise(answered))
     clean = [i for i in answered if is_white(rows[i])]
@@ -187,13 +188,13 @@ def is_white(row: SampleTime) -> bool:
 
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:
-    """Whether the next longer sample time with an answer finds the same, and knows it no better."""
+    """Whether the next longer sample time with an answer agrees, and is not clearly more certain."""
     shared = row.constants.keys() & other.constants.keys()
     return bool(shared) and not moved(row, other) and not _less_certain(row, other)
 
 
 def _less_certain(row: SampleTime, other: SampleTime) -> bool:
-    """Whether another sample time knows Ix or Iy clearly better."""
+    """Whether Ix or Iy is clearly more certain at the other sample time."""
     both = {ROLL.inertia, PITCH.inertia} & row.constants.keys() & other.constants.keys()
     return any(row.constants[name].std > WIDER * other.constants[name].std for name in both)
 
@@ -209,7 +210,7 @@ def moved(row: SampleTime, other: SampleTime) -> list[str]:
 
 
 def sample_time_of(answer: VehicleAnswer) -> SampleTime:
-    """The answer of one sample time. Without a thrust there is no scale of torques, and so no answer."""
+    """The answer at one sample time. Without a thrust, torques have no scale, so there is no answer."""
     scales = [each.name for each in answer.problem.model.parameters if each.scales_torque]
     answered = answer.answered and not any(name in answer.fixed for name in scales)
     constants = vehicle_constants(answer).constants if answered else {}
@@ -218,6 +219,6 @@ def sample_time_of(answer: VehicleAnswer) -> SampleTime:
     found = [answer.disturbances[axis.rate] for axis in AXES if axis.rate in answer.disturbances] * answer.answered
     largest, samples = max((row.correlation for row in found), key=abs, default=1.0), 0
     if answer.answered and answer.estimate.parts is not None:
-        # The sum of the squares of the innovations of a body rate, which have a mean of 1.
+        # Squared innovations have a mean of 1, so that their sum is their number.
         samples = round(float(np.asarray(answer.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))
     return SampleTime(float(answer.problem.flight.dt), constants, largest, samples)

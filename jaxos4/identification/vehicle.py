@@ -1,4 +1,4 @@
-"""Recordings of a vehicle: its data at several sample times, with the likelihood of innovations."""
+"""From a vehicle's recordings to its data at several sample times, with the likelihood of innovations."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions
 from .problem import Intervals, bracket_of
 
 SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
-RECORDINGS = 4  # from twice this many on, there are more segments
+RECORDINGS = 4  # twice this many or more have more segments
 MIN_SEGMENT = 1.25  # s
-# Up to this sample time [s], torque hardly answers what is measured in its own sample, if that is an instant or if
-# motors follow commands. These need the innovations of the samples before, too (`lagged`).
+# Up to this sample time [s], torque hardly answers a measurement in its own sample, if measurements are instants or
+# motors follow commands. Commands then need the innovations of earlier samples, too (`lagged`).
 UNANSWERED = 0.005
 SIGMA = 0.5  # rad/s; the scale of the errors of a simulation, for networks
 GUESS_REACH = 4.0  # alpha8 may be this many times a guess too small or too large: published drag torques differ as much
@@ -39,8 +39,8 @@ class VehicleSettings:
 
     - `terms`: of `jaxos4.TERMS`; by default those that the recordings allow.
     - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.
-    - `sample_time`: average to samples of this length [s]; by default the best from 0.002 s (commands: 0.004 s), or
-      that of the recordings if it is longer, to 0.032 s.
+    - `sample_time`: average to samples of this length [s]; by default the best one up to 0.032 s, from 0.002 s
+      (commands: 0.004 s) or the recordings' sample time if it is longer.
     - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
     """
 
@@ -59,7 +59,7 @@ def prepare_vehicle(
     bracket: Intervals = None,
     validate: Recording | None = None,
 ) -> list[Data[InnovationsProblem]]:
-    """The data at several sample times, the shortest first. Arguments as of `identify`."""
+    """The data at several sample times, the shortest first. Arguments as in `identify`."""
     if validate is not None and settings.holdout:
         raise InputError("`holdout`: `validate` is predicted instead of a part of the flights; leave one of them out.")
     if validate is not None and any(validate.same_data(recording) for recording in recordings):
@@ -71,7 +71,7 @@ def prepare_vehicle(
     prepared = prepare(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
-    # All sample times share one program, with room for the shortest, the finest.
+    # All sample times share one program, with capacity for the shortest, which has the most samples.
     return [
         _data(recordings, airframe, settings, each, prepared[0], bracket=bracket, validate=validate)
         for each in prepared
@@ -91,7 +91,7 @@ def _data(
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
     if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
-        value, error = prepared.level  # the flight says how the accelerometer errs along z
+        value, error = prepared.level  # the flight shows the accelerometer's error along z
         bracket = {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
     powered = any(VOLTAGE in TERMS[term].needs for term in terms)
     if powered and voltage is not None and SAG in model.parameter_names and not isinstance(bracket, Bracket):
@@ -139,21 +139,21 @@ def _data(
 
 
 def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingProblem:
-    """The problem of a vehicle's flight: its rates, and what its model says of specific force."""
+    """The problem of a vehicle's flight: its rates, and specific force if the model predicts it."""
     return ShootingProblem(model, flight, sigma=np.full(12, SIGMA), channels="rates", method="rk4", **settings)
 
 
 def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared) -> InnovationsProblem:
-    """The likelihood of a vehicle, in a program for all flights that are not longer than the `finest`."""
+    """The likelihood of a vehicle, padded so that all flights up to the length of the `finest` share a program."""
     recordings = max(prepared.recordings) + 1
-    # Segments are as many for all sample times, and last a while at the longest.
+    # All sample times have the same number of segments, so that none is too short at the longest.
     seconds = float(finest.fitted.dt) * finest.fitted.time.shape[0]
     most = SEGMENTS * max(recordings // RECORDINGS, 1)
     segments = int(np.clip(seconds / MIN_SEGMENT, 2 * recordings if recordings > 1 else 1, most))
     least_noise = np.append(np.zeros(3), prepared.force_noise[list(shooting.model.force_axes)])
     capacity = capacity_of(finest.fitted.time.shape[0])
     flight, commanded = shooting.flight, COMMANDS in prepared.available
-    # Torque before an instant cannot answer it. Motors answer more slowly than a short sample lasts.
+    # Torque before a measured instant cannot answer it, and motors take longer to answer than a short sample lasts.
     is_late = float(flight.averaging_time) == 0.0 or commanded
     return InnovationsProblem(
         with_room(shooting, capacity),
@@ -167,7 +167,7 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
 def _input_innovations(
     shooting: ShootingProblem, capacity: int, *, commanded: bool
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
-    """Those of the body rates and of the vertical force, of a flight that is padded to `capacity` samples."""
+    """Input innovations of body rates and vertical force, padded to `capacity`; `None` without `Flight.within`."""
     flight, columns = shooting.flight, shooting.columns
     if flight.within is None:
         return None
@@ -221,7 +221,7 @@ def _prepare_other(validate: Recording, sample_time: float, model: FlightModel) 
     for term in model.terms:
         if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
             raise InputError(
-                f"{validate.name}: `validate` did not measure what the term {term} needs; give `terms` without it."
+                f"{validate.name}: `validate` lacks measurements that the term {term} needs; give `terms` without it."
             )
     return other
 

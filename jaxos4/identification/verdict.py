@@ -31,12 +31,12 @@ RESERVATION, CONTRADICTION = "successful", "implausible"
 """Severities of an issue, by the result code to which it leads."""
 
 
-# An issue that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. By
-# more than one of them, it makes a reservation; by neither, it is a note. A `RESERVATION` contradicts only if it
-# moves the quantity by more than its own size. Errors of discretisation reach 3 %. Moves add up.
+# An issue that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. If
+# it exceeds only one of the limits, it makes a reservation; if neither, it is a note. A `RESERVATION` contradicts only
+# if the quantity moves by more than its own size. Errors of discretisation reach 3 %. Moves add up.
 MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
-# Half of the 95 % interval as a share of a moment of inertia, from which on the quantity has a reservation, or is not
-# identified. With intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
+# Relative half-widths of a 95 % interval above which a moment of inertia has a reservation, or is not identified. With
+# intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
 UNCERTAIN, TOO_UNCERTAIN = 0.1, 0.4
 MAX_PRIOR = 0.25  # share of the information about a parameter that its bracket may give without a reservation
 SIGNIFICANT = 3.0  # standard deviations that exceed chance
@@ -46,7 +46,7 @@ IMPROBABLE = 1e-3  # a smaller probability exceeds chance
 class Move(msgspec.Struct, frozen=True):
     """The change of a quantity if an issue were true.
 
-    - `share`: of the quantity. Parameters can be 0: theirs is a share of the half-width of their bracket.
+    - `share`: relative to the quantity; for parameters, which can be 0, relative to the half-width of their bracket.
     - `deviations`: the same in standard deviations of the estimate.
     """
 
@@ -55,21 +55,21 @@ class Move(msgspec.Struct, frozen=True):
 
     @property
     def limits_exceeded(self) -> int:
-        """The number of the two limits that it exceeds."""
+        """How many of the two limits the change exceeds."""
         return (self.share > MAX_SHARE) + (self.deviations > MAX_DEVIATIONS)
 
 
 Moves = Mapping[str, Move | None]
-"""Quantities by name, and how far each would move; `None`: nothing says how far."""
+"""How far each quantity would move, by name; `None`: unknown."""
 
 
 class Issue(msgspec.Struct, frozen=True):
-    """What speaks against an estimate, or a part of it.
+    """Evidence against an estimate, or against a part of it.
 
-    - `severity`: `CONTRADICTION` by physics, the airframe or the data; `RESERVATION`, which refuses nothing; otherwise
-      the flights or the search do not show the quantities, and this is the name of the result code to which it leads.
+    - `severity`: `CONTRADICTION` by physics, the airframe or the data; `RESERVATION`, which refuses nothing; or the
+      name of another result code, if the flights or the search do not determine the quantities.
     - `cause`, `remedy`: what is wrong, and what to do.
-    - `moves`: the quantities that it concerns, and how far each would move if the issue were true.
+    - `moves`: the quantities that it concerns, and how far they would move if the issue were true.
     """
 
     severity: str = msgspec.field(name="result")
@@ -78,18 +78,18 @@ class Issue(msgspec.Struct, frozen=True):
     moves: Moves = {}
 
     def __post_init__(self) -> None:
-        msgspec.structs.force_setattr(self, "moves", dict(self.moves))  # nobody else's
+        msgspec.structs.force_setattr(self, "moves", dict(self.moves))  # a copy
 
     def __str__(self) -> str:
         return f"{self.cause}; {self.remedy}"
 
     @property
     def status(self) -> str:
-        """The status that it leaves to a quantity if nothing says how far the quantity would move."""
+        """The status of a quantity with this issue, if it is unknown how far the quantity would move."""
         return {RESERVATION: RESERVED, CONTRADICTION: CONTRADICTED}.get(self.severity, MISSING)
 
     def share_of(self, name: str) -> float:
-        """By which share the quantity of this name would move; 0 if nothing says how far."""
+        """The share by which the quantity of this name would move; 0 if unknown."""
         return 0.0 if (move := self.moves.get(name)) is None else move.share
 
     def status_left(self, name: str) -> str:
@@ -107,7 +107,7 @@ class Verdict(msgspec.Struct, frozen=True):
     """Whether a quantity can be trusted.
 
     - `status`: `identified`, `identified with a reservation`, `not identified` or `contradicted`.
-    - `value`: of the quantity, with its 95 % interval and its conditions, in words; empty if parameters show it.
+    - `value`: the quantity's value, 95 % interval and conditions, in words; empty if the parameters show them.
     - `reasons`: the reservations, or the causes with their remedies. Empty if the quantity is `identified`.
     """
 
@@ -124,11 +124,11 @@ class Verdict(msgspec.Struct, frozen=True):
 class Quantity(NamedTuple):
     """A quantity before it is judged.
 
-    - `value`: see `Verdict`. `spread`: half of its 95 % interval, as a share of it; 0 if it can be 0.
+    - `value`: see `Verdict`. `spread`: relative half-width of the 95 % interval; 0 if the quantity can be 0.
     - `missing`: why there is no estimate, and what to do; empty if there is one.
     - `reservations`: caveats that are not issues.
     - `remedy`: what to do if the interval is too long.
-    - `requires`: the quantities without which it cannot be trusted either.
+    - `requires`: the quantities that must be trusted too.
     """
 
     value: str = ""
@@ -140,7 +140,7 @@ class Quantity(NamedTuple):
 
 
 def judge(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> dict[str, Verdict]:
-    """The verdict for each quantity. `issues`: all of the identification."""
+    """The verdict for each quantity. `issues`: all issues of the identification."""
     verdicts = {}
     for name, quantity in quantities.items():
         causes: dict[str, list[str]] = {status: [] for status in STATUSES}
@@ -167,8 +167,8 @@ def judge(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> dict[s
 def result_of(verdicts: Mapping[str, Verdict], issues: Sequence[Issue], search: str, required: Iterable[str]) -> str:
     """The name of the result code: `"successful"` if all required quantities can be trusted.
 
-    Otherwise that of the first issue that refuses one of them. If there is none: `search`, the code of the search, or
-    `"unidentifiable"` if the search was successful.
+    Otherwise the code of the first issue that refuses one of them. If there is no such issue, the code of the `search`,
+    or `"unidentifiable"` if the search was successful.
     """
     refused = [name for name in required if not verdicts[name].trusted]
     if not refused:
@@ -178,7 +178,7 @@ def result_of(verdicts: Mapping[str, Verdict], issues: Sequence[Issue], search: 
         for name in (each for each in refused if left[each][place] not in _TRUSTED):
             if issue.severity != RESERVATION:
                 return issue.severity
-            # A reservation that contradicts together with another decides nothing by itself.
+            # A reservation that contradicts only together with another issue does not decide the code.
             if issue.status_left(name) not in _TRUSTED:
                 return CONTRADICTION
     return search if search != "successful" else "unidentifiable"
@@ -187,8 +187,8 @@ def result_of(verdicts: Mapping[str, Verdict], issues: Sequence[Issue], search: 
 def _statuses_left(issues: Sequence[Issue], name: str) -> list[str]:
     """The status that each issue leaves to the quantity of this name.
 
-    Reservations of known size add up. If one of them is impossible, and together they exceed what one issue may move,
-    they contradict the quantity: an impossible parameter shows that the model errs, and another issue by how much.
+    Reservations of known size add up. If one of them is due to an impossible parameter, and their sum exceeds both
+    limits, they contradict the quantity: the parameter shows that the model is wrong, the other issues by how much.
     """
     alone = [issue.status_left(name) for issue in issues]
     reserved = (i for i, status in enumerate(alone) if status == RESERVED)
@@ -200,7 +200,7 @@ def _statuses_left(issues: Sequence[Issue], name: str) -> list[str]:
 
 
 def _reason(issue: Issue, name: str) -> str:
-    """The issue in words, with how far it moves this quantity, or the inertias if it is this quantity's own."""
+    """The issue in words, and how far it moves this quantity, or else the inertias."""
     if (move := issue.moves.get(name)) is not None:
         return f"{issue.cause} (this would move it by {percent(move.share)})"
     moves = {each: issue.moves.get(each) for each in INERTIAS}
@@ -223,7 +223,7 @@ def statuses_of(verdicts: Mapping[str, Verdict]) -> dict[str, str]:
 
 
 def pooled_status(statuses: Iterable[str]) -> str:
-    """The status of the mean of several results: the worst of those that count, or of all if none counts."""
+    """The status of the mean of several results: the worst of the trusted results, or of all if none is trusted."""
     given = list(statuses)
     return max([each for each in given if each in _TRUSTED] or given, key=STATUSES.index)
 

@@ -29,14 +29,14 @@ class Parameter(NamedTuple):
     """One unknown of a model.
 
     - `half_width`, `center`: of the default bracket of a term's parameter.
-    - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
+    - `each_recording`: whether each recording has a separate value. If not, the vehicle has one value.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
-    - `in_forcing`: whether the forcing depends on it. If not, the rate equations are linear in it. The model sets it.
+    - `in_forcing`: whether the forcing depends on it; set by the model. If not, the rate equations are linear in it.
     - `nonnegative`: whether physics forbids a negative value.
-    - `scales_torque`: whether torque exceeds that of the airframe by this factor.
-    - `plain`: the usual value, at which the parameter is held unless the flights clearly contradict it.
-    - `contradiction`: a function of a value and its error. It returns why physics or the airframe forbids the value,
-      and what to do; `None` if nothing does.
+    - `scales_torque`: whether torque exceeds the airframe's by this factor.
+    - `plain`: the usual value, at which the parameter is fixed unless the flights clearly contradict it.
+    - `contradiction`: a function of a value and its error. It returns cause and remedy if physics or the airframe
+      forbids the value, otherwise `None`.
     """
 
     name: str
@@ -55,9 +55,9 @@ class Parameter(NamedTuple):
 class ByRecording(NamedTuple):
     """The parameters of each of several recordings.
 
-    - `model`: of any one of them.
-    - `places`: of the parameters of `model` among those of all recordings.
-    - `number`: of the recording of each sample, counted from 0 in order.
+    - `model`: the model of a single recording, the same for all.
+    - `places`: for each recording, the indices of the parameters of `model` among the parameters of all recordings.
+    - `number`: the recording of each sample, counted from 0 in order.
     """
 
     model: "AbstractModel"
@@ -125,13 +125,13 @@ class AbstractModel(eqx.Module):
         return tuple(jax.tree.leaves(state))
 
     def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> "ByRecording | None":
-        """The model of one recording, if several in a row have parameters of their own. `stretch`: see `Flight`."""
+        """The model of one recording, if several in order have separate parameters. `stretch`: see `Flight`."""
         del stretch
         return None
 
     @property
     def quantities(self) -> dict[str, list[str]]:
-        """The physical quantities beside moments of inertia, each with the names of its parameters. Default: none."""
+        """The physical quantities besides moments of inertia, with the names of their parameters. Default: none."""
         return {}
 
     @property

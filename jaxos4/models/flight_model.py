@@ -51,7 +51,7 @@ class FlightModel(AbstractModel):
       `motor`, `lag` and `delay` if rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0; the last number holds
       for all stretches that follow. Each recording has its own offsets and gyro biases.
-    - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V].
+    - `battery_voltage`: V_0, the voltage at which a command gives the rotor speed in the flight [V].
     - `batch`: up to this many samples of a padded flight, or parts of them, are computed together.
 
     **Raises:** `ValueError` for terms that do not exist, are given twice or exclude each other, recordings that are not
@@ -86,7 +86,7 @@ class FlightModel(AbstractModel):
         powered = [term for term in terms if VOLTAGE in TERMS[term].needs]
         if powered and battery_voltage is None:
             raise ValueError(f"`battery_voltage` must be given for the term {powered[0]}: it is the usual voltage.")
-        # All flights of one recording share a program, in however many stretches they are.
+        # All flights of one recording share a program, however many stretches they have.
         every = list(recordings)
         while every[-2:] == every[-1:] * 2:
             every.pop()
@@ -100,7 +100,7 @@ class FlightModel(AbstractModel):
 
     @property
     def quantities(self) -> dict[str, list[str]]:
-        """The quantities that the terms describe, each with its parameters, without biases; see `Term.quantity`."""
+        """The quantities that the terms describe, with their parameters but without biases; see `Term.quantity`."""
         found: dict[str, list[str]] = {}
         for term, _, parameter in self._table:
             if term.quantity and parameter.force_axis is None:
@@ -147,7 +147,7 @@ class FlightModel(AbstractModel):
         return not any(term.gyro or term.accelerometer for term in self._terms)
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The chain from commands to torque and thrust: each term acts at its place. Padding takes no time."""
+        """The chain from commands to torque and thrust, in which each term acts at its place. Padding takes no time."""
         if inputs.within is None:
             return self._beside(inputs, self._rotors(inputs, parameters))
         samples, parts, _ = inputs.within.shape
@@ -158,18 +158,18 @@ class FlightModel(AbstractModel):
         return self._beside(inputs, jax.tree.map(lambda leaf: leaf[following].mean(axis=1), fine))
 
     def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The forcing over each sample around its time, as `Flight.within` has the rotor speeds."""
+        """The mean forcing of each sample, around its time like the rotor speeds in `Flight.within`."""
         if inputs.within is None:
             return self.forcing(inputs, parameters)
         samples, parts, _ = inputs.within.shape
         edges, length = np.linspace(0, 1, parts + 1), jnp.asarray(inputs.averaging_time) / inputs.dt
-        after = jnp.clip(edges - (1 - length) / 2, 0, length)  # begin of the window
-        # The share of the measurement's rows that are left after a time: its integral over each part, doubled.
+        after = jnp.clip(edges - (1 - length) / 2, 0, length)  # since the beginning of the window
+        # The share of a measurement's rows that are later than a time, integrated over each part and doubled.
         rows = jnp.round(1 / jnp.sqrt(jnp.maximum(1 - length**2, 1e-6)))
         many = jnp.minimum(edges, (1 + length) / 2) - after**2 / jnp.where(length > 0, 2 * length, 1.0)
         few = sum(jnp.where(i < rows, jnp.minimum(edges, (i + 0.5) / rows), 0.0) / rows for i in range(parts - 1))
         left = 2 * jnp.diff(jnp.where(rows < parts, few, many))
-        wide = jnp.maximum(length, 2 / parts)  # an instant is seen as the parts before and after it
+        wide = jnp.maximum(length, 2 / parts)  # an instant counts as the parts before and after it
         seen = jnp.diff(jnp.clip(edges - (1 - wide) / 2, 0, wide)) / wide
 
         def averaged(fine: Forcing) -> Forcing:
@@ -181,7 +181,7 @@ class FlightModel(AbstractModel):
         return self._beside(inputs, self._rotors(inputs.divided, parameters, parts=parts, of_parts=averaged))
 
     def _beside(self, inputs: Inputs, rotors: Forcing) -> Forcing:
-        """The forcing by the rotors, and what acts beside them."""
+        """The forcing by the rotors, completed by recording and velocity."""
         own, velocity = jnp.zeros(inputs.omega.shape[0], dtype=int), inputs.velocity
         if inputs.stretches is not None:
             own = of_stretches(self.recordings, inputs.stretches.number)
@@ -191,7 +191,7 @@ class FlightModel(AbstractModel):
     def _rotors(
         self, inputs: Inputs, parameters, *, parts: int = 0, of_parts: Callable[[Forcing], Forcing] = lambda fine: fine
     ) -> Forcing:
-        """The forcing by the rotors, as `of_parts` makes it. `parts`: of each sample, if `inputs` hold them."""
+        """The forcing by the rotors, transformed by `of_parts`. `parts`: parts per sample; 0: `inputs` are samples."""
         grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=parts > 0)
         if inputs.length is not None:
             whole = self.batch - self.batch % max(parts, 1)  # a batch holds all parts of its samples
@@ -200,7 +200,7 @@ class FlightModel(AbstractModel):
         return of_parts(self._driven(inputs, grid, every, parameters)[0])
 
     def _driven(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
-        """The forcing by the rotors over some samples, and the rotor speeds at the end of the last."""
+        """The forcing by the rotors over some samples, and the rotor speeds at the end of the last sample."""
         airframe = self.airframe
 
         def omega(rows: Int[Array, "*rows"]) -> Float[Array, "*rows 4"]:
@@ -243,21 +243,21 @@ class FlightModel(AbstractModel):
         return jax.tree.map(lambda leaf: leaf[: samples * many // rows], filled)
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
-        """p', q', r' [rad/s^2]: the rigid body's, and the contribution of each term."""
+        """p', q', r' [rad/s^2] of the rigid body, with the contribution of each term."""
         total = self._rigid_body.angular_acceleration(rates, forcing, tuple(parameters[:8]))
         for add, values in self._contributions("angular_acceleration", parameters, forcing):
             total = add(total, values, rates, forcing)
         return total
 
     def specific_force(self, thrust: Samples, forcing: Forcing, parameters) -> Vector:
-        """The specific force along the body's axes [m/s^2] that a specific thrust and the terms make."""
+        """The specific force along the body's axes [m/s^2] from a specific thrust and the terms."""
         force = (jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust)
         for add, values in self._contributions("specific_force", parameters, forcing):
             force = add(force, values, forcing)
         return force
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
-        """See `AbstractModel`. Terms use the measured body velocity, or else that of the state."""
+        """See `AbstractModel`. Terms use the measured body velocity, or else the velocity of the state."""
         t, orientation = state.translation, None if state.attitude is None else Orientation.of(state.attitude)
         forcing = self._with_velocity(forcing, t, orientation)
         rates = self.angular_acceleration(state.rates, forcing, parameters)
@@ -298,7 +298,7 @@ class FlightModel(AbstractModel):
 
     def _of_terms(self, constant: Callable[[Parameter], OfAirframe]) -> Parameters:
         """A constant of each row of the table, for this airframe."""
-        # In the order of the table: a set would order the operations of a program by the addresses of its functions.
+        # In the order of the table, because a set would order a program's operations by the addresses of functions.
         constants = [constant(parameter) for *_, parameter in self._table]
         values = {c: as_float(c(self.airframe) if callable(c) else c) for c in dict.fromkeys(constants)}
         return jnp.stack([values[c] for c in constants]) if constants else jnp.zeros(0)
@@ -311,7 +311,7 @@ class FlightModel(AbstractModel):
         return [(change, self._values(term, parameters, forcing)) for term, change in acting if change]
 
     def _values(self, term: Term, parameters, forcing: Forcing | None) -> Values:
-        """The values of a term's parameters by name: for each sample those of its recording."""
+        """The values of a term's parameters by name. In each sample, the values of its recording count."""
         found: dict[str, list[Scalar]] = {}
         for place, (owner, name, _) in enumerate(self._table, start=len(PARAMETER_NAMES)):
             if owner is term:
@@ -339,7 +339,7 @@ def without_recording(name: str) -> str:
 
 @functools.cache
 def _table(terms: tuple[Term, ...], force_axes: tuple[int, ...], recordings: int) -> tuple[Row, ...]:
-    """The parameters term by term, and within a term recording by recording; names count recordings from 1."""
+    """The parameters by term, and within a term by recording. Names count recordings from 1."""
     rows, numbers = [], [""] if recordings == 1 else [f"_{i + 1}" for i in range(recordings)]
     for term in terms:
         sources = [source for source in term.parameters if source.force_axis in (None, *force_axes)]

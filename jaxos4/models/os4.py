@@ -1,4 +1,4 @@
-"""The two models of the OS4: as the paper prints it, and the same as a rigid body.
+"""The two models of the OS4: as the paper prints it, and corrected to a rigid body.
 
 Eqs. (1)-(3) and (7)-(9) of the paper are `PublishedOS4`; (4)-(6) `state.attitude_rates`; (10)-(13) `Airframe.mixer`,
 with alpha by `alpha_from_inertia`; (14) `STATE_NAMES`.
@@ -19,7 +19,7 @@ from .state import Forcing, Orientation, Rates, State, Translation, attitude_rat
 
 
 class AbstractOS4(AbstractModel):
-    """The common part of the OS4 models, of alpha_1..8. `gyroscopic_unit`: the unit of alpha2 and alpha5."""
+    """The common part of the OS4 models, with alpha_1..8. `gyroscopic_unit`: the unit of alpha2 and alpha5."""
 
     gyroscopic_unit: ClassVar[str]
 
@@ -69,8 +69,8 @@ class AbstractOS4(AbstractModel):
 class PublishedOS4(AbstractOS4):
     """The model exactly as the paper prints it: Eqs. (1)-(13), kept as a benchmark.
 
-    It departs from a rigid body (`CorrectedOS4`) in three places: the gyroscopic terms lack the rotor speed, so that
-    alpha2 = J_R d / Ix [1/s]; Eq. (2) has alpha5 r, physics has alpha5 p; Eqs. (7)-(9) mix two earth frames.
+    It departs from a rigid body (`CorrectedOS4`) in three places. The gyroscopic terms lack the rotor speed, so that
+    alpha2 = J_R d / Ix [1/s]. Eq. (2) has alpha5 r instead of alpha5 p. Eqs. (7)-(9) mix two earth frames.
     """
 
     gyroscopic_unit: ClassVar[str] = "1/s"

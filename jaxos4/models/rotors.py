@@ -1,4 +1,4 @@
-"""Rotors between command and thrust: a delay, the motor, and the thrust that the speeds make."""
+"""Rotors between command and thrust: a delay, the motor, and the thrust of the rotor speeds."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -17,16 +17,16 @@ Commands = Callable[[Int[Array, "*rows"]], Float[Array, "*rows 4"]]
 
 
 def of_stretches(recordings: tuple[int, ...], stretch: Int[Numeric, " samples"]) -> Int[Numeric, " samples"]:
-    """The recordings of these stretches; the last of `recordings` is that of all stretches that follow."""
-    xp = np if isinstance(stretch, np.ndarray) else jnp  # what is known needs no compiled program
+    """The recordings of these stretches. The last of `recordings` holds for all stretches that follow."""
+    xp = np if isinstance(stretch, np.ndarray) else jnp  # known numbers need no compiled program
     return xp.asarray(recordings)[xp.minimum(stretch, len(recordings) - 1)]
 
 
 class Grid(NamedTuple):
     """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
 
-    `elapsed`: the fitted time in the recording before it [s]. `voltage`: of the battery over `battery_voltage`.
-    `are_parts`: the samples are parts of those of the flight (`Flight.within`), with their mean speeds.
+    `elapsed`: the fitted time in the recording before the sample [s]. `voltage`: the battery's over `battery_voltage`.
+    `are_parts`: whether the samples are parts of the flight's samples (`Flight.within`), with their mean speeds.
     """
 
     dt: Scalar
@@ -53,9 +53,9 @@ class Grid(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Some samples of a grid in a row, computed together.
+    """Consecutive samples of a grid, computed together.
 
-    - `rows`: their numbers.
+    - `rows`: the numbers of the samples.
     - `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
     """
 
@@ -78,10 +78,10 @@ class Speeds(NamedTuple):
 
 
 def measured_speeds(omega: Commands, batch: Batch) -> Speeds:
-    """Speeds that are held over each sample. The last row of a stretch changes nothing.
+    """Speeds that are constant over each sample. After the last row of a stretch they do not change.
 
-    Means over parts of a sample change between their edges, where cubics through the means of the four parts around an
-    edge have their values.
+    If the samples are parts, `change` is the difference between the edges of a part. A cubic through the means of the
+    four parts around an edge gives the speed there.
     """
     first, last = batch.grid.first[batch.rows], batch.grid.last[batch.rows]
 
@@ -107,7 +107,7 @@ def squared(speeds: Speeds, batch: Batch) -> tuple[RotorSpeeds, RotorSpeeds]:
 
 
 def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
-    """Commands that act `delay` [s] later. Before a stretch its first command acts, and after it its last one.
+    """Commands that act `delay` [s] later. Before a stretch, its first command acts, and after it, its last command.
 
     Cubics interpolate between samples (Catmull and Rom 1974): a delay of whole samples is exact, and the derivative in
     the delay has no jumps at which a search could end.
@@ -139,26 +139,25 @@ class Motor(NamedTuple):
 
         lag w' = g(u - c w) - k w^2.
 
-    u - c w is the voltage less that which the motor itself makes. It drives the current and so the torque, g(x) = x.
-    Below 0 the motor brakes with a share of it, g(x) = braking x - (1 - braking) s (1 - exp(x / s)).
-    Without a load, and with full braking, this is a first-order system.
+    u - c w is the voltage minus the motor's back EMF. It drives the current and so the torque, g(x) = x. Below 0 the
+    motor brakes with a share of this torque, g(x) = braking x - (1 - braking) s (1 - exp(x / s)). Without a load, and
+    with full braking, this is a first-order system.
 
     - `lag`: time constant without a load [s].
     - `curve`: 1: the thrust is quadratic in the command, as without a load. 0: it is linear.
-    - `braking`: the torque of a motor that is faster than its voltage, as a share of that of a drive. 0: it coasts.
+    - `braking`: the torque of a motor that is faster than its voltage, as a share of the driving torque. 0: it coasts.
     - `full`: the speed at the full command [rad/s].
-    - `sag`: the share of the battery's voltage that the load of hover takes, `hover` [rad/s] being the speed of all
-      rotors then. The voltage falls with the sum of the rotors' currents, so that a command to all rotors gains less
-      than one to a single rotor. The current is taken as proportional to the cube of the speed.
+    - `sag`: the share of the battery's voltage that the load of hover takes. `hover`: the speed of all rotors in hover
+      [rad/s]. The voltage falls with the sum of the rotors' currents, so a command to all rotors has less effect than a
+      command to a single rotor. The current is assumed to be proportional to the cube of the speed.
 
-    The same for all motors:
+    Constants of all motors:
 
-    - `smooth`: s, the voltage as a share of the full one over which a motor passes from driving to braking: the ripple
-      of its current.
-    - `shortest_lag`: the lag that acts is at least this share of a sample, so that a step stays finite wherever a
-      search looks.
-    - `emptiest`: no load takes more than the rest of the battery's voltage.
-    - `least`: smaller numbers under a root or in a quotient count as this.
+    - `smooth`: s, the range of voltage over which a motor passes from driving to braking, as a share of the full
+      voltage. It is not 0 because the current has ripple.
+    - `shortest_lag`: the lag is at least this share of a sample, so that a step stays finite wherever a search goes.
+    - `emptiest`: at least this share of the battery's voltage remains under any load.
+    - `least`: the lower limit of numbers under a root or in a quotient.
     """
 
     smooth = 0.005
@@ -178,11 +177,11 @@ class Motor(NamedTuple):
         return command * jnp.maximum(1 - self.sag * (jnp.mean((omega / self.hover) ** 3) - 1), self.emptiest)
 
     def command(self, omega: Speed) -> Speed:
-        """The command [rad/s] that keeps a speed."""
+        """The command [rad/s] that maintains a speed."""
         return omega * (self.curve + (1 - self.curve) * omega / self.full)
 
     def settled(self, command: Speed) -> Speed:
-        """The speed [rad/s] that a command keeps."""
+        """The speed [rad/s] at which rotors settle under a command."""
         root = jnp.sqrt(jnp.maximum(self.curve**2 + 4 * (1 - self.curve) * command / self.full, self.least))
         return 2 * command / jnp.maximum(self.curve + root, self.least)
 

@@ -1,7 +1,7 @@
 """The state of a quadrotor as a cascade, and the forcing: rotors -> torque -> rates -> attitude -> translation.
 
-Parameters enter the forcing and the rates alone, and no level feeds back: a `State` may stop at any level, and what
-is `None` is not simulated. States are scalars, because a batch of scalars vectorises.
+Parameters enter the forcing and the rates alone, and no level feeds back. So a `State` may stop at any level; a level
+that is `None` is not simulated. States are scalars, because a batch of scalars vectorises.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ class Attitude(NamedTuple):
 
 
 class Orientation(NamedTuple):
-    """The sines and cosines of an attitude, which are slow to compute and which several equations use."""
+    """The sines and cosines of an attitude, which are slow to compute and used by several equations."""
 
     sin_phi: Samples
     cos_phi: Samples
@@ -79,8 +79,8 @@ class Forcing(NamedTuple):
     - `specific_thrust`: U_c/m around the time of the sample [m/s^2], as an accelerometer measures it.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
     - `velocity`: along the body's axes, measured or by dead reckoning [m/s].
-    - `early`: the same, weighted by the time that is left in the sample: what they add to a mean over it. `None`:
-      instants.
+    - `early`: the forcing weighted by the time that remains in the sample, for its effect on a mean over the sample.
+      `None`: measurements are instants.
     """
 
     roll: Samples

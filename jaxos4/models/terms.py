@@ -1,7 +1,7 @@
 """The terms of the vehicle model: one object for each effect of real vehicles that the corrected OS4 lacks.
 
-A new term is one more `Term` in `TERMS`, or an entry point of another package in the group `jaxos4.terms`; everything
-else is found in that object.
+A new term is one more `Term` in `TERMS`, or an entry point of another package in the group `jaxos4.terms`. Nothing else
+needs to be changed.
 """
 
 from collections.abc import Callable, Container, Iterable, Mapping
@@ -18,7 +18,7 @@ from .abstract import Contradiction, Parameter
 from .rotors import Batch, Commands, Grid, Motor, Speeds, delayed, driven
 from .state import Forcing, Rates, Samples, Vector
 
-# What a term can need from the logs or from the airframe.
+# The data that a term can need from the logs or from the airframe.
 COMMANDS = "commands"
 VELOCITY = "velocity"
 MEASURED_VELOCITY = "measured velocity"
@@ -28,13 +28,13 @@ FULL_SCALE = "full scale"
 VOLTAGE = "battery voltage"
 
 STEEPEST = 1.2
-"""A thrust curve beyond this is no propeller's."""
+"""The largest `thrust_curve` of a propeller."""
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
 VERTICAL_BIAS = _FORCE_BIASES[2]
-"""The parameter that is the constant error of the accelerometer along z."""
+"""The parameter for the constant error of the accelerometer along z."""
 SAG, VOLTAGE_EXPONENT = "battery_sag", "voltage_exponent"
-"""The share of the battery's voltage that the load of hover takes; the power of the logged voltage."""
+"""The share of the battery's voltage that the load of hover takes; the exponent of the logged voltage."""
 
 T = TypeVar("T")
 Values = Mapping[str, Float[Array, "..."]]
@@ -47,14 +47,15 @@ class Term:
 
     - `description`: the effect, its parameters and their units.
     - `parameters`: the table of its parameters.
-    - `needs`: what the log or the airframe must have, by the constants at the top of this file.
-    - `by_default`: takes what is available; returns whether an estimate uses the term if the user names none.
+    - `needs`: the data that logs or airframe must have, named by the constants at the top of this file.
+    - `by_default`: whether an estimate uses the term if the user names none, as a function of the available data.
     - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
-    - `quantity`: what its parameters describe together, if that has a verdict of its own; see
+    - `quantity`: the quantity that its parameters describe together, if it gets a verdict; see
       `Identification.verdicts`.
 
-    The other fields are the contributions, at least one. Each is a function of the quantity without the term, and of
-    the values of the term's parameters by name. It returns the quantity with the term. They act in this order:
+    The other fields are contributions; a term has at least one. A contribution is a function of the quantity without
+    the term, and of the values of the term's parameters by name. It returns the quantity with the term. Contributions
+    act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s], a function of the numbers of the samples.
     - `speed(omega, values, batch, airframe)`: the rotor speeds that follow the commands over some samples. Only one of
@@ -64,8 +65,8 @@ class Term:
     - `gyro(rates, values)`: the measured body rates [rad/s].
     - `accelerometer(force, values)`: the measured specific force [m/s^2]. It makes specific force a measurement.
 
-    `values` holds those of the sample's recording. The first two contributions act before recordings are distinguished:
-    `ValueError` if each recording has its own value.
+    `values` holds the values for the sample's recording. The first two contributions act before recordings are
+    distinguished: `ValueError` if a parameter of such a term has a separate value for each recording.
     """
 
     description: str
@@ -97,7 +98,7 @@ class Term:
 
 
 def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
-    """A fifth of the hover torque of two rotors (in yaw a fifth of it) over the inertia [rad/s^2], divided by `per`."""
+    """A fifth of the hover torque of two rotors (in yaw 1/25) over the inertia [rad/s^2], divided by `per`."""
 
     def share(airframe: Airframe) -> Scalar:
         arm = jnp.abs(jnp.asarray(airframe.rotor_positions)).mean()
@@ -112,7 +113,7 @@ def _reaction(airframe: Airframe) -> Scalar:
 
 
 def _unsure_reaction(airframe: Airframe) -> Scalar:
-    """Twice the airframe's value, because moments of inertia of rotors are estimated; wide if it has none."""
+    """Twice the airframe's value, because rotors' moments of inertia are estimates; a wide default if it has none."""
     known = _reaction(airframe)
     return jnp.where(known > 0, 2 * known, 0.01)
 
@@ -149,7 +150,7 @@ _LEVEL = _limits((-0.6, 0.6, _OFF, "correct `mass` or `gravity`, or calibrate th
 
 
 def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[[Rates, Values, Rates, Forcing], Rates]:
-    """Adds to each axis its parameter of this name times a number; there is none for an axis without a parameter."""
+    """Adds the parameter of this name times a number to each axis. `per_unit` may omit the last axes."""
 
     def add(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
         axes = zip(MOTIONS, total, (*per_unit(rates, forcing), None), strict=False)
@@ -179,7 +180,7 @@ def _velocity(forcing: Forcing):
 
 
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    """Against the velocity along each axis for which there is a parameter."""
+    """Subtracts drag times velocity along each axis that has a drag parameter."""
     drags = (values.get(f"{axis}_drag") for axis in "xyz")
     each = zip(force, drags, _velocity(forcing), strict=True)
     x, y, z = (a if drag is None else a - drag * v for a, drag, v in each)
@@ -191,12 +192,12 @@ def _add_force_bias(force: Vector, values: Values) -> Vector:
     return x, y, z
 
 
-# Rotors of 2 to 15 inches have 0.01 to 0.08 s. A time constant of less than -0.002 s is neither chance nor rounding.
+# Rotors of 2 to 15 inches have lags of 0.01 to 0.08 s. A lag of less than -0.002 s is neither chance nor rounding.
 _LAG = Parameter("rotor_lag", "s", 0.035, center=0.045, contradiction=_limits((-0.002, _INF, _LATE, _CLOCKS)))
 
 _OWN: dict[str, Term] = {
     "offset": Term(
-        "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
+        "a constant torque about each axis, for each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
         tuple(Parameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(MOTIONS)),
         angular_acceleration=_torque("offset", lambda rates, forcing: (1.0, 1.0, 1.0)),
     ),
@@ -209,7 +210,7 @@ _OWN: dict[str, Term] = {
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
-        # By thrust about roll and pitch. About yaw by the drag of rotors, about 0.3 1/s, times m r^2 / Iz, about 2.
+        # Thrust damps roll and pitch. Yaw is damped by the drag of rotors, about 0.3 1/s, times m r^2 / Iz, about 2.
         tuple(
             Parameter(f"{x}_damping", "1/s", half_width, center=center, nonnegative=True, contradiction=_DAMPED)
             for x, center, half_width in zip(MOTIONS, (0.0, 0.0, 0.5), (5.0, 5.0, 0.5), strict=True)
@@ -237,7 +238,7 @@ _OWN: dict[str, Term] = {
         "commands lose effect as the battery empties: battery_fade [1/s], the share of rotor speed lost in a second",
         (Parameter("battery_fade", "1/s", 3e-3),),
         needs=frozenset({COMMANDS, VERTICAL_FORCE}),
-        # A logged voltage knows it.
+        # A logged voltage already shows the fade.
         by_default=lambda available: VOLTAGE not in available,
         command=_scaled(lambda values, grid, rows: 1 - values["battery_fade"] * grid.elapsed[rows]),
     ),
@@ -257,7 +258,7 @@ _OWN: dict[str, Term] = {
         quantity="motors",
     ),
     "lag": Term(
-        "rotors follow their commands as first-order systems: rotor_lag [s]; if no load can be found",
+        "rotors follow their commands as first-order systems: rotor_lag [s]; for logs without the data for `motor`",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
         speed=lambda omega, values, batch, airframe: driven(omega, Motor(values["rotor_lag"]), batch),
@@ -265,7 +266,7 @@ _OWN: dict[str, Term] = {
     ),
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
-        # A delay of the motors, and an offset between the clocks of motors and gyro, of either sign.
+        # The delay of the motors plus an offset between the clocks of motors and gyro, which may have either sign.
         (Parameter("rotor_delay", "s", 0.02, center=0.005),),
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
         quantity="motors",
@@ -308,7 +309,7 @@ _OWN: dict[str, Term] = {
         quantity="drag",
     ),
     "gyro_bias": Term(
-        "rates are measured with an offset, of each recording: p_bias, q_bias, r_bias [rad/s]",
+        "rates are measured with an offset, for each recording: p_bias, q_bias, r_bias [rad/s]",
         tuple(Parameter(f"{rate}_bias", "rad/s", 0.1, each_recording=True) for rate in "pqr"),
         by_default=lambda available: False,
         gyro=lambda rates, values: Rates(*(a + values[f"{rate}_bias"] for a, rate in zip(rates, "pqr", strict=True))),
@@ -317,7 +318,7 @@ _OWN: dict[str, Term] = {
 
 
 TERMS: Registry[Term] = Registry("jaxos4.terms", _OWN)
-"""The terms by name. One of another package (an entry point in the group `jaxos4.terms`) is used if it is named."""
+"""The terms by name. A term of another package (an entry point in the group `jaxos4.terms`) is used only by name."""
 
 
 def default_terms(available: frozenset[str]) -> tuple[str, ...]:
@@ -333,7 +334,7 @@ def follows_commands(terms: Iterable[str]) -> bool:
 def clash(terms: Container[str]) -> str:
     """Why these terms cannot be used together; empty if they can."""
     first, *others = [name for name in TERMS if name in terms and TERMS[name].speed] or [""]
-    return f"{first} says how the rotors follow their commands; leave out {', '.join(others)}" if others else ""
+    return f"{first} already models how rotors follow commands; leave out {', '.join(others)}" if others else ""
 
 
 def required(value: T | None, message: str) -> T:

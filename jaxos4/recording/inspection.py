@@ -1,4 +1,4 @@
-"""The contents of a log: its stretches in flight, their excitation, and the airframe's file that it begins."""
+"""Inspection of a log: its stretches in flight, their excitation, and a draft of the airframe's file."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,7 +48,7 @@ class Inspection(msgspec.Struct, frozen=True):
     - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
     - `refusals`: why no vehicle can be identified, and what to do, most important first. In JSON: `findings`.
     - `findings`: faults that the log shows, see `jaxos4.recording.checks`. In JSON: `checks`.
-    - `notes`: remarks of the reader.
+    - `notes`: remarks from reading the log.
     - `parts`: the stretches in order of time.
     """
 
@@ -70,7 +70,7 @@ class Inspection(msgspec.Struct, frozen=True):
 
 
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
-    """Describe a log that was read with this airframe and `full_scale=1.0`. Without one, torques are unknown."""
+    """Describe a log that was read with this airframe and `full_scale=1.0`. Torques are unknown without an airframe."""
     seconds = fair_share([recording], finest(recording.dt, commanded=recording.commanded))
     evidence, parts = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
@@ -112,11 +112,11 @@ def _measured(recording: Recording) -> dict[str, Channel]:
 
 
 def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
-    """Begin the file of an airframe with what a log knows: spins, hover speed, sometimes the rotors' positions.
+    """Draft an airframe's file from a log: spins, hover speed, and the rotors' positions if the log has them.
 
     **Arguments:** `recording`: read without an airframe, and with `full_scale=1.0`.
 
-    **Returns:** the text, in which what must be weighed or measured is a comment, and the keys that are missing.
+    **Returns:** the text, with comments in place of values that must be weighed or measured, and the missing keys.
     """
     facts, full = recording.facts, ASSUMED_FULL_SCALE if recording.commanded else 1.0
     flown = usable(recording)
@@ -144,9 +144,10 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
 
 
 def _hover(flown: Sequence[Recording]) -> tuple[float, bool] | None:
-    """The rotor speed that carries the weight, in the unit of the flight, and whether an accelerometer felt it.
+    """The rotor speed that carries the weight, in the unit of the flight, and whether an accelerometer shows it.
 
-    Without one, or if its median is not half to twice gravity, the median thrust in flight counts as the weight.
+    Without an accelerometer, or if its median is not half to twice gravity, the median thrust in flight counts as the
+    weight.
     """
     if not flown:
         return None

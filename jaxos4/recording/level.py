@@ -1,4 +1,4 @@
-"""The constant error of the accelerometer along z, by flight and by rest before take-off."""
+"""The constant error of the accelerometer along z, from flight and from rest before take-off."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..logs import Recording
 from .motion import Ups
 
-KEEPS = 0.2  # m/s^2; standard deviation of the change of an error at rest in flight, where sensors warm up and vibrate
+KEEPS = 0.2  # m/s^2; standard deviation of the error's change from rest to flight, as sensors warm up and vibrate
 AGREE = 3.0  # standard deviations; if flight and rest differ by more, drag or manoeuvres have misled the flight
 
 
@@ -36,9 +36,9 @@ def force_level(
     return float(weights @ [flown[0], rest] / weights.sum()), float(weights.sum() ** -0.5)
 
 
-GAINED = 1.0  # m/s over a stretch, at the most
+GAINED = 1.0  # m/s; the most velocity that a vehicle gains over a stretch
 UNCARRIED = 0.003  # share of the weight that the mean force may miss
-UPRIGHT = 0.5  # the least mean cosine of the tilt
+UPRIGHT = 0.5  # smallest mean cosine of the tilt
 
 
 def _by_flight(
@@ -46,9 +46,9 @@ def _by_flight(
     every: Sequence[Ups],
     gravity: float,
 ) -> tuple[float, float] | None:
-    """The mean upright part of the specific force, less gravity.
+    """The mean vertical component of the specific force minus gravity, and its standard deviation [m/s^2].
 
-    A vehicle gains little velocity over a stretch, so all forces together carry its weight.
+    A vehicle gains little velocity over a stretch, so on average the force carries its weight.
     """
     force = fitted.specific_force
     if not every or force is None or not (known := np.isfinite(force).all(axis=1)).any():

@@ -1,9 +1,9 @@
-"""White noise and vibration of sensors, and the rotor speeds that are expected given all measured ones.
+"""White noise and vibration of sensors, and rotor speeds without their noise.
 
-A noisy input makes the slope of a regression too small: moments of inertia come out too large. The expectation of the
-speeds given the measurements, by a Wiener filter without delay, has no such bias: what it misses does not correlate
-with it, and acts as a disturbance. Thrust and torques are filtered separately: rotors answer some of them more than
-others, and the noise is the same in all.
+A noisy input makes the slope of a regression too small, so moments of inertia come out too large. The expectation of
+the speeds given all measurements, by a Wiener filter without delay, has no such bias: its error does not correlate with
+it, and acts as a disturbance. Thrust and torques are filtered separately, because their power differs and the noise
+is the same in all.
 
 Reference: Carroll, Ruppert, Stefanski and Crainiceanu 2006, Measurement Error in Nonlinear Models, ch. 4.
 """
@@ -24,21 +24,21 @@ Changes = Float[np.ndarray, "frequencies 4"]
 def white_noise(values: Float[np.ndarray, " samples"], order: int) -> float:
     """The standard deviation of white noise, from the median size of differences of this order; NaN without any.
 
-    Motion is smooth from sample to sample, noise is not. A higher order tolerates faster motion. Jumps between
-    stretches, and of angles by a turn, do not count.
+    Motion is smooth from sample to sample, noise is not. A higher order tolerates faster motion. The median ignores
+    jumps between stretches, and jumps of angles by a whole turn.
     """
     size = np.diff(values, order)
     size = np.abs(size[np.isfinite(size)])
     return float(np.median(size)) / 0.6745 / math.sqrt(math.comb(2 * order, order)) if size.size else math.nan
 
 
-LEAST_NOISE = 0.5  # share of the noise by second differences
+LEAST_NOISE = 0.5  # share of the noise from second differences
 
 
 def force_noise(recording: Recording) -> Float[np.ndarray, "3"]:
-    """The least white noise of means over a second [m/s^2]: by second differences, and by one count of the sensor.
+    """A lower limit of the white noise of means over a second [m/s^2], from second differences and the sensor's count.
 
-    Vibration is not smooth from row to row, and so no disturbance. Without this limit, a fit may take it for one.
+    Vibration is not smooth from row to row. Without this limit, a fit may take it for a disturbance.
     """
     least, force = np.zeros(3), recording.specific_force
     for axis, values in enumerate([] if force is None else force.T):
@@ -50,7 +50,7 @@ def force_noise(recording: Recording) -> Float[np.ndarray, "3"]:
     return least
 
 
-SPECTRUM = 1.0  # s that the samples of one spectrum last
+SPECTRUM = 1.0  # s; duration of the samples of one spectrum
 
 
 def spectra(
@@ -73,9 +73,10 @@ NEGLIGIBLE = 1e-3  # share of the power of the changes; less noise changes no an
 
 
 def without_noise(stretches: Sequence[Recording], airframe: Airframe) -> tuple[list[Recording], float, float]:
-    """The stretches of one recording with the expected rotor speeds. Commands have no noise.
+    """The stretches of one recording with rotor speeds without their noise. Commands have no noise.
 
-    **Returns:** also the noise's standard deviation [rad/s], and its share of the power of changes between samples.
+    **Returns:** the stretches, the noise's standard deviation [rad/s], and its share of the power of changes between
+    samples.
     """
     if any(each.commanded for each in stretches):
         return list(stretches), 0.0, 0.0
@@ -98,7 +99,7 @@ NEIGHBOURS = 2  # frequencies to either side over which spectra are averaged
 
 
 def _power(signals: Sequence[Float[np.ndarray, "_ 4"]], dt: float) -> Changes | None:
-    """The mean power of the changes from sample to sample, by frequency; white changes have their variance."""
+    """The mean power of the changes from sample to sample, by frequency. For white changes, it is their variance."""
     length = 2 * (max(round(SPECTRUM / dt), MIN_SAMPLES) // 2)
     found = np.concatenate([spectra(np.diff(signal, axis=0), length) for signal in signals])
     if not len(found):
@@ -119,8 +120,9 @@ PASSES = 20  # of the weighted fit
 def _noise(power: Changes) -> Float[np.ndarray, " frequencies"]:
     """The power of the noise in the changes of each direction, by frequency.
 
-    The changes of true speeds do not grow with frequency, because of the motors' lag: a constant, and a part that falls
-    with the square. Those of white noise grow, and fall again if the speeds were interpolated between packets.
+    Because of the motors' lag, the changes of true speeds do not grow with frequency: they have a constant part, and a
+    part that falls with its square. The changes of white noise grow with frequency, and fall again if the speeds were
+    interpolated between packets.
     """
     from scipy.optimize import nnls  # slow to import
 
@@ -143,7 +145,7 @@ def _noise(power: Changes) -> Float[np.ndarray, " frequencies"]:
 
 
 def _filtered(signal: Float[np.ndarray, "samples 4"], kept: Changes) -> Float[np.ndarray, "samples 4"]:
-    """The signal times a share at each frequency. Its mirror images stand before and after it."""
+    """The signal times a share at each frequency. It is continued by its mirror image, so that its ends do not jump."""
     mirrored = np.concatenate([signal, signal[::-1]])
     frequencies = np.linspace(0, len(kept) - 1, len(mirrored) // 2 + 1)
     share = np.column_stack([np.interp(frequencies, np.arange(len(kept)), each) for each in kept.T])
@@ -151,17 +153,17 @@ def _filtered(signal: Float[np.ndarray, "samples 4"], kept: Changes) -> Float[np
     return np.fft.irfft(share * np.fft.rfft(mirrored, axis=0), len(mirrored), axis=0)[: len(signal)]
 
 
-ABOVE = 25.0  # Hz; a rigid body that rotors turn moves below this frequency
+ABOVE = 25.0  # Hz; rotors move a rigid body only below this frequency
 TIMES = 5.0  # a line has this many times the power of its surroundings: the median within an octave to both sides
 OCTAVE = 2.0
-MIN_SPECTRA = 5  # that are averaged
+MIN_SPECTRA = 5  # fewest spectra that are averaged
 
 
 def vibrating_rates(stretches: Sequence[Recording]) -> dict[str, float]:
     """The body rates (`p`, `q`, `r`) whose spectrum shows a line, with its frequency [Hz].
 
-    Rotors that turn at nearly one speed shake a gyro at this frequency, or at one that the log's rate folds it to.
-    White noise, its filter and the motion of a rigid body have no line.
+    Rotors that turn at nearly one speed shake a gyro at this frequency, or at its alias for the log's rate. Filtered
+    white noise and the motion of a rigid body have no line.
 
     **Arguments:** `stretches`: as logged, not averaged, of one vehicle.
     """

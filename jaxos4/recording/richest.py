@@ -1,4 +1,4 @@
-"""The parts of a long log that tell the most. A fit of all of it would take hours, and change only the last digits."""
+"""The most informative parts of a long log. A fit of all of it would take hours, and change only the last digits."""
 
 import math
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from ..logs import Recording
 from ..logs.table import counted
 from .stretches import MIN_STRETCH, Stretch, cut
 
-PIECE = 30.0  # s; shorter pieces would be chosen by their gusts, which biases a fit, and begin with unsettled filters
+PIECE = 30.0  # s; shorter pieces would be chosen for their gusts, which biases a fit, and begin with unsettled filters
 MOST = 65_536  # samples of a fit, which takes more than a minute; flights of any length up to it share a program
 _SAME = 1e-6  # durations that differ by less than this share are equal
 _BIN = 0.02  # s; torques that change faster hardly turn a vehicle
-_LEVELS = 2.0  # for each factor of 2: pieces whose torques differ by less than chance are equal
+_LEVELS = 2.0  # for each factor of 2; pieces whose torques differ only by chance count as equal
 
 
 def richest(
@@ -22,13 +22,14 @@ def richest(
 ) -> list[Stretch]:
     """The pieces of some parts in which the torques vary the most, in the order of time.
 
-    Roll, pitch and yaw choose in turn. Of pieces that are alike, the first is chosen.
+    Roll, pitch and yaw choose in turn. The first of equal pieces is chosen.
 
     **Arguments:**
 
     - `parts`: usable stretches of the recording.
-    - `torques`: about each axis, for the squares of the rotor speeds. Only ratios count.
-    - `seconds`: how long the pieces last together [s] at the most, unless not even one fits. Shorter parts stay.
+    - `torques`: the matrix from squared rotor speeds to the torque about each axis. Only ratios count.
+    - `seconds`: the longest total duration of the pieces [s], of which at least one is chosen. If all parts together
+      are shorter, they are returned.
     """
     if sum(part.length for part in parts) <= seconds:
         return list(parts)
@@ -46,7 +47,7 @@ def richest(
 
 
 def fair_share(recordings: Sequence[Recording], step: float) -> float:
-    """How much of each recording is fitted at the most [s], so that all have `MOST` samples of `step` [s] together."""
+    """The longest duration to fit of each recording [s], so that all together have `MOST` samples of `step` [s]."""
     lengths, left = sorted(float(np.ptp(each.time[[0, -1]])) for each in recordings), MOST * step
     for number, length in enumerate(lengths):
         if length * (len(lengths) - number) > left:
@@ -68,7 +69,7 @@ def note_of(name: str, chosen: Sequence[Stretch], parts: Sequence[Stretch]) -> l
 
 
 def _pieces(part: Stretch, longest: float) -> list[Stretch]:
-    """A part in equal pieces."""
+    """Divides a part into equal pieces."""
     edges = np.linspace(part.begin, part.end, math.ceil(part.length / longest) + 1).tolist()
     return [Stretch(begin, end) for begin, end in zip(edges, edges[1:], strict=False)]
 
@@ -82,7 +83,7 @@ def _varied(piece: Recording, torques: Float[np.ndarray, "axes 4"]) -> Float[np.
 
 
 def _merged(pieces: Sequence[Stretch]) -> list[Stretch]:
-    """Pieces in the order of time, adjacent ones as one."""
+    """Joins adjacent pieces; they are in the order of time."""
     out: list[Stretch] = []
     for piece in pieces:
         if out and out[-1].end == piece.begin:

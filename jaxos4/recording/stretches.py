@@ -1,6 +1,6 @@
-"""The stretches of a flight: which can be used for identification, and why not the others.
+"""Divides a flight into stretches that can be used for identification, and others with the reason.
 
-A stretch is usable if the rotors carry the vehicle, and the accelerometer feels it, no rotor rests or is at its limit
+A stretch is usable if the rotors carry the vehicle and the accelerometer feels it, no rotor rests or is at its limit
 for longer than a moment, no samples are lost, and the vehicle does not crash.
 """
 
@@ -26,7 +26,7 @@ Samples = Bool[np.ndarray, " samples"]
 
 
 class Stretch(NamedTuple):
-    """A stretch of a flight from the sample at `begin` to that at `end` [s]. `reason`: why it is not usable, or ""."""
+    """A stretch of a flight from the sample at `begin` to the one at `end` [s]. `reason`: why it is unusable, or ""."""
 
     begin: float
     end: float
@@ -38,7 +38,7 @@ class Stretch(NamedTuple):
         return self.end - self.begin
 
 
-MIN_STRETCH = 1.0  # s; of a usable stretch, and of the rest of a vehicle that lies on its side or back
+MIN_STRETCH = 1.0  # s; shortest usable stretch, and shortest rest of a vehicle that lies on its side or back
 MARGIN = 0.3  # s; between the ground and free flight
 ONE_G = 0.15  # in multiples of gravity; the error of an accelerometer that feels only the weight
 
@@ -46,15 +46,15 @@ ONE_G = 0.15  # in multiples of gravity; the error of an accelerometer that feel
 def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
     """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
-    `airframe`: the weight and the largest rotor speed. Without it, or if the thrust is below a third or above three
-    times the weight, the median thrust is taken as the weight.
+    `airframe`: gives the weight and the largest rotor speed. Without it, or if the thrust is below a third or above
+    three times the weight, the median thrust is taken as the weight.
     """
     recording = as_recording(flight)
     time, omega, dt, force = recording.time, recording.omega, recording.dt, recording.specific_force
     rates = recording.states[:, RATES]
     share = _thrust_share(recording, airframe)
     landed = np.zeros(time.size, dtype=bool)
-    for begin, end in recording.facts.landed:  # as the vehicle itself says
+    for begin, end in recording.facts.landed:  # as the vehicle itself reports
         landed |= (time >= begin - dt / 2) & (time <= end + dt / 2)
     ground = _ground(share, dt) | landed
     saturations = _saturations(omega, airframe, dt)
@@ -89,7 +89,7 @@ def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> t
 
 
 def nothing_usable(every: Sequence[Stretch]) -> str:
-    """Why none of these stretches of a flight can be used: the longest one, with its reason."""
+    """Why none of these stretches can be used, in words: the longest one, with its reason."""
     longest = max(every, key=lambda stretch: stretch.length)
     no_flight = (ON_GROUND, IDLE, "less than", _REASONS[_LOST])
     grounded = longest.reason in (ON_GROUND, IDLE) and all(each.reason.startswith(no_flight) for each in every)
@@ -102,7 +102,7 @@ TUMBLES = 10.0  # rad/s; a vehicle that turns faster so early was thrown, or tip
 
 
 def end_of_tumble(recording: Recording, airframe: Airframe) -> float | None:
-    """When a vehicle that tumbles at its first launch has recovered [s]; `None` if it does not."""
+    """The time at which a vehicle has recovered from tumbling at its first launch [s]; `None` if it does not tumble."""
     dt, time = recording.dt, recording.time
     flies = np.flatnonzero(~_ground(_thrust_share(recording, airframe), dt))
     if not flies.size or flies[0] == 0:  # the log begins in flight
@@ -129,7 +129,7 @@ def usable(recording: Recording, airframe: Airframe | None = None) -> list[Recor
     return [cut(recording, stretch) for stretch in stretches(recording, airframe) if not stretch.reason]
 
 
-# Share of full command with which a vehicle hovers at the least: no vehicle has a thrust of 25 times its weight.
+# The smallest share of full command at which a vehicle hovers: no vehicle has a thrust of 25 times its weight.
 LEAST_HOVER = 0.2
 
 
@@ -151,7 +151,7 @@ def _thrust_share(recording: Recording, airframe: Airframe | None) -> Float[np.n
     return squares / max(usual, 1e-300)
 
 
-CARRIES = 0.3  # share of the weight; with less thrust, the vehicle does not fly. It may fall.
+CARRIES = 0.3  # share of the weight; with less thrust, a vehicle does not fly, though it may fall
 SUSTAINED = 0.5  # s; shorter pauses of thrust happen in flight, shorter bursts on the ground
 
 
@@ -170,7 +170,7 @@ def _ground(share: Float[np.ndarray, " samples"], dt: float) -> Samples:
 
 MOMENT = 0.1  # s; a rotor may rest or be at its limit for this long: about its lag
 SAME = 1e-3  # share of a rotor's largest speed; smaller differences count as none
-FULL = 0.995  # share of the airframe's `max_rotor_speed` from which a rotor is at full speed, also if speeds are noisy
+FULL = 0.995  # share of the airframe's `max_rotor_speed` that counts as full speed, with a margin for noise
 
 
 def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dict[str, Bool[np.ndarray, "samples 4"]]:
@@ -182,7 +182,7 @@ def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dic
         same = SAME * largest
         if largest <= 0:
             continue
-        # Each sample that equals the one before or after it.
+        # A sample is steady if it equals the one before or after it.
         equal = np.abs(np.diff(speed)) <= same
         steady = np.append(equal, False) | np.insert(equal, 0, False)
         full, rest = speed >= FULL * full_scale, speed <= same
@@ -195,7 +195,7 @@ def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dic
     return found
 
 
-GAP = 0.05  # s; the longest without a measurement, or five samples of a slow sensor
+GAP = 0.05  # s; the longest usable gap between measurements, or five samples of a slow sensor
 
 
 def _lost(states: np.ndarray, dt: float) -> Samples:
@@ -234,19 +234,19 @@ def _crashed(rates: np.ndarray, force: np.ndarray | None, share: np.ndarray, gro
 
 
 BIN = 0.05  # s; means over this time are compared
-TILTED, STILL = 0.5, 0.2  # gravity along z of a vehicle on its side or back, and its rates [rad/s]
+TILTED, STILL = 0.5, 0.2  # largest share of gravity along z, and rate [rad/s], of a vehicle on its side or back
 
 
 def _resting(omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: Samples, dt: float) -> Samples:
-    """Whether each `airborne` sample is of a vehicle at rest, by its accelerometer.
+    """Whether the accelerometer shows that the vehicle is at rest, for each `airborne` sample.
 
-    In flight the specific force along z is the thrust over the mass; on the ground and in a hand it is gravity,
-    whatever the rotors do, and on its side or back it is across their axes. Constant thrust proves nothing.
+    In flight, the specific force along z is thrust over mass. On the ground or in a hand it is gravity, whatever the
+    rotors do. If the vehicle lies on its side or back, gravity is not along +z. Constant thrust proves nothing.
     """
     size = omega.shape[0]
     length = max(round(BIN / dt), 1)
     bins = size // length
-    if bins < 2 or np.ptp(np.nan_to_num(force), axis=0).max() == 0:  # no accelerometer lies still to the last bit
+    if bins < 2 or np.ptp(np.nan_to_num(force), axis=0).max() == 0:  # no accelerometer is still to the last bit
         return np.zeros(size, dtype=bool)
     sensed = np.column_stack([omega.mean(axis=1) ** 2, force / STANDARD_GRAVITY, np.abs(rates).max(axis=1)])
     sensed[~airborne] = np.nan
@@ -260,14 +260,14 @@ def _resting(omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: 
 
 SMOOTH = 4  # bins; longer than the lag of any rotor
 REST = 2.0  # s; a window in which thrust and force are compared
-FILLED = 5.0  # s; a gap between two resting windows that is filled at the most
-VARIES = 0.2  # the least standard deviation of thrust in a window, as a share of its mean
-UNFELT = 0.1  # the relative change of the vertical force for a relative change of thrust: 1 in flight
+FILLED = 5.0  # s; the longest gap between two resting windows that is filled
+VARIES = 0.2  # smallest relative standard deviation of thrust in a window
+UNFELT = 0.1  # relative change of the vertical force per relative change of thrust; 1 in flight
 STEADY = 0.1  # standard deviation of the force of a resting vehicle, in multiples of gravity
 
 
 def _unfelt(means: Float[np.ndarray, "bins 5"], step: float) -> Bool[np.ndarray, " bins"]:
-    """The bins of windows in which thrust changes, and the accelerometer does not."""
+    """The bins of windows in which thrust changes, but the accelerometer's signal does not."""
     kernel, edge = np.full(SMOOTH, 1 / SMOOTH), SMOOTH // 2
     smooth = np.column_stack([np.convolve(column, kernel, "same") for column in means.T])
     smooth[:edge] = smooth[-edge:] = np.nan
@@ -293,7 +293,7 @@ def _unfelt(means: Float[np.ndarray, "bins 5"], step: float) -> Bool[np.ndarray,
 
 
 def _lasting(where: Samples, most: float) -> Samples:
-    """`where`, without runs of at most this many samples."""
+    """`where`, without the runs of at most `most` samples."""
     out = np.zeros_like(where)
     for begin, end in _runs(where):
         out[begin:end] = end - begin > most

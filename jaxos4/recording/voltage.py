@@ -1,4 +1,4 @@
-"""How much of a battery's sag under load a logged voltage shows."""
+"""The share of a battery's sag under load that a logged voltage does not show."""
 
 import math
 
@@ -8,14 +8,14 @@ from ..logs import Recording
 
 _MANOEUVRE = 0.2  # s; the load of the rotors changes within about this time
 _SAG = 0.04  # the share of the voltage that a load takes: a coarser voltage does not show it
-_LEAST = 0.1  # even a voltage in each row is measured before or after the load, and with noise
+_LEAST = 0.1  # even a voltage in each row has noise, and is measured before or after the load
 
 
 def unseen_sag(recording: Recording) -> float:
-    """The share of the sag that the logged voltage does not show, 0 to 1: by its rate and by its resolution.
+    """The share of the sag that the logged voltage does not show, 0 to 1, from its rate and its resolution.
 
-    A voltage that is logged slowly is held or interpolated between its measurements; both are counted by the changes of
-    its slope.
+    A slowly logged voltage is held or interpolated between its measurements. The measurements are counted by the steps
+    of a held voltage, or by the changes of slope of an interpolated one.
     """
     voltage = np.empty(0) if recording.voltage is None else recording.voltage[recording.voltage > 0]
     if voltage.size < 3:

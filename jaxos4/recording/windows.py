@@ -1,4 +1,4 @@
-"""Recordings as windows: averaged to longer samples, concatenated to whole windows, some of them held out."""
+"""Recordings in windows: averaged to longer samples, concatenated in whole windows, some of them held out."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,10 @@ _SAME = 1e-6  # sample times that differ by less than this share are equal
 
 
 def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
-    """A flight averaged to samples of each length [s], if longer than its own, with the rotor speeds `within` each."""
+    """A flight averaged to samples of each of these lengths [s], with the rotor speeds `within` each sample.
+
+    A length that does not exceed the flight's own sample time leaves its samples as they are.
+    """
     within = speeds_within(flight.time, flight.omega, held=flight.held)
     columns = flight.columns()
     average = averages(flight.time, flight.omega, np.column_stack([*columns.values()]), held=flight.held)
@@ -26,7 +29,7 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
             return flight._replace(within=within(flight.time, flight.dt))
         time, omega, means = average(dt)
         signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within(time, dt)}
-        # Means of as many instants have the same variance in time as a mean over this time.
+        # The instants of a mean have the same variance in time as a continuous mean over this time.
         averaging_time = dt * math.sqrt(1 - (flight.dt / dt) ** 2)
         return flight._replace(**signals, time=time, held=True, averaging_time=averaging_time)
 
@@ -34,7 +37,7 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:
-    """Put stretches of flight one after the other, as one flight of whole windows of `length` samples.
+    """Concatenate stretches of flight to one flight of whole windows of `length` samples.
 
     Samples at the end of a stretch that do not fill a window are dropped. Time becomes a count of samples from 0.
 
@@ -112,7 +115,7 @@ def hold_out(
 
 
 def _without(rows: np.ndarray, which: Bool[np.ndarray, " samples"]) -> np.ndarray:
-    """The rows of a signal; NaN in some samples."""
+    """The rows of a signal, with NaN in the samples `which`."""
     kept = rows.copy()
     kept[which] = np.nan
     return kept

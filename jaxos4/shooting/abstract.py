@@ -1,4 +1,4 @@
-"""`AbstractProblem`: a likelihood of one flight, and its unknowns. Solvers know nothing else of it."""
+"""`AbstractProblem`: the likelihood of one flight, and its unknowns. Solvers use nothing else."""
 
 import abc
 import dataclasses
@@ -17,7 +17,7 @@ from .._custom_types import Count, Numeric, Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket, is_identifiable
 from ..models.abstract import AbstractModel
 
-# The unknowns of each window: those that all windows share, and then the window's own initial state if it is free.
+# The unknowns of each window: the ones that all windows share, then the window's initial state if that is free.
 WindowUnknowns = Float[Array, "windows unknowns"]
 Values = Float[Array, " unknowns"]
 Problem = TypeVar("Problem", bound="AbstractProblem")
@@ -28,15 +28,15 @@ def _as_mask(x: ArrayLike) -> Bool[Array, "..."]:
 
 
 class Unknowns(eqx.Module):
-    """Everything that is known before the search about the unknowns that all windows of a flight share.
+    """The unknowns that all windows of a flight share, with what is known about them before the search.
 
-    The model's parameters come first. A likelihood may add unknowns of its own, such as the levels of the noise.
+    The model's parameters come first. A likelihood may add further unknowns, such as noise levels.
 
     - `names`, `units`: of each unknown.
-    - `parameter_count`: how many of them, the first, are the model's parameters.
+    - `parameter_count`: the number of the model's parameters, which come first.
     - `prior`: how the cost uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
-    - `center`, `half_width`: of the bracket in which each is looked for.
-    - `free`: whether it is searched. The others are fixed at `center`.
+    - `center`, `half_width`: of the bracket in which each unknown is searched.
+    - `free`: whether an unknown is searched. The others are fixed at `center`.
     - `precision`: of a Gaussian prior around `center`, as the reciprocal of a variance; 0: no prior.
     - `lowest`, `highest`: the values beyond which no search may go, however wide the bracket.
     - `stride`: the longest useful step of a search.
@@ -80,7 +80,7 @@ class Unknowns(eqx.Module):
         return len(self.names)
 
     def within(self, bracket: Bracket) -> "Unknowns":
-        """The unknowns in another bracket; a fixed one keeps its value. Raises `ValueError` for another length."""
+        """The unknowns in another bracket; fixed ones keep their values. Raises `ValueError` for another length."""
         if bracket.lower.shape != (self.count,):
             raise ValueError(f"`bracket` must hold {self.count} parameters, got {bracket.lower.shape[0]}.")
         known_free = not isinstance(self.free, Tracer) and bool(np.asarray(self.free).all())
@@ -88,7 +88,7 @@ class Unknowns(eqx.Module):
         return dataclasses.replace(self, center=center, half_width=bracket.half_width)
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
-        """The same unknowns, some fixed at known values. Raises `ValueError` for a strange name, or if none is free."""
+        """The same unknowns, some fixed at values. Raises `ValueError` for an unknown name, or if none remains free."""
         strangers = [name for name in values if name not in self.names]
         if strangers:
             raise ValueError(f"`values`: {strangers[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
@@ -123,12 +123,12 @@ class Unknowns(eqx.Module):
         return Bracket.around(self.center, self.half_width)
 
     def limits(self, reach: Float[ArrayLike, ""]) -> tuple[Values, Values]:
-        """The least and the greatest values of a search that may go `reach` half-widths from the center."""
+        """The lowest and highest values of a search that may go `reach` half-widths from the center."""
         lower, upper = self.center - reach * self.half_width, self.center + reach * self.half_width
         return jnp.maximum(lower, self.lowest), jnp.minimum(upper, self.highest)
 
     def identifiable(self, std: Float[Array, " unknowns"], prior: float | None = None) -> Bool[Array, " unknowns"]:
-        """Whether each is identifiable or fixed. `prior`: of an estimator; by default as the cost uses the bracket."""
+        """Whether each unknown is identifiable or fixed. `prior`: of an estimator; by default the prior of the cost."""
         return jnp.asarray(is_identifiable(std, self.half_width, self.prior if prior is None else prior)) | ~self.free
 
 
@@ -142,8 +142,8 @@ def _fixed(
 class Shot(NamedTuple):
     """One simulated window: the cost of the samples before the trajectory fails, and whether it is `feasible`.
 
-    It fails at a pitch of +-90 degrees, or a body rate above `FASTEST` in `scans.py`. The cost of a failed shot means
-    nothing, but its derivative still points back to feasible trajectories.
+    A trajectory fails at a pitch of +-90 degrees, or at a body rate above `FASTEST` in `scans.py`. The cost of a failed
+    shot is meaningless, but its derivative still points back to feasible trajectories.
     """
 
     cost: Scalar
@@ -153,9 +153,9 @@ class Shot(NamedTuple):
 class Parts(NamedTuple):
     """The likelihood of each part of a flight, without the prior.
 
-    - `gradient`, `information`: about all unknowns.
+    - `gradient`, `information`: in all unknowns.
     - `products`: for each channel, sums of the products of standardised innovations 0, 1, 2, ... samples apart.
-    - `noise_feedthrough`: the feedthroughs of the whole flight, whose share of the innovations counts as noise.
+    - `noise_feedthrough`: the feedthroughs of the whole flight; the innovations that they explain count as noise.
     """
 
     gradient: Float[Array, "parts unknowns"]
@@ -165,12 +165,12 @@ class Parts(NamedTuple):
 
 
 class LocalModel(NamedTuple):
-    """The quadratic model of a cost around some unknowns, of one window or with the windows as first axis.
+    """The quadratic model of a cost around some unknowns, for one window or with the windows as first axis.
 
-    - `cost`, `feasible`: as of a `Shot`.
-    - `gradient`, `information`: in the parameters, and then in a free initial state. The information is that of
-      Fisher, J^T W^2 J for a shot.
-    - `parts`: from a likelihood whose parts are compared.
+    - `cost`, `feasible`: as in a `Shot`.
+    - `gradient`, `information`: in the parameters, and then in a free initial state. The information is the Fisher
+      information, J^T W^2 J for a shot.
+    - `parts`: only of a likelihood whose parts are compared.
     """
 
     cost: Float[Array, "*windows"]
@@ -180,7 +180,7 @@ class LocalModel(NamedTuple):
     parts: Parts | None = None
 
     def restricted(self, searched: Bool[Array, " unknowns"]) -> "LocalModel":
-        """The model of these unknowns; 0 in all others."""
+        """The model in the searched unknowns only; derivatives in all others are 0."""
         gradient = jnp.where(searched, self.gradient, 0.0)
         information = jnp.where(searched & searched[:, None], self.information, 0.0)
         return self._replace(gradient=gradient, information=information)
@@ -190,8 +190,8 @@ class InitialGuess(NamedTuple):
     """Where a search starts.
 
     - `starts`: the unknowns of each window, the shared ones first; several starts if the likelihood has several maxima.
-    - `off`: how far off each may be: two standard deviations of what is known before the flight.
-    - `known`: the initial state of each window, as far as it is known and so no unknown.
+    - `off`: how far off each start may be: two standard deviations of the knowledge before the flight.
+    - `known`: the part of each window's initial state that is known, and so not among the unknowns.
     """
 
     starts: Float[Array, "starts windows unknowns"]
@@ -219,7 +219,7 @@ class Stage(NamedTuple):
         return jnp.full(self.off.shape, own, dtype=float).at[:, : self.unknowns.count].set(shared)
 
     def limits(self, reach: Scalar | float) -> tuple[WindowUnknowns, WindowUnknowns]:
-        """The least and the greatest value of each unknown, see `Unknowns.limits`; a free initial state has none."""
+        """The lowest and highest value of each unknown, see `Unknowns.limits`; a free initial state has no limits."""
         lower, upper = self.unknowns.usable.limits(reach)
         return self.of_windows(lower, -jnp.inf), self.of_windows(upper, jnp.inf)
 
@@ -230,17 +230,17 @@ class Stage(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """A likelihood in stages, each of which is searched from the answer of the one before; the last is the whole.
+    """A likelihood in stages. Each stage is searched from the answer of the stage before; the last is the whole.
 
-    All stages have the same unknowns; an early stage may search only some of them, on a part of the data.
+    All stages have the same unknowns, but an early stage may search only some of them, on a part of the data.
 
-    - `unknowns`, `off`: those of the likelihood, and of its `InitialGuess`.
-    - `number`: how many stages there are. `first`: the stage with which a search begins. `whole`: the first that fits
+    - `unknowns`: of the likelihood. `off`: of its `InitialGuess`.
+    - `number`: the number of stages. `first`: the stage with which a search begins. `whole`: the first stage that fits
       all data.
-    - `local_model`: from the number of a stage, the unknowns that were found before it, and some unknowns: the model of
-      the stage's cost around the last. It is 0 in what the stage does not search.
+    - `local_model`: a function of the number of a stage, the unknowns found before it, and the unknowns of a shot. It
+      returns the model of the stage's cost around the shot, with derivatives of 0 in unknowns that are not searched.
     - `searched`: for each stage, the unknowns that it searches.
-    - `measurements`: for each stage, how many measurements its cost compares; 0 if the noise is an unknown.
+    - `measurements`: for each stage, the number of measurements that its cost compares; 0 if the noise is an unknown.
     - `smallest_step`: for each stage, the step in standard deviations below which rounding decides the sign of a slope.
     """
 
@@ -270,8 +270,8 @@ class Stages(NamedTuple):
 class AbstractProblem(eqx.Module):
     """The negative log-likelihood of a flight, which may be cut into windows.
 
-    Windows share the unknowns in `unknowns`; each may have a free initial state too. The unknowns of all windows are
-    one array: a row for each window, with the shared unknowns first. `initial_guess` has its shape.
+    Windows share the unknowns in `unknowns`, and each window may also have a free initial state. The unknowns of all
+    windows are one array: a row for each window, with the shared unknowns first. `initial_guess` has its shape.
     """
 
     unknowns: eqx.AbstractVar[Unknowns]
@@ -286,12 +286,12 @@ class AbstractProblem(eqx.Module):
     def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """The function from the unknowns to the cost of each window, with gradient, information and parts.
 
-        What does not depend on the unknowns is computed when the function is taken: take it before a loop.
+        Everything that does not depend on the unknowns is computed when the function is made: make it before a loop.
         """
 
     @abc.abstractmethod
     def fix(self: Problem, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> Problem:
-        """The same likelihood, with some unknowns fixed at known values. `bracket`: where the others are looked for.
+        """The same likelihood, with some unknowns fixed at known values. `bracket`: where the others are searched.
 
         **Raises:** `ValueError` for a name that is no unknown, if none remains free, or for a bracket of another
         length.
@@ -301,7 +301,7 @@ class AbstractProblem(eqx.Module):
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The likelihood in stages.
 
-        `shares`: of the flight, to which a likelihood that simulates fits the body rates first, one after the other.
+        `shares`: a likelihood that simulates first fits the body rates to these shares of the flight, one by one.
         """
 
     def hold(self: Problem, values: Mapping[str, Float[ArrayLike, ""]]) -> Problem:

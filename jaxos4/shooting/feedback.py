@@ -1,4 +1,4 @@
-"""What corrects the estimates of a filter: gains of innovations and of input innovations, and their derivatives.
+"""The feedback of a filter: gains of innovations and of input innovations, and their derivatives.
 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
@@ -14,7 +14,7 @@ from .sums import Segments
 
 
 class InputGains(NamedTuple):
-    """What a unit of each input innovation adds to the estimates at the end of its sample, by feedthrough.
+    """The change of the estimates at the end of a sample for a unit of each input innovation, by feedthrough.
 
     - `driven`: to the rate [rad/s], or to the force besides the model's [m/s^2].
     - `disturbance`: to the disturbance [rad/s^2], or [m/s^2].
@@ -45,13 +45,13 @@ class Feedback(NamedTuple):
 
 
 def by_inputs(gains: tuple[Array, ...], inputs: Float[Array, "feedthroughs channels segments"]) -> Channels:
-    """What input innovations add to an estimate, by channel."""
+    """The change of an estimate by input innovations, by channel."""
     each = (v * (k if k.ndim > 1 else k[:, None]) for k, v in zip(gains, inputs, strict=True))
     return sum(each, jnp.zeros(inputs.shape[1:], dtype=float))
 
 
 def feedback_slopes(gains: Gains, steps: Step, by_input: InputGains, count: int) -> Feedback:
-    """The derivatives of the feedback in `count` parameters, which are 0, in the noise, and in gains of inputs."""
+    """The derivatives of the feedback: 0 in `count` parameters, then in the noise and in the gains of inputs."""
     levels, units = gains.variance.shape[0], basis(by_input)
     of_noise = jax.tree.map(lambda leaf: jnp.zeros((levels, *leaf.shape[1:]), leaf.dtype), units)
     some, more = jax.vmap(Feedback.of)(gains, steps, of_noise), len(jax.tree.leaves(by_input))

@@ -1,16 +1,15 @@
 """Input innovations: the part of torque and thrust that the past does not predict.
 
-All of the torque is known before its sample, but for its *input innovation* v. Two things make v depend on what the
-filter compares and estimates:
+The past predicts the torque of a sample except for its *input innovation* v, which matters to the filter in three ways:
 
-- If a sample lasts longer than the controller takes to answer, v holds answers to the noise of what is measured in it.
-  With white noise in the log's rows, v depends on what is measured through the filter's innovation e alone. So
-  e - gamma v is compared, with an unknown *feedthrough* gamma.
-- A controller that runs faster than the log measures rates that the log lacks. Its answers tell of rates and
-  disturbances, so that the estimates of the filter are corrected by unknown gains times v. Without these gains, the
+- If a sample lasts longer than the controller takes to answer, v holds answers to the noise of measurements in it. With
+  white noise in the log's rows, v depends on the measurements only through the filter's innovation e. So e - gamma v is
+  compared, with an unknown *feedthrough* gamma.
+- A controller that runs faster than the log measures rates that the log lacks. Its answers contain information about
+  rates and disturbances, so the filter's estimates are corrected by unknown gains times v. Without these gains, the
   error of the filter correlates with the torque that follows, and all parameters are biased.
 - Motors follow a command of the log until its next row, but the commands of such a controller change sooner. The torque
-  is wrong by a share of v for as long as the motors take to follow, so that the v of a few samples count (`lagged`).
+  is wrong by a share of v for as long as the motors take to follow, so the v of a few samples count (`lagged`).
 
 See `docs/method/filter_error.md`.
 """
@@ -23,11 +22,11 @@ COUNTS = (2, 2, 1, 1)
 rotors."""
 FEEDTHROUGHS = max(COUNTS)
 LAGGED_COUNTS = (3, 3, 3, 1)
-"""The same if motors follow commands in short samples: the innovation of the sample, and those of samples before. With
-fewer, rotor_lag and rotor_delay have several minima, and with more, the motors' own answer is lost."""
-# The share of a signal that rounding may have made.
+"""The same if motors follow commands in short samples: the innovations of the sample and of samples before it. With
+fewer, rotor_lag and rotor_delay have several minima; with more, the response of the motors is lost."""
+# A smaller share of a signal may be due to rounding.
 _ROUNDING = 1e-6
-# The rows of one matrix product: more would not fit the cache, and BLAS would divide so small a product among threads.
+# Rows of one matrix product. More would not fit the cache, and BLAS would divide so small a product among threads.
 _BLOCK = 2048
 
 
@@ -40,13 +39,13 @@ def input_innovations(
     *,
     memory: float = 0.1,
 ) -> Float[np.ndarray, "samples count"]:
-    """The part of the torque or thrust within each sample that the past does not tell, of mean square 1.
+    """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
-    A linear regression on earlier samples of the input and of what is measured of its motion leaves `count`
-    combinations of the parts of a sample, in which most of the rest lies. 0 at the beginning of a stretch. The sign
-    of a combination is arbitrary.
+    The prediction is a linear regression on earlier samples of the input and of the measured motion. The result is the
+    `count` combinations of the parts of a sample with most of the residual, with arbitrary signs; 0 at the beginning of
+    a stretch.
 
-    - `inputs`: in equal parts of each sample, in any unit.
+    - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN counts as the mean.
     - `stretch`: the number of the uninterrupted stretch of each sample.
     - `dt`: sample time [s]. `memory`: how far back the past reaches [s], at least three samples.
@@ -71,7 +70,7 @@ def input_innovations(
 def lagged(
     innovation: Float[np.ndarray, " samples"], stretch: Int[np.ndarray, " samples"], count: int
 ) -> Float[np.ndarray, "samples count"]:
-    """An innovation beside those of the `count` - 1 samples before; 0 before the beginning of a stretch."""
+    """The innovations of each sample and of the `count` - 1 samples before; 0 before the beginning of a stretch."""
     found = np.zeros((len(innovation), count))
     for lag in range(count):
         rows = np.arange(lag, len(innovation))
@@ -80,7 +79,7 @@ def lagged(
 
 
 def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
-    """The columns less their means, in the unit of their standard deviation."""
+    """The columns minus their means, over their common standard deviation."""
     about = columns - columns.mean(axis=0)
     return about / (about.std() or 1.0)
 
@@ -88,10 +87,10 @@ def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarra
 def _unexplained(
     series: Float[np.ndarray, "samples series"], targets: int, rows: Int[np.ndarray, " rows"], lags: int
 ) -> Float[np.ndarray, "rows targets"]:
-    """The first `targets` series at these rows, less a linear regression on the `lags` samples of all series before.
+    """The residual of the first `targets` series at these rows, after a regression on `lags` samples of all series.
 
-    By normal equations, because the matrix of the regression would not fit into memory. A ridge keeps them regular if
-    series differ by rounding only. The second pass removes what the ridge and the rounding of the first have left.
+    It uses normal equations, because the matrix of the regression would not fit into memory. A ridge keeps them regular
+    if series differ by rounding only. A second pass removes the errors of the first by ridge and rounding.
     """
     from scipy.linalg import cho_factor, cho_solve  # slow to import
 
@@ -117,8 +116,8 @@ def _unexplained(
 def _lagged_products(windows: list[Float[np.ndarray, "_ series"]], lags: int) -> Float[np.ndarray, "columns columns"]:
     """The upper triangle of the normal equations: products of the samples 1 to `lags` before a row, summed over rows.
 
-    A window holds `lags` samples and then its rows. One sample further back in both, the sum is the same but for the
-    edges of the windows.
+    A window holds `lags` samples and then its rows. If both factors are taken one sample earlier, the sum differs only
+    at the edges of the windows.
     """
     width, most = windows[0].shape[1], lags - 1
     products, edges = np.zeros((lags, width, lags, width)), np.zeros((most, width, most, width))

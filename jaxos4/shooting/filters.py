@@ -46,9 +46,10 @@ BLOCK = 32
 
 
 class _Row(NamedTuple):
-    """One sample of all segments, which may forget before it or the next; `measured` is 0 if it was not.
+    """One sample of all segments.
 
-    `inputs`: the input innovations, 0 where nothing was measured.
+    - `measured`: 0 for a missing measurement. `inputs`: the input innovations, 0 where nothing was measured.
+    - `restarts`, `restarts_next`: whether the filter of a segment restarts before this sample, or before the next.
     """
 
     measured: Channels
@@ -59,9 +60,9 @@ class _Row(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """The knowledge of the filters at the beginning of a sample, by channel.
+    """The estimates of the filters at the beginning of a sample, by channel.
 
-    - `driven`: the rates, then the specific forces besides the model's. `disturbance`: what drives them.
+    - `driven`: the rates, then the specific forces besides the model's. `disturbance`: their disturbances.
     """
 
     driven: tuple[Segments, ...]
@@ -79,7 +80,7 @@ def _advance(
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """The estimates one sample later, and the innovations of this sample. `going`: the segments that have not diverged.
 
-    Innovations and rates are computed once for all that uses them, and so are their derivatives.
+    Innovations, rates and their derivatives are computed once, although several results need them.
     """
     move, average, observe = functions
     seen = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
@@ -93,7 +94,7 @@ def _advance(
         return tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
 
     errors = computed_once(going, compared)
-    # What was not measured has no gain.
+    # A missing measurement has a gain of 0.
     driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
     rates = computed_once(going, lambda: move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates)
     driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
@@ -130,7 +131,7 @@ class Segmented(NamedTuple):
     - `inputs`: input innovations, see `jaxos4.shooting.feedthrough`.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters on which they depend.
-    - `window`: what a measurement averages.
+    - `window`: the part of a sample that a measurement averages.
     """
 
     observed: Observed
@@ -145,9 +146,9 @@ class Segmented(NamedTuple):
 class Point(NamedTuple):
     """The unknowns at which a flight is filtered.
 
-    - `parameters`: of all segments, or of each.
-    - `feedthrough`: what the input innovations explain of the innovations of the same samples.
-    - `noise_feedthrough`: feedthroughs that were found before; what they explain counts as noise.
+    - `parameters`: common to all segments, or of each segment.
+    - `feedthrough`: the coefficients by which input innovations explain the innovations of the same samples.
+    - `noise_feedthrough`: feedthroughs that were found before; the innovations that they explain count as noise.
     """
 
     parameters: Float[Array, "parameters *segments"]
@@ -160,17 +161,17 @@ class Point(NamedTuple):
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """Filter all segments. The likelihood of the innovations has derivatives in the parameters and in the noise.
 
-    A change of one channel's noise is taken to change no other channel's innovations.
+    The derivatives neglect that one channel's noise affects another channel's innovations.
 
-    - `functions`: of a state, the forcing and the parameters: the state one sample later, its mean over what a
-      measurement averages, and the outputs of the sensors.
-    - `positions`: of the parameters on which the forcing depends.
+    - `functions`: three functions of a state, the forcing and the parameters. They return the state one sample later,
+      its mean over the window of a measurement, and the outputs of the sensors.
+    - `positions`: indices of the parameters on which the forcing depends.
     """
     return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)
 
 
 def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
-    """The innovations of a batch, whose lanes become segments: each lane's segments stand next to each other."""
+    """The innovations of a batch, whose lanes become segments. The segments of a lane are adjacent."""
     (moving, _, flight, at), (fixed, positions, fixed_flight, fixed_at) = many, shared
     segments = eqx.combine(flight, fixed_flight).observed.measured.shape[-1]
 
@@ -185,7 +186,7 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         return jnp.repeat(leaf, segments, axis=0)
 
     def in_each_segment(one: Any, same: Any) -> Any:
-        """Values of all segments of a lane, or of each segment."""
+        """Values in each segment, from values common to a lane or of each segment."""
         one = jax.tree.map(lambda leaf: leaf if leaf.ndim > 2 else jnp.repeat(leaf[..., None], segments, 2), one)
         same = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else jnp.repeat(leaf[:, None], segments, 1), same)
         return lanes_before_last(one, same)
@@ -201,7 +202,7 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
 
         return function
 
-    rows = fixed_flight.rows if flight.rows is None else flight.rows.max()  # in the rows of other lanes, nothing counts
+    rows = fixed_flight.rows if flight.rows is None else flight.rows.max()  # surplus rows of shorter lanes do not count
     observed, inputs, forcing, tangents = lanes_before_last(flight[:4], fixed_flight[:4])
     dt, window = (of_each_segment(*pair) for pair in zip(flight[5:], fixed_flight[5:], strict=True))
     flight = Segmented(observed, inputs, forcing, tangents, rows, dt, window)
@@ -218,7 +219,7 @@ def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmente
 
 
 def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
-    """See `innovate`; functions of all segments. What `at` holds may have an axis of segments, the last."""
+    """See `innovate`. `functions` act on all segments. Arrays in `at` may have segments as last axis."""
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
     parameters, noise, feedthrough, noise_feedthrough, by_input = at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
@@ -278,8 +279,8 @@ def _filter_rows(
 ) -> _Carry:
     """The filters after some more rows.
 
-    `steps`: the disturbance over a sample, with its derivatives in the noise. `fed`: what feedthroughs explain of the
-    innovations, the squares of what they explained before, and the derivatives of the first.
+    `steps`: the disturbance over a sample, with its derivatives in the noise. `fed`: the part of the innovations that
+    `feedthrough` explains, the square of the part that `noise_feedthrough` explains, and the derivatives of the first.
     """
     count, segments = parameters.shape[0], counts.shape[1]
     scalars, own = tuple(parameters), parameters.shape[1:]
@@ -296,7 +297,7 @@ def _filter_rows(
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
         fed = Feedback.of(gains, steps[0], by_input)
-        # The noise acts by the feedback alone, and the parameters do not act on it.
+        # The noise acts only through the feedback, and the parameters do not act on the feedback.
         fed_slopes = feedback_slopes(gain_slopes, steps[1], by_input, count)
 
         def filtered(known: _Known, fed: Feedback, scalars: tuple, forcing: Forcing = forcing):

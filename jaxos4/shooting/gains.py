@@ -1,12 +1,12 @@
-"""The noise of filter error, and the gains of its Kalman filters, which depend on no parameter.
+"""The noise of filter error, and the gains of its Kalman filters. The gains depend on no parameter.
 
 A disturbance d acts in each channel. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise. On a body rate x
 it acts as an angular acceleration [rad/s^2], x' = d. On a specific force it acts through a low-pass filter, because
 gusts and rotors answer smoothly: the force per mass [m/s^2] is x, with x' = (d - x) / smoothing.
 
-A measurement is the mean over a window of its sample (`Window`). A filter knows x and d at the beginning of a sample.
-From them and from the noise within the sample follow three numbers: x and d at its end, and what is measured. Their
-joint covariance is exact, so innovations of the right model are white at every sample time.
+A measurement is the mean over a window of its sample (`Window`). A filter estimates x and d at the beginning of a
+sample. With the noise within the sample, they determine x and d at its end, and the measurement. The joint covariance
+of these three is exact, so innovations of the right model are white at every sample time.
 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
@@ -29,7 +29,7 @@ RATE_COUNT = CHANNELS["rates"]
 """The number of body rates, which come first among the channels."""
 # Standard deviation of the rates before the first measurement of a segment [rad/s]: as good as unknown.
 _UNKNOWN_RATE = 1e3
-# Nodes of the quadrature over each part of a sample: exact to nine digits, as it is shorter than four time constants.
+# Nodes of the quadrature over each part of a sample: exact to nine digits if it is shorter than four time constants.
 _NODES = 8
 # The time constant of the low-pass filter of a force that has none [s].
 _NO_FILTER = 1e-9
@@ -47,12 +47,12 @@ INSTANT = Window()
 
 
 class LogNoise(NamedTuple):
-    """The logarithms of each channel's noise levels, in all segments or in each. Logarithms may have any sign.
+    """The logarithms of each channel's noise levels, which may have any sign; common to all segments, or of each.
 
-    - `strength`: standard deviation of the disturbance, [rad/s^2] for rates, and of x [m/s^2] for specific force.
+    - `strength`: standard deviation of the disturbance [rad/s^2] for rates, and of x [m/s^2] for specific force.
     - `time_constant`: of the disturbance [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
-    - `smoothing`: the time constant of the low-pass filter of a specific force [s]; of a rate it means nothing. `None`:
+    - `smoothing`: the time constant of the low-pass filter of a specific force [s]; without meaning for a rate. `None`:
       no filter, so that the disturbance itself is the force.
     """
 
@@ -66,7 +66,7 @@ class Observed(NamedTuple):
     """The measurements, in segments.
 
     - `measured`: body rates, then specific force. NaN: not measured.
-    - `restart`: whether a segment forgets what it knew before this sample.
+    - `restart`: whether the filter of a segment restarts before this sample.
     - `counts`: whether the innovations at a sample count.
     - `known`: the rates at the first sample. `None`: unknown.
     """
@@ -80,8 +80,8 @@ class Observed(NamedTuple):
 class Gains(NamedTuple):
     """The effect of a unit of innovation, and the variance of the innovation.
 
-    - `driven`, `disturbance`: at the beginning of the sample.
-    - `driven_later`: at the end, besides `driven`. `disturbance_later`: at the end.
+    - `driven`, `disturbance`: the effect at the beginning of the sample.
+    - `driven_later`: the additional effect on x at the end. `disturbance_later`: the effect on d at the end.
     """
 
     driven: Series
@@ -100,9 +100,9 @@ class Covariance(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """d and x over one sample, without noise.
+    """The propagation of d and x over one sample, without noise.
 
-    - `kept`, `driven_kept`: the shares of d and of x that remain. `reach`: what a unit of d adds to x.
+    - `kept`, `driven_kept`: the shares of d and of x that remain. `reach`: the change of x for a unit of d.
     """
 
     kept: Channels
@@ -111,7 +111,7 @@ class Transition(NamedTuple):
 
     @classmethod
     def of(cls, noise: LogNoise, dt: Float[Array, "..."]) -> "Transition":
-        """Over one sample of this length."""
+        """The propagation over one sample of this length."""
         response = _Response.of(noise)
         return cls(response.fading(dt), response.driven_fading(dt), response.driven(dt))
 
@@ -119,8 +119,8 @@ class Transition(NamedTuple):
 class Step(NamedTuple):
     """The disturbance over one sample, of each channel.
 
-    - `transition`: see there.
-    - `driven_seen`, `seen`: what a unit of x and of d adds to the measurement.
+    - `transition`: propagates the disturbance over one sample, without noise.
+    - `driven_seen`, `seen`: the change of the measurement for a unit of x and of d.
     - `since_seen`: x at the end of the sample, for each unit of x in the measurement.
     - `added`: the covariance that its noise adds at the end of the sample.
     - `noise`: the variance that its noise adds to the measurement; `with_driven`, `with_disturbance`: the covariance
@@ -146,7 +146,7 @@ def is_rate(channels: Float[Numeric, "channels *rest"]) -> Bool[np.ndarray, "cha
 
 
 class _Response(NamedTuple):
-    """The response of a channel to a unit of x or of d after a time [s]. `driven` is that of x to d."""
+    """The response of a channel to a unit of x or of d after a time [s]. `driven` is the response of x to d."""
 
     time_constant: Channels
     smoothing: Channels
@@ -159,21 +159,21 @@ class _Response(NamedTuple):
         return cls(tau, jnp.where(is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing)))
 
     def fading(self, time: Array) -> Array:
-        """Of d to d."""
+        """The response of d to d."""
         return jnp.exp(-time / self.time_constant)
 
     def driven_fading(self, time: Array) -> Array:
-        """Of x to x."""
+        """The response of x to x."""
         return jnp.where(is_rate(self.smoothing), 1.0, jnp.exp(-time / self.smoothing))
 
     def driven(self, time: Array) -> Array:
-        """Of x to d."""
+        """The response of x to d."""
         tau = self.time_constant
         force = tau / (tau - self.smoothing) * (self.fading(time) - jnp.exp(-time / self.smoothing))
         return jnp.where(is_rate(tau), -tau * jnp.expm1(-time / tau), force)
 
     def driven_sum(self, time: Array) -> Array:
-        """Of the integral of x to d."""
+        """The response of the integral of x to d."""
         tau, fast = self.time_constant, self.smoothing
         slow, quick = (-x * jnp.expm1(-time / x) for x in (tau, fast))
         return jnp.where(is_rate(tau), tau * (time - slow), tau * (slow - quick) / (tau - fast))
@@ -185,13 +185,13 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     response, variance = _Response.of(noise), jnp.exp(2 * noise.strength)
     tau, fast = response
     rate = is_rate(tau)
-    # A force has the standard deviation `strength`, and its disturbance a larger one.
+    # `strength` is the standard deviation of a force; its disturbance has a larger one.
     drive = jnp.where(rate, variance, variance * (tau + fast) / tau)
     begin, end = jnp.asarray(window.begin, dtype=float), jnp.asarray(window.begin + window.length, dtype=float)
     long = jnp.where(window.length > 0, window.length, 1.0)
 
     def measured(time: Array) -> Array:
-        """By a unit of the disturbance at this time of the sample."""
+        """The change of the measurement for a unit of d at this time of the sample."""
         until_begin, until_end = jnp.maximum(begin - time, 0.0), jnp.maximum(end - time, 0.0)
         mean = (response.driven_sum(until_end) - response.driven_sum(until_begin)) / long
         return jnp.where(window.length > 0, mean, response.driven(until_begin))
@@ -205,7 +205,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     x, d, m = response.driven(dt - time), response.fading(dt - time), measured(time)
     products = x * x, x * d, d * d, m * m, m * x, m * d
     x_x, x_d, d_d, m_m, m_x, m_d = ((share * each).sum(axis=0) for each in products)
-    # The mean of what remains of x over the window, and what of that mean remains at the end: finite for every filter.
+    # The mean over the window of the share of x that remains. It is finite for every filter.
     in_window = jnp.where(window.length > 0, window.length, 0.0) / fast
     mean = jnp.where(in_window > 0, -jnp.expm1(-in_window) / jnp.where(in_window > 0, in_window, 1.0), 1.0)
     force = jnp.where(rate, 0.0, variance)
@@ -232,12 +232,12 @@ def next_gains(
     p: Covariance, step: Step, is_measured: Bool[Array, "channels segments"], restart: Bool[Array, " segments"]
 ) -> tuple[Covariance, Gains]:
     """The covariance one sample later, and the gains of this sample, from the covariance at its beginning."""
-    # After a restart the rates are unknown. XLA takes no longer than if this came before the loop.
+    # After a restart the rates are unknown. Inside the loop this costs no time.
     first = first_covariance(step, p.driven.shape[-1])
     first = first._replace(driven=first.driven + jnp.where(is_rate(first.driven), _UNKNOWN_RATE**2, 0.0))
     driven, cross, disturbance = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
     (kept, _, reach), seen, since = step.transition, step.seen, step.since_seen
-    # Covariances with the measurement, and with `gap`: x at the end less what remains of the measurement. The gap does
+    # Covariances with the measurement, and with `gap`: x at the end minus `since` times the measurement. The gap does
     # not depend on x at the beginning, whose variance may be huge. So no difference of large numbers is computed.
     driven_seen = step.driven_seen * driven + seen * cross
     disturbance_seen = step.driven_seen * cross + seen * disturbance
@@ -268,7 +268,7 @@ def next_gains(
 
 
 def basis(unknowns: T) -> T:
-    """The directions of each leaf: in each direction, the same unknown of all channels changes by 1."""
+    """The directions of derivatives: in each direction, one unknown changes by 1 in all channels."""
     leaves, tree = jax.tree.flatten(unknowns)
     directions = np.eye(len(leaves))
     rows = zip(directions, leaves, strict=True)

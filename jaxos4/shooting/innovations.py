@@ -1,8 +1,9 @@
 """A problem of innovations: the likelihood of a flight with disturbances that the model does not contain.
 
-A controller answers gusts and whatever a model lacks, so input and disturbance correlate, and a likelihood that takes
-the disturbance for noise of the sensors is biased, however long the flight. Here a Kalman filter estimates it from the
-past, and only the innovations are compared: the part of a measurement that the past cannot predict.
+A controller answers gusts and all other disturbances, so input and disturbance correlate. A likelihood that takes the
+disturbance for sensor noise is therefore biased, however long the flight. Here a Kalman filter estimates the
+disturbance from the past, and only the innovations are compared: the part of a measurement that the past cannot
+predict.
 
 References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, System Identification, ch. 7 and 13.
 """
@@ -39,26 +40,26 @@ SETTLING = 128
 class InnovationsProblem(AbstractProblem):
     """A shooting problem's rates and specific force, compared as innovations of Kalman filters.
 
-    Each channel has a disturbance with a strength and a time constant, and white noise of its sensor. The logarithms of
-    the three are unknowns like the parameters, and follow them: `log_p_strength`, `log_p_time`, `log_p_sensor`, then
-    those of q, r, and each specific force that the model predicts; with forces also `log_az_smoothing`, the time
-    constant of the low-pass filter of its disturbance (fixed for rates, which have none), and with `input_innovations`
+    Each channel has a disturbance with a strength and a time constant, and white sensor noise. The logarithms of these
+    three follow the parameters as further unknowns: `log_p_strength`, `log_p_time`, `log_p_sensor`, then the same for
+    q, r, and each specific force that the model predicts. With forces there is also `log_az_smoothing`, the time
+    constant of the low-pass filter of the disturbance (fixed for rates, which have none), and with `input_innovations`
     `p_rate_gain_1`, `p_disturbance_gain_1`, `p_feedthrough_1` and so on. The bracket is a Gaussian prior, whose
     standard deviation is its half-width.
 
     - `problem`: model, flight, known or free initial state, and the bracket of the parameters. Its windows and its
       sigma do not matter.
     - `segments`: the number of parts of the flight that are filtered in parallel; by default one for about 384 samples.
-      Short ones lose information, because a filter begins without memory. Padded flights with equal numbers of segments
-      and equal room share a program.
+      Short segments lose information, because a filter begins without memory. Padded flights with equal numbers of
+      segments and equal capacity share a program.
     - `settling`: after this many samples a filter has settled. The first innovations of a segment do not count.
-    - `least_noise`: the least standard deviation of each channel's sensor, by what is known of it; 0: nothing.
-    - `input_innovations`: of each channel, what the past does not tell of its torque or thrust within a sample, see
-      `jaxos4.shooting.feedthrough`; by default nothing: the controller knows no more than the log.
+    - `least_noise`: a lower limit of the standard deviation of each channel's sensor noise; 0: none is known.
+    - `input_innovations`: for each channel, the part of torque or thrust within a sample that the past does not
+      predict, see `jaxos4.shooting.feedthrough`. By default none: the controller knows no more than the log.
     - `answers_within`: whether the controller answers a rate within its sample; otherwise feedthroughs are 0.
-    - `noise_feedthrough`: feedthroughs that were found before: what they explain counts as noise. NaN, or by default:
-      not known, so that a search has two stages. The first finds them, the second counts them.
-    - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants.
+    - `noise_feedthrough`: feedthroughs that are treated as known: the innovations that they explain count as noise. NaN
+      (default): unknown. A search then has two stages: the first finds them, the second counts what they explain.
+    - `start`: where searches start. NaN (default): the center of the bracket, with each of several time constants.
     """
 
     problem: ShootingProblem
@@ -91,7 +92,7 @@ class InnovationsProblem(AbstractProblem):
         each = self._by_recording
         if each is not None and segments <= len(each.places):
             raise ValueError(f"`segments` must be more than the {len(each.places)} recordings, got {segments}.")
-        # An array in any case, so that all starts share one program.
+        # Always an array, so that all starts share one program.
         channels, samples = self.problem.columns.size, problem.flight.time.shape[-1]
         nothing = np.zeros((samples, 0, channels))
         self.input_innovations = as_float(nothing if input_innovations is None else input_innovations)
@@ -144,7 +145,7 @@ class InnovationsProblem(AbstractProblem):
             begins = numpy.searchsorted(each.number, np.arange(len(each.places)))
         if isinstance(length, Tracer) or isinstance(begins, jax.Array):
             edges = jnp.append(jnp.asarray(begins), room if length is None else length)
-        else:  # what is known needs no compiled program
+        else:  # known numbers need no compiled program
             edges = np.append(begins, room if length is None else int(length))
         return Segments.of(self.segments, room, edges, self.settling)
 
@@ -157,7 +158,7 @@ class InnovationsProblem(AbstractProblem):
     @property
     @eqx.filter_jit  # one compiled program instead of one for each operation, and traced once
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
+        """The parameters, then the logarithms of the noise levels, in brackets from differences of measurements."""
         data = self.problem.measured(), self.flight.dt, self.least_noise
         has_input = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
         return with_noise(
@@ -166,7 +167,7 @@ class InnovationsProblem(AbstractProblem):
 
     @property
     def initial_guess(self) -> InitialGuess:
-        """`start` where it is not NaN; all starts are equal if it is a whole start. A filter finds its own state."""
+        """`start` where it is not NaN, so that a complete one makes all starts equal. Filters find their own states."""
         unknowns, count = self.unknowns.usable, self.problem.unknowns.count
         place, times = np.arange(unknowns.count) - count, jnp.log(jnp.asarray(TIMES))
         is_time = (place >= 0) & (place % len(self._own) == 1)
@@ -180,7 +181,7 @@ class InnovationsProblem(AbstractProblem):
         return dataclasses.replace(self, start=start)
 
     def with_noise_feedthrough(self, found: Float[ArrayLike, "channels feedthroughs"]) -> "InnovationsProblem":
-        """The same problem, with what these feedthroughs explain counted as noise."""
+        """The same problem; the innovations that these feedthroughs explain count as noise."""
         return dataclasses.replace(self, noise_feedthrough=found)
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> "InnovationsProblem":
@@ -204,7 +205,7 @@ class InnovationsProblem(AbstractProblem):
         return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
 
     def _of_inputs(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "3 channels feedthroughs"]:
-        """The gains of rate and disturbance by input innovations, then the feedthroughs."""
+        """The gains of input innovations on rate and disturbance, then the feedthroughs."""
         own = self._of_channels(unknowns)[:, self._levels :]
         return jnp.moveaxis(own.reshape(len(own), 3, self.input_innovations.shape[-2]), 1, 0)
 
@@ -215,7 +216,7 @@ class InnovationsProblem(AbstractProblem):
         return lambda unknowns: at(unknowns, noise_feedthrough)
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
-        """The whole problem; in a second stage, what feedthroughs that were found before explain counts as noise."""
+        """The whole problem. If it has feedthroughs, a second stage counts as noise the innovations they explain."""
         del shares
         number, at = 2 if self.noise_feedthrough.size else 1, self._local_model()
         is_known = ~jnp.isnan(self.noise_feedthrough).any()
@@ -243,7 +244,7 @@ class InnovationsProblem(AbstractProblem):
         unknowns, innovations = self.unknowns.usable, self._innovations()
         count, free = self.problem.unknowns.count, unknowns.free
         both, places = free & free[:, None], None
-        if (each := self._by_recording) is not None:  # of the unknowns of each segment
+        if (each := self._by_recording) is not None:  # indices of each segment's unknowns
             others = np.broadcast_to(np.arange(count, free.size), (self.segments, free.size - count))
             places = jnp.concatenate([jnp.asarray(each.places)[self.segmentation.recording], others], axis=1)
 
@@ -265,7 +266,7 @@ class InnovationsProblem(AbstractProblem):
 
     @property
     def _place(self) -> Int[Array, "segments time"]:
-        """The samples of each segment; the last one instead of those that do not exist."""
+        """The samples of each segment. Indices beyond the flight are those of its last sample."""
         return jnp.minimum(jnp.asarray(self.segmentation.place), self.flight.time.shape[0] - 1)
 
     def observed(self) -> Observed:
@@ -275,9 +276,9 @@ class InnovationsProblem(AbstractProblem):
     def innovations(
         self, parameters: Parameters, noise: LogNoise, by_input: Float[Array, "3 channels feedthroughs"] | None = None
     ) -> Innovations:
-        """The innovations of all segments, with derivatives in the parameters of its recording.
+        """The innovations of all segments, with derivatives in the parameters of the segment's recording.
 
-        `by_input`: the gains of rate and disturbance by input innovations, and the feedthroughs; by default 0.
+        `by_input`: the gains of input innovations on rate and disturbance, and the feedthroughs; by default 0.
         """
         nothing = jnp.zeros((3, self.problem.columns.size, self.input_innovations.shape[-2]))
         by_input = nothing if by_input is None else by_input
@@ -285,7 +286,7 @@ class InnovationsProblem(AbstractProblem):
         return self._innovations()(parameters, noise, by_input, noise_feedthrough)
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
-        """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
+        """`innovations` for a loop: everything that does not depend on parameters and noise is computed once."""
         problem, observed, forced, each = self.problem, self.observed(), self._forced(), self._by_recording
         places = None
         if each is not None:
@@ -312,7 +313,7 @@ class InnovationsProblem(AbstractProblem):
         inputs, samples = self.flight.inputs._replace(length=self.problem.length), self._place
 
         def segments_last(forcing: Forcing) -> Forcing:
-            forcing = forcing._replace(recording=())  # each segment belongs to one
+            forcing = forcing._replace(recording=())  # a segment belongs to one recording
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
 
         def of(parameters: Parameters) -> Forcing:
@@ -337,7 +338,7 @@ def _move(problem: ShootingProblem, state: State, forcing: Forcing, parameters) 
 
 
 def _average(problem: ShootingProblem, state: State, forcing: Forcing, parameters) -> State:
-    """The mean over what a measurement averages, from the rates at the beginning of a sample."""
+    """The mean of the state over a measurement's window, from the rates at the beginning of a sample."""
     if forcing.early is None:  # measured at the beginning
         return state
     early = forcing.early._replace(recording=forcing.recording, velocity=forcing.velocity)

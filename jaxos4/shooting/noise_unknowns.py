@@ -16,12 +16,12 @@ _STRIDE = 1.0  # the cost is roughly quadratic in a logarithm over such a step
 _REACH = 1e8  # factor to either side of the first noise levels; large, as simulated flights have no disturbance
 _SHORTEST, _LONGEST = 0.25, 3.0  # time constants, in samples and in seconds
 _SHORTEST_OF_FORCE = 0.25  # s; faster disturbances of specific force are vibration, a noise of the sensor
-# Where the search of a force's low-pass filter starts, and its largest time constant [s]; the smallest is `_SHORTEST`.
-# It is shorter than that of any disturbance of a force.
+# Time constants of a force's low-pass filter [s]: the start of a search, and the largest, which is shorter than that of
+# any disturbance of a force. The smallest is `_SHORTEST`.
 _SMOOTHING, _LONGEST_SMOOTHING = 0.05, 0.2
 
 
-@jax.jit  # traced once, although many ask for it
+@jax.jit  # traced once for all callers
 def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_constant: Scalar) -> LogNoise:
     """Rough noise levels from differences of the measurements. `time_constant`: of all disturbances [s]."""
 
@@ -42,7 +42,7 @@ def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_con
 
 
 def levels(channels: int) -> int:
-    """The number of noise levels of each channel: one more if there are specific forces, see `LogNoise`."""
+    """The number of noise levels of each channel; 4 instead of 3 if there are specific forces, see `LogNoise`."""
     return 4 if channels > RATE_COUNT else 3
 
 
@@ -58,7 +58,7 @@ def with_noise(
 ) -> Unknowns:
     """The parameters, then noise, gains and feedthroughs of each channel, in brackets from the measurements.
 
-    Noise levels are unknown by their logarithms, see `LogNoise`. `has_input`: which input innovations a channel has.
+    The unknowns are the logarithms of noise levels, see `LogNoise`. `has_input`: which input innovations a channel has.
     `answers_within`: see `InnovationsProblem`.
     """
     first = jnp.stack(first_noise(measured, dt, TIMES[0])[:3], axis=1)
@@ -68,7 +68,7 @@ def with_noise(
     lowest, highest = first - np.log(_REACH), first + np.log(_REACH)
     lowest = lowest.at[:, 1].set(jnp.where(rate[:, 0], shortest, np.log(_SHORTEST_OF_FORCE)))
     highest = highest.at[:, 1].set(np.log(_LONGEST))
-    # A rate has no filter: its place stays where it is.
+    # A rate has no filter: its `smoothing` is fixed.
     lowest = lowest.at[:, 3:].set(jnp.where(rate, first[:, 3:], shortest))
     highest = highest.at[:, 3:].set(jnp.where(rate, first[:, 3:], np.log(_LONGEST_SMOOTHING)))
     lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))

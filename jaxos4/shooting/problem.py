@@ -32,7 +32,7 @@ from .scans import (
 )
 from .stages import ROUNDING, stages_of
 
-# How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
+# Errors that an unmeasured initial state may have, in cascade order: rad/s, rad, then m and m/s.
 _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
 
 
@@ -44,14 +44,14 @@ class ShootingProblem(AbstractProblem):
     - `sigma`: standard deviation of each channel's noise, in the order of `CHANNEL_NAMES`; its reciprocal is the
       weight. The three values of specific force may be omitted: they are then 0.3 m/s^2.
     - `initial_state`: X at the first sample. `None`: free, and estimated with the parameters.
-    - `channels`: what is compared and simulated: `"rates"`, `"attitude"` (with the rates), or `"all"`.
+    - `channels`: the states that are compared and simulated: `"rates"`, `"attitude"` (with the rates), or `"all"`.
     - `method`: the stepper, `"euler"` or `"rk4"`.
     - `windows`: number of windows for multiple shooting. The flight is cut into windows of equal length, and each is
       simulated from its own free initial state, so that errors of the model add up over one window only. Windows are
       independent, so the information in a long drift is lost. Measure each channel in at least some windows: nothing
       else identifies the initial states.
-    - `length`: the number of samples that count; the others are padding, in which nothing was measured. `padded` makes
-      it. `None`: all of them.
+    - `length`: the number of samples that count; the others are padding, in which nothing was measured. `padded` sets
+      it. `None`: all samples count.
     - `unknowns`: by default all parameters of the model, in the model's bracket.
 
     An *initial state* below is the part of X that the channels need, in cascade order: p, q, r, then phi, theta, psi,
@@ -123,7 +123,7 @@ class ShootingProblem(AbstractProblem):
 
     @property
     def columns(self) -> Int[np.ndarray, " columns"]:
-        """The positions in `CHANNEL_NAMES` of what is compared: states in cascade order, then specific force."""
+        """The positions of the compared channels in `CHANNEL_NAMES`: states in cascade order, then specific force."""
         forces = np.asarray(self.model.force_axes, dtype=int)
         return np.concatenate([CASCADE_ORDER[: self.size], len(STATE_NAMES) + forces])
 
@@ -155,7 +155,7 @@ class ShootingProblem(AbstractProblem):
         return dataclasses.replace(self, channels=channels)
 
     def measured(self) -> Float[Array, "samples columns"]:
-        """The measurements in the order of `columns`. A known first sample is NaN: it is no data."""
+        """The measurements in the order of `columns`. A known first sample is NaN, because it is not fitted."""
         measured = (self.flight.channels if self.model.force_axes else self.flight.states)[:, self.columns]
         if self.initial_state is None:
             return measured
@@ -180,7 +180,7 @@ class ShootingProblem(AbstractProblem):
         return self.model.forcing(self.flight.inputs, parameters)
 
     def forced_rows(self) -> Callable[[Parameters], Rows]:
-        """`rows` with the derivatives of the forcing, for a loop: what depends on no parameter is made once."""
+        """`rows` with the derivatives of the forcing, for a loop: parts that depend on no parameter are made once."""
         rows, inputs, index = self.rows(), self.flight.inputs, self.window_samples()[0]
         places = self.model.forcing_parameters
 
@@ -196,12 +196,12 @@ class ShootingProblem(AbstractProblem):
         return initial_state.reshape(self.windows, self.size)
 
     def join(self, parameters: Parameters, initial_state: InitialStates) -> WindowUnknowns:
-        """The unknowns of each window: the parameters, and its initial state if that is free."""
+        """The unknowns of each window: the parameters, and the window's initial state if that is free."""
         repeated = jnp.broadcast_to(parameters, (self.windows, parameters.shape[0]))
         return jnp.concatenate([repeated, self.split(initial_state)[:, : self.free_size]], axis=1)
 
     def first_state(self) -> tuple[InitialStates, InitialStates]:
-        """The known state, or each window's first measurement of each channel, or 0; and how far off it may be."""
+        """The known state, or each window's first measurement of each channel, or 0; and the error that it may have."""
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
@@ -256,7 +256,7 @@ class ShootingProblem(AbstractProblem):
 
     @property
     def model_of_window(self) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
-        """The function to the local model of one window, in the parameters and a free initial state."""
+        """The function that returns the local model of one window, in the parameters and a free initial state."""
         return functools.partial(
             shoot_with_derivatives,
             self._advance,

@@ -21,10 +21,10 @@ from ..models.state import Forcing, State, Translation, unstack
 from .abstract import LocalModel, Shot
 from .sparsity import Panel, panels_of, symmetric
 
-# A body rate [rad/s] that no quadrotor reaches and no gyro measures: a faster trajectory has diverged.
+# rad/s; no quadrotor reaches this body rate and no gyro measures it, so a faster trajectory has diverged.
 FASTEST = 1e3
 
-# From a state, the forcing and the parameters: the state one sample later, and the output of noise-free sensors.
+# Returns the state one sample later and the output of noise-free sensors, from a state, the forcing and the parameters.
 Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
 Carry = TypeVar("Carry")
 Series = TypeVar("Series", Forcing, tuple[Array, ...])
@@ -38,8 +38,8 @@ Length = Int[Array, ""] | None
 class Rows(NamedTuple):
     """One window, or a batch of windows: one leaf for each channel, one row for each sample.
 
-    `forcing` acts from each sample to the next. A missing measurement is NaN. `forcing_tangents` is the derivative of
-    the forcing in the parameters on which it depends, along the last axis.
+    `forcing` acts from each sample to the next. A missing measurement is NaN. `forcing_tangents` holds the derivatives
+    of the forcing in the parameters on which it depends, along the last axis.
     """
 
     forcing: Forcing
@@ -72,7 +72,7 @@ def predict_window(
 def with_tangents(
     of: Callable[[Parameters], Forcing], parameters: Parameters, places: tuple[int, ...]
 ) -> tuple[Forcing, Forcing]:
-    """The forcing that is a function `of` the parameters, and its derivatives in those in these places."""
+    """The forcing as a function `of` the parameters, and its derivatives in the parameters at these `places`."""
     positions = np.asarray(places, dtype=int)
 
     def forcing(values: Float[Array, " positions"]) -> tuple[Forcing, Forcing]:
@@ -130,7 +130,7 @@ def shoot_with_derivatives(
     initial_state_is_free: bool,
     length: Length = None,
 ) -> LocalModel:
-    """`shoot` with gradient and information in the parameters and a free initial state. A batch is in lanes."""
+    """`shoot` with gradient and information in the parameters and a free initial state. A batch runs in lanes."""
     how = {"forcing_parameters": forcing_parameters, "initial_state_is_free": initial_state_is_free}
     alone = functools.partial(_linearised_shot, **how)
 
@@ -154,10 +154,10 @@ def shoot_with_derivatives(
 class _Carried(NamedTuple):
     """A linearised shot up to some sample.
 
-    - `late`: the tangents of the unknowns that act on the translation alone; `tangent`: those of all others.
+    - `late`: the tangents of the unknowns that act on the translation alone. `tangent`: those of all other unknowns.
     - `gradient`: in the unknowns of `tangent`, and then of `late`.
-    - `panels`: some rows of the information, in the columns of `tangent`, and then of `late`, without what lies right
-      of the rows' square.
+    - `panels`: some rows of the information, in the columns of `tangent`, and then of `late`. Columns to the right of
+      the rows' diagonal block are left out.
     """
 
     state: State
@@ -179,7 +179,7 @@ def _linearised_shot(
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
 ) -> LocalModel:
-    """`shoot_with_derivatives` of one flight, or of flights in lanes, which are then the last axis of all arrays.
+    """`shoot_with_derivatives` for one flight, or for flights in lanes, which are then the last axis of all arrays.
 
     Rows and weights that all lanes share have a last axis of 1.
     """
@@ -195,11 +195,11 @@ def _linearised_shot(
 
     def step(carry: _Carried, row: Rows) -> tuple[_Carried, None]:
         feasible = carry.shot.feasible & _is_feasible(carry.state)
-        # At rest after a failure, so that no derivative overflows.
+        # After a failure the state is 0, so that no derivative overflows.
         state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), carry.state)
         forcing = jax.tree.map(along_lanes, row.forcing)
 
-        # The rates alone are cheaper to repeat.
+        # If only the rates are simulated, repeating them is cheaper.
         repeated = not lanes or state.attitude is None
         at, late = (state, forcing, scalars), carry.late
         sample = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
@@ -256,7 +256,7 @@ def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: 
 def _added(
     blocks: list[Array], panel: Panel, first_late: int, squares: list[Lanes], slopes: list[tuple[Array, ...]]
 ) -> list[Array]:
-    """The rows of a panel with those of one sample."""
+    """The rows of a panel, with those of one sample added."""
     (top, end, outputs), late = panel, len(blocks) - 1
     own = slice(top - first_late * late, end - first_late * late)
     rows = [(i, (squares[i] * slopes[late][i][own])[:, None]) for i in outputs]
@@ -273,7 +273,7 @@ def _linearised_sample(
 ) -> tuple[State, Callable, Callable | None, Lanes, list[Lanes], list[Lanes]]:
     """The next state, the derivative of `advance`, the cost, and the weighted errors and squared weights.
 
-    If `late`, the second derivative is that in the translation alone.
+    The second derivative is in the translation alone; `None` unless `late`.
     """
     state, forcing, scalars = at
     if row.forcing_tangents is None:
@@ -322,7 +322,7 @@ def window_samples(
 
 
 def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
-    """The series of each window, from those of the flight. Windows of equal length need no copy."""
+    """The series of each window, from the series of the flight. Windows of equal length need no copy."""
 
     def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:
         return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
@@ -331,7 +331,7 @@ def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
 
 
 def each_window(function: Callable, *arguments: Any) -> Any:
-    """`function` of each window. The only window of a flight needs no `vmap`, which takes long to trace."""
+    """`function` for each window. A single window needs no `vmap`, which takes long to trace."""
     if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
         return jax.vmap(function)(*arguments)
     only = jax.tree.map(lambda leaf: leaf[0], arguments)
@@ -341,7 +341,7 @@ def each_window(function: Callable, *arguments: Any) -> Any:
 def first_measured(
     measured: Float[Array, "windows length columns"],
 ) -> tuple[Float[Array, "windows columns"], Bool[Array, "windows columns"]]:
-    """The first measurement of each window, or 0 if there is none; and whether it is that of the first sample."""
+    """The first measurement of each window, or 0 if there is none; and whether it was made at the first sample."""
     first = jnp.argmin(jnp.isnan(measured), axis=1)
     value = jnp.take_along_axis(measured, first[:, None], axis=1)[:, 0]
     return jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)

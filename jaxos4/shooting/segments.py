@@ -15,21 +15,21 @@ from .filters import BLOCK
 from .gains import Observed
 from .problem import ShootingProblem
 
-# A gap of this length ends what a filter knows [s].
+# s; after a gap of this length, a filter restarts.
 _GAP = 0.1
-# A flight is padded to the first of these numbers of samples that is enough. A longer flight is not padded: to compile
-# its program takes less time than to simulate it.
+# A flight is padded to the smallest of these numbers of samples that suffices. A longer flight is not padded: compiling
+# its program takes less time than simulating it.
 _CAPACITIES = (4096, 16384, 65536)
 
 
 class Segments(NamedTuple):
-    """How recordings are cut.
+    """The division of recordings into segments.
 
-    A segment begins with the end of the segment before it, which its filter needs to settle. The first begins with its
-    recording. Segments are equally long, but for the last of each recording.
+    A segment begins with the last samples of the segment before it, in which its filter settles. The first segment
+    begins with its recording. Segments are equally long, except for the last one of each recording.
 
-    - `place`: the samples of each segment, in a multiple of `BLOCK` rows. Those beyond the last do not exist.
-    - `owned`: whether a sample belongs to a segment. Each belongs to one; in other segments it settles the filter.
+    - `place`: the samples of each segment, in a multiple of `BLOCK` rows. Indices beyond the flight are padding.
+    - `owned`: whether a sample belongs to a segment. Each sample belongs to one; in another it settles the filter.
     - `rows`: the number of rows that are used; the others are padding.
     - `recording`: the number of the recording of each segment.
     """
@@ -41,13 +41,14 @@ class Segments(NamedTuple):
 
     @classmethod
     def of(cls, number: int, capacity: int, edges: Int[Numeric, " edges"], settling: int) -> "Segments":
-        """At most this many segments, more than there are recordings if these are several.
+        """At most `number` segments. Several recordings need more segments than there are recordings.
 
-        `capacity`: the room for samples. `edges`: the first sample of each recording, and the end of the last.
+        `capacity`: the number of samples with padding. `edges`: the first sample of each recording, and the end of the
+        last.
         """
-        numpy = jnp if isinstance(edges, jax.Array) else np  # what is known needs no compiled program
+        numpy = jnp if isinstance(edges, jax.Array) else np  # known numbers need no compiled program
         recordings, settling = edges.shape[0] - 1, settling if number > 1 else 0
-        # A recording whose length is no multiple of a segment's has one more.
+        # A recording whose length is no multiple of a segment's has one segment more.
         whole = number - (recordings if recordings > 1 else 0)
         begin, end, own = edges[:-1], edges[1:], numpy.maximum(numpy.diff(edges) - settling, 0)
         length, most = numpy.maximum(-(-own.sum() // whole), 1), -(-(capacity - settling) // whole)
@@ -65,8 +66,8 @@ class Segments(NamedTuple):
 def observe_in_segments(problem: ShootingProblem, segments: Segments, settling: int) -> Observed:
     """The measurements in segments, where filters restart, and which innovations count.
 
-    A filter restarts in a gap, and where a stretch begins. Until it has settled its innovations do not count, except at
-    the beginning of a flight in one piece: a simulation begins at rest.
+    A filter restarts in a gap, and where a stretch begins. Until it has settled, its innovations do not count, except
+    at the beginning of a flight without stretches: a simulation begins at rest.
     """
     flight, index, samples = problem.flight, jnp.asarray(segments.place), problem.flight.time.shape[0]
     exists, place = ((index >= 0) & (index < samples)).T, jnp.minimum(index, samples - 1)
@@ -107,9 +108,9 @@ def _restarts(
 
 
 def padded(problem: ShootingProblem) -> ShootingProblem:
-    """The problem with a padded flight, unless it is cut into windows. Derivatives are then forward-mode only.
+    """The problem with a padded flight, unless it is cut into windows. A padded flight has no reverse-mode derivatives.
 
-    Padding is not simulated: it costs memory and no time. Results change by rounding errors only.
+    Padding is not simulated, so it costs memory but no time. Results change by rounding errors only.
     """
     samples = problem.flight.time.shape[0]
     capacity = capacity_of(samples)

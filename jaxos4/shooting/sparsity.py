@@ -1,4 +1,4 @@
-"""Which unknowns act on which output. All other derivatives are zero: their products need not be summed."""
+"""Finds which unknowns act on which output. All other derivatives are zero, so their products need not be summed."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..models.state import CHANNELS
 
-# Rows of the information that are summed together, without the columns right of their square.
+# Rows of the information that are summed together, without the columns to the right of their diagonal block.
 _ROWS = 4
 
 
@@ -20,7 +20,7 @@ Panel = tuple[int, int, tuple[int, ...]]
 
 
 def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results arguments"]:
-    """Which leaves of a function's result depend on which of its arguments; inner functions are not looked into."""
+    """Which leaves of a function's result depend on which arguments. An inner function counts as one operation."""
     program = jax.make_jaxpr(function)(*arguments).jaxpr
     nothing = np.zeros(len(program.invars), dtype=bool)
     known = dict(zip(program.invars, np.eye(nothing.size, dtype=bool), strict=True))
@@ -36,9 +36,9 @@ def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results
 def panels_of(
     advance: Callable, at: tuple[Any, Any, tuple], forcing_parameters: tuple[int, ...], *, free: bool
 ) -> tuple[int, list[Panel]]:
-    """The place of the first unknown after those that act on rates or attitude; and the panels of all rows.
+    """The index after the last unknown that acts on rates or attitude, and the panels of all rows.
 
-    - `advance`: from a state, forcing and parameters, which are `at`, to the next state and the outputs.
+    - `advance`: returns the next state and the outputs, from a state, the forcing and the parameters, which are `at`.
     - `free`: whether the initial state is unknown too. Its leaves then follow the parameters.
     """
     leaves = dependence(advance, *at)
@@ -59,7 +59,7 @@ def panels_of(
 
 
 def symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *lanes"]:
-    """The symmetric matrix of which each panel holds some rows, without what lies right of the panel's square."""
+    """The symmetric matrix from panels of its rows, which end with their diagonal blocks."""
     size, lanes = panels[-1].shape[1], panels[0].ndim - 2
     filled = [jnp.pad(panel, ((0, 0), (0, size - panel.shape[1]), *((0, 0),) * lanes)) for panel in panels]
     lower = jnp.concatenate(filled)

@@ -1,7 +1,7 @@
 """A search in stages: the body rates of a short part of the flight first, then more.
 
-Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, so the cost of a long
-flight has other minima: the first stages are short.
+Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, which gives the cost of a
+long flight other minima, so the first stages are short.
 """
 
 import functools
@@ -25,10 +25,10 @@ ROUNDING = 64.0
 
 
 def stages_of(problem: "ShootingProblem", shares: tuple[float, ...]) -> Stages:
-    """The stages of a problem, whose last is the whole.
+    """The stages of a problem; the last fits the whole flight.
 
-    `shares`: of the flight, to which the body rates are fitted first. One of several windows is short enough as a
-    whole. All stages compare specific force.
+    `shares`: the body rates are first fitted to these shares of the flight. If there are several windows, only a share
+    of 1 counts, because windows are short enough. All stages compare specific force.
     """
     wanted = (share for share in shares if share == 1 or problem.windows == 1)
     rates = tuple(("rates", share) for share in wanted if (problem.channels, share) != ("rates", 1))
@@ -77,7 +77,7 @@ def stages_of(problem: "ShootingProblem", shares: tuple[float, ...]) -> Stages:
 def _model_of_part(
     problem: "ShootingProblem", part: "ShootingProblem", rows: Rows, parameters: Array, own: Array, length: Length
 ) -> LocalModel:
-    """The local model of the whole problem's `rows` on the channels of `part`, in all unknowns."""
+    """The local model of the whole problem's `rows`, on the channels of `part` but in all unknowns."""
     part = eqx.tree_at(lambda p: p.length, part, length, is_leaf=lambda leaf: leaf is None)
     compared = rows._replace(measured=rows.measured[: part.size] + rows.measured[problem.size :])
     model = each_window(part.model_of_window, compared, parameters, own[:, : part.size])

@@ -21,7 +21,7 @@ LAGS = 8
 class Innovations(NamedTuple):
     """The innovations of each segment and their negative log-likelihood.
 
-    The unknowns of a channel are the parameters, and then its own `LogNoise` and feedthroughs.
+    The unknowns of a channel are the parameters, then the channel's `LogNoise` and feedthroughs.
 
     - `feasible`: whether the rates stay below `FASTEST`.
     - `information`: the Fisher information.
@@ -48,8 +48,8 @@ def likelihood(
 ) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
     """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations.
 
-    `feedthrough_squares`: the squares of what feedthroughs explain, which the noise made too. `noise`: the places of
-    the noise among the unknowns.
+    `feedthrough_squares`: the squares of the explained part of the innovations, which counts as noise. `noise`: the
+    indices of the noise among the unknowns.
     """
     weight = jnp.where(counts, 1 / variance, 0.0)
     logarithm = jnp.where(counts, jnp.log(variance), 0.0)
@@ -70,7 +70,7 @@ def likelihood(
 def joined(
     gradient: Float[Array, "channels some"], information: Float[Array, "channels some some"], count: int
 ) -> tuple[Float[Array, " unknowns"], Float[Array, "unknowns unknowns"]]:
-    """Gradient and information about all unknowns, from those of each channel about parameters and its own."""
+    """Gradient and information in all unknowns, from each channel's in `count` parameters and its other unknowns."""
     channels, each = gradient.shape[0], gradient.shape[1] - count
     size = count + each * channels
     total = jnp.concatenate([gradient[:, :count].sum(axis=0), gradient[:, count:].ravel()])
@@ -89,7 +89,7 @@ def placed(
     places: Int[Numeric, "segments some"],
     size: int,
 ) -> tuple[Float[Array, "segments size"], Float[Array, "segments size size"]]:
-    """Gradient and information of each segment about `size` unknowns, of which it has those at `places`."""
+    """Gradient and information of each segment in all `size` unknowns, from its own, which are at `places`."""
     segments = np.arange(places.shape[0])
     pairs = segments[:, None, None], places[:, :, None], places[:, None, :]
     return (

@@ -48,7 +48,7 @@ CHECKS: tuple[Check, ...] = (
 """Each check looks for one fault. A new check is one function, and one line here."""
 
 KINEMATIC: tuple[Check, ...] = (wrong_scale, wrong_axes)
-"""The checks that hold for a flight without a controller too, which may turn far and drift away."""
+"""The checks that also hold for a flight without a controller, which may turn far and drift away."""
 
 
 def self_checks(
@@ -63,7 +63,7 @@ def self_checks(
 
     - `recording`: as it was logged, of one vehicle.
     - `airframe`: without it, gyro and accelerometer are not compared with the rotors.
-    - `checks`: of the table.
+    - `checks`: the checks to make, from `CHECKS`.
 
     **Returns:** the findings; those that contradict quantities come first.
     """
@@ -78,7 +78,7 @@ def findings(evidence: Evidence, checks: Sequence[Check] = CHECKS) -> tuple[Find
 
 
 def different_vehicles(recordings: Sequence[Recording], airframe: Airframe) -> Finding | None:
-    """Compare the thrust of recordings that should be of one vehicle: the force that each felt for its rotor speeds.
+    """Check whether recordings are of one vehicle: compare the measured force with the thrust of the rotor speeds.
 
     Without an accelerometer, thrust is compared with the weight.
     """

@@ -1,4 +1,4 @@
-"""Checks of the channels against others: the scales, axes and clocks of gyro, accelerometer, attitude and velocity."""
+"""Checks of channels against each other: scales, axes and clocks of gyro, accelerometer, attitude and velocity."""
 
 import math
 from typing import NamedTuple
@@ -12,23 +12,23 @@ from .estimates import scaled_angles
 from .evidence import EXPLAINED, STANDARD_ERRORS, Evidence, Finding
 from .mounting import ANGLE, earth_axes, tilted_force
 
-# Share of the attitude's turns that a gyro explains before their scale and delay count; with less than the second, a
-# gyro that moves is of another flight than the attitude.
+# Shares of the attitude's turns that the gyro explains. Above the first, scale and delay are judged. Below the second,
+# gyro and attitude are of different flights.
 FOLLOWS, UNRELATED = 0.2, 0.1
-# Difference of the horizontal acceleration by the velocity from that by force and attitude, relative. Velocities that
+# Relative difference between the horizontal accelerations from velocity and from force and attitude. Velocities that
 # are averaged while the vehicle yaws differ by 5 %.
 VELOCITY_ERROR = 0.15
 _ATTITUDE = (*INERTIAS, "attitude")
-_CLOCKS = {  # how to say that it is wrong, and what it concerns
+_CLOCKS = {  # the verbs of its message, and the quantities that it concerns
     "gyro": ("is", "lags", INERTIAS),
     "accelerometer": ("is", "lags", (*INERTIAS, "thrust", "motors")),
     "attitude": ("is", "lags", ("attitude",)),
     "motors": ("are", "lag", ("motors",)),
 }
 
-SCALE = 0.1  # of attitude against gyro, relative; inertias are wrong by the scale of the gyro
-KINEMATICS = 2.5  # standard errors between two causes, both of which are named if neither is clear
-SLOW_GYRO = 0.0202  # s; the longest between samples of a gyro whose integral is compared with the attitude: 50 Hz
+SCALE = 0.1  # largest relative difference of attitude and gyro; inertias are wrong by the scale of the gyro
+KINEMATICS = 2.5  # standard errors that separate two causes; with fewer, both are named
+SLOW_GYRO = 0.0202  # s; the longest sample of a gyro whose integral is compared with the attitude: 50 Hz
 
 
 def wrong_scale(evidence: Evidence) -> Finding | None:
@@ -75,7 +75,7 @@ def _gyro_step(evidence: Evidence) -> float:
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
-    """The channel that is wrong if it is not the attitude. A velocity shows whether it is the time."""
+    """The cause if the attitude is right: the gyro or the time stamps. A measured velocity tells them apart."""
     if evidence.velocity is not None:
         slope, unlike = float(evidence.velocity.value[0]), VELOCITY_ERROR
         if abs(slope / scale - 1) < unlike < abs(slope - 1):
@@ -128,7 +128,7 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
     """One clock that differs from the others.
 
     Each measured delay is a difference of two clocks. The clock that is named explains all delays best if the other
-    clocks are right. Several are named if they explain them alike.
+    clocks are right. If several explain them equally well, all are named.
     """
     delays, differ = _delays(evidence)
     if not differ:
@@ -148,7 +148,7 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
         for name, i in named.items()
     ]
     off = wrong[best[0]]
-    if len(named) == 2 and wrong[[*named.values()]].prod() < 0:  # one difference of two clocks, seen from either
+    if len(named) == 2 and wrong[[*named.values()]].prod() < 0:  # one difference between two clocks
         early, behind = sorted(named, key=lambda name: wrong[named[name]])
         causes, off = [f"the {behind} {_CLOCKS[behind][1]} the {early}"], abs(off)
     return Finding(
@@ -162,13 +162,13 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
     )
 
 
-DELAY = 0.01  # s between two sensors that are noted; damping and inflow make errors of up to 8 ms
-# s between two sensors that contradict: 20 ms change inertias by 10 %. The filter of an accelerometer can be 10 ms
-# later than the gyro's.
+DELAY = 0.01  # s; a longer delay between two sensors is noted; damping and inflow make errors of up to 8 ms
+# s; a longer delay between two sensors contradicts: 20 ms change inertias by 10 %. The filter of an accelerometer can
+# be 10 ms later than the gyro's.
 LATE = 0.015
 LATE_ATTITUDE = 0.025  # s after the gyro; filters and cameras are late by up to 20 ms
-# Standard deviations of delays that are no error of a clock [s]: filters, damping that varies, and the lag and delay of
-# rotors that follow commands, with their mean.
+# Standard deviations of delays that are no clock errors [s]: by filters, by varying damping, and by the rotors' lag and
+# delay if they follow commands; then the mean of the last.
 FILTERS, DAMPING, LAGS, USUAL_LAG = 0.003, 0.004, 0.025, 0.05
 ANSWERED = 0.014  # s; the delay that a gyro seems to have if the rotors do nothing but answer gusts
 
@@ -199,7 +199,7 @@ def _delays(evidence: Evidence) -> tuple[list[_Delay], bool]:
 
 
 def _beyond(late: float, usual: float) -> float:
-    """A delay; 0 if it is a usual one, which is 0 to `usual`."""
+    """The delay, or 0 if it is in the usual range of 0 to `usual`."""
     return 0.0 if 0.0 < late < usual else late
 
 

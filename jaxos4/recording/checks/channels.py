@@ -11,7 +11,7 @@ from ...logs.table import counted
 from .evidence import HELD, Evidence, Finding
 
 _UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
-# Clipped thrust seems weaker, and moments of inertia are proportional to it.
+# Clipped thrust seems too weak, and moments of inertia are proportional to it.
 _CLIPPED = {axis.rate: (axis.inertia,) for axis in AXES} | {"az": ("thrust", *INERTIAS)}
 
 
@@ -46,7 +46,7 @@ def impossible_values(evidence: Evidence) -> Finding | None:
         "impossible_values",
         "single values are impossible, and count as not measured",
         ", ".join(f"{name}: {counted(number, 'value')}, as {worst:.4g}" for name, (number, worst) in found.items()),
-        "nothing is to be done if they are few",
+        "if they are few, nothing needs to be done",
         (*INERTIAS, "thrust"),
         False,
     )
@@ -92,19 +92,19 @@ def constant_force(evidence: Evidence) -> Finding | None:
     )
 
 
-# Time between rotor speeds at instants [s]. 16 ms make Ix 4 % too small and Iz 9 % too large for rotors with a lag of
-# 25 ms, 8 ms less than 1 and 5 %.
+# Longest time between instantaneous rotor speeds [s]. For rotors with a lag of 25 ms, 16 ms make Ix 4 % too small and
+# Iz 9 % too large; the errors for 8 ms are below 1 % and 5 %.
 INSTANTS = 0.0105
 
 
 def rare_speeds(evidence: Evidence) -> Finding | None:
-    """Rotor speeds at instants so far apart that what rotors do in between matters."""
+    """Instantaneous rotor speeds so far apart that their changes in between matter."""
     logged = evidence.logged
     if logged.commanded or logged.held or logged.dt <= INSTANTS:
         return None
     return Finding(
         "rare_speeds",
-        "rotor speeds were logged so rarely that what rotors did in between is not known",
+        "rotor speeds were logged too rarely to show how they changed in between",
         f"every {1e3 * logged.dt:.0f} ms",
         "log rotor speeds at 100 Hz or more, or their means",
         (*INERTIAS, "damping"),
@@ -118,7 +118,7 @@ def rare_motors(evidence: Evidence) -> Finding | None:
         return None
     return Finding(
         "rare_motors",
-        "motors were logged more rarely than rotors answer, so that the damping comes out too large",
+        "motors were logged more rarely than the rotors respond, so the damping comes out too large",
         f"new values every {1e3 * evidence.motor_step:.0f} ms",
         "log motors at 100 Hz or more, on board",
         ("damping",),
@@ -126,8 +126,8 @@ def rare_motors(evidence: Evidence) -> Finding | None:
     )
 
 
-# Independent motions of roll and pitch. Fewer do not show how large the noise is: the standard deviation of a mean
-# square is 37 % for 15. Two seconds of flight have 5 to 12, four have 7 to 21.
+# Fewest independent motions of roll and pitch that show how large the noise is: with 15, the standard deviation of a
+# mean square is 37 %. Two seconds of flight have 5 to 12, four have 7 to 21.
 MIN_MOTIONS = 15.0
 
 

@@ -1,4 +1,4 @@
-"""Quantities that a log measures twice, with errors: attitude against gyro, velocity and force against the tilt."""
+"""Comparisons of quantities that a log measures twice: attitude against gyro, velocity and force against the tilt."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,8 +13,8 @@ from ...logs.sampling import averages
 from ...rotations import rotations_to_body
 
 BATCHES = 12
-"""The batches of the jackknife."""
-# The turns within `_SPAN` are compared, one each `_STEP` [s]; the attitude may be later than the gyro by these steps.
+"""The number of batches of the jackknife."""
+# Turns over `_SPAN` [s] are compared every `_STEP` [s]; the attitude may be later than the gyro by `_SHIFTS` steps.
 _STEP, _SPAN, _SHIFTS = 0.01, 0.1, np.arange(-50, 51)
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -28,7 +28,7 @@ class Measured(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, sums: Inexact[np.ndarray, "batches ..."], fit: Callable[[np.ndarray], np.ndarray]) -> "Measured":
-        """The numbers that fit the sum of all batches; their errors by the jackknife, which leaves out one batch."""
+        """Fits the sum of all batches. Errors are by the jackknife, which leaves out one batch at a time."""
         whole = sums.sum(axis=0)
         without = np.array([fit(whole - batch) for batch in sums])
         share = (len(sums) - 1) / len(sums)
@@ -47,7 +47,7 @@ class Turns(msgspec.Struct, frozen=True):
     """The turns of the attitude: `matrix` times the turns of the gyro, `delay` later.
 
     - `matrix`: the identity if both agree. Rows are the axes of the attitude, columns the axes of the gyro.
-    - `delay`: [s].
+    - `delay`: of the attitude behind the gyro [s].
     - `explained`: by axis of the attitude, the share of its turns that the gyro explains.
     """
 
@@ -56,8 +56,8 @@ class Turns(msgspec.Struct, frozen=True):
     explained: Float[np.ndarray, "3"]
 
 
-MIN_BATCHES = 4  # of a flight
-MIN_BATCH = 0.5  # s
+MIN_BATCHES = 4  # fewest batches of a flight
+MIN_BATCH = 0.5  # s; the shortest batch
 TILTS = 2.0  # s; the length of a batch in which rotations about several axes are compared
 
 
@@ -80,12 +80,12 @@ def attitude_turns(stretches: Sequence[Recording]) -> Turns | None:
 
 
 def scaled_angles(stretches: Sequence[Recording], turns: Turns) -> float:
-    """Whether the angles are too large, and not the rates too small, by how rotations about several axes add up.
+    """Whether the angles have a wrong scale, and not the rates, from rotations about several axes.
 
     The rates of a tilted vehicle follow from its angles by a formula that holds for the true angles only.
 
     **Returns:** how much better the gyro agrees with the scaled angles than with the scaled rates, in standard errors;
-    negative: worse. 0: unknown.
+    negative if worse, 0 if unknown.
     """
     scale = np.diagonal(turns.matrix.value)
     if (scale <= 0).any():
@@ -106,7 +106,7 @@ def scaled_angles(stretches: Sequence[Recording], turns: Turns) -> float:
 def _turned(stretches: Sequence[Recording], scale: Float[np.ndarray, "3"] | None = None) -> list[Pair]:
     """The angles by which attitude and gyro turn about the body's axes within `_SPAN` [rad], in each stretch.
 
-    Angles are divided by `scale` before. NaN in gaps.
+    Angles are first divided by `scale`. Gaps are NaN.
     """
     every, late = [], round(_SPAN / _STEP)
     for flown in stretches:
@@ -185,7 +185,7 @@ def _fit(products: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def peak(values: Float[np.ndarray, " steps"]) -> tuple[int, float]:
-    """The place of the largest value, and how far after it the maximum lies, in steps: at the vertex of a parabola."""
+    """The index of the largest value, and the offset to the vertex of a parabola through its neighbours, in steps."""
     best = int(np.clip(np.argmax(values), 1, values.size - 2))
     before, at, after = values[best - 1 : best + 2]
     bend = before - 2 * at + after
@@ -193,7 +193,7 @@ def peak(values: Float[np.ndarray, " steps"]) -> tuple[int, float]:
 
 
 def velocity_slopes(stretches: Sequence[Recording]) -> Measured | None:
-    """The horizontal acceleration along and across the one by force and attitude, relative. `None`: not measured."""
+    """The horizontal acceleration relative to that from force and attitude, along and across it, or `None`."""
 
     def vectors(angles: np.ndarray, force: np.ndarray, velocity: np.ndarray, step: float) -> Pair:
         felt = np.einsum("tji,tj->ti", rotations_to_body(angles), force) - [0.0, 0.0, GRAVITY]
@@ -203,9 +203,9 @@ def velocity_slopes(stretches: Sequence[Recording]) -> Measured | None:
 
 
 def tilt_slopes(stretches: Sequence[Recording]) -> Measured | None:
-    """The horizontal force along and across the one that the thrust has if it is given along the earth's axes.
+    """The horizontal force relative to that of a tilted thrust in the earth's axes, along and across it, or `None`.
 
-    `None`: not measured. Along the body's axes, the slope is 0 or less.
+    If the force is given along the body's axes, the slope is 0 or less.
     """
 
     def vectors(angles: np.ndarray, force: np.ndarray, velocity: np.ndarray, step: float) -> Pair:
@@ -222,9 +222,10 @@ def tilt_slopes(stretches: Sequence[Recording]) -> Measured | None:
 def _slopes(
     stretches: Sequence[Recording], vectors: Callable[..., Pair], *, step: float, moving: bool = True
 ) -> Measured | None:
-    """The slopes of horizontal vectors along and across others, of means over `step` [s].
+    """Slopes of horizontal vectors along and across reference vectors, from means over `step` [s].
 
-    `vectors`: of means of angles, specific force and velocity, and their step [s]. `moving`: the velocity is needed.
+    `vectors`: the reference and the compared vectors, as a function of the means of angles, specific force and velocity
+    and of their step [s]. `moving`: whether the velocity is needed.
     """
     every = []
     for flown in stretches:

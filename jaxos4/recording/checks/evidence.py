@@ -1,6 +1,6 @@
-"""The evidence of a log: its plausible values, its stretches in flight, how its channels agree; and a finding of it.
+"""`Evidence`: plausible values, stretches in flight and comparisons of channels, which checks share; and `Finding`.
 
-Each number of the evidence is computed once, when it is first used.
+Each fact is computed once, when it is first used.
 """
 
 import functools
@@ -27,12 +27,12 @@ from .response import Response, rotor_response
 class Finding(msgspec.Struct, frozen=True):
     """A fault that a log shows.
 
-    - `name`: for programs.
-    - `cause`: what is wrong with the log. If several causes fit, all of them.
+    - `name`: an identifier for programs.
+    - `cause`: what is wrong with the log. If several causes are possible, it names all of them.
     - `size`: the figure behind it, with its unit.
     - `remedy`: what to do.
     - `quantities`: what the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
-    - `contradicted`: the log contradicts these quantities. Otherwise the finding is to be noted only.
+    - `contradicted`: whether the log contradicts these quantities. Otherwise the finding is only noted.
     """
 
     name: str
@@ -50,11 +50,11 @@ class Finding(msgspec.Struct, frozen=True):
         return msgspec.to_builtins(self)
 
 
-# Chance reaches this many standard errors in one of 2,000 comparisons, because these errors are of a dozen
+# Chance reaches this many standard errors in one of 2,000 comparisons, because the errors are estimated from a dozen
 # batches of the flight.
 STANDARD_ERRORS = 5.0
-# Shares of the errors of predicted rates, and of the vertical force, that the rotors explain before their delays count.
-# The first one counts for the sum of roll and pitch before axes are judged.
+# Shares of the errors of predicted rates, and of the vertical force, that the rotors must explain before delays are
+# judged. Axes are judged if the sum for roll and pitch reaches the first.
 EXPLAINED = 0.02, 0.03
 MOVES = 0.05  # rad/s; standard deviation of the rates of a vehicle that moves
 REST = 0.25  # s; a vehicle at rest is still for this long
@@ -63,9 +63,9 @@ HELD = 0.015  # s; motors may keep their value for half of the shortest lag of r
 
 
 class Evidence:
-    """The facts that the checks of one recording share. `airframe`: `None` if it is not known.
+    """The facts of one recording that its checks share. `airframe`: `None` if it is not known.
 
-    **Arguments:** of `self_checks`. `seconds`: how much of the flight is looked at [s], see `richest`.
+    **Arguments:** as in `self_checks`. `seconds`: the longest duration that is examined [s], see `richest`.
     """
 
     def __init__(self, recording: Recording, airframe: Airframe | None, *, seconds: float = math.inf):
@@ -88,12 +88,12 @@ class Evidence:
         return [each for each in self.every if not each.reason]
 
     def richest(self, parts: Sequence[Stretch]) -> list[Stretch]:
-        """The pieces of some parts that tell the most, of at most `seconds`."""
+        """The most informative pieces of some parts, of at most `seconds` together."""
         return richest(self.plausible.recording, parts, torques_of(self.airframe), self.seconds)
 
     @functools.cached_property
     def stretches(self) -> tuple[Recording, ...]:
-        """The usable stretches of the flight; those that tell the most, if it is longer than `seconds`."""
+        """The usable stretches of the flight; only the most informative pieces if it is longer than `seconds`."""
         recording = self.plausible.recording
         if recording.stretch is not None:  # concatenated flights are usable
             edges = np.flatnonzero(np.diff(recording.stretch)) + 1
@@ -146,7 +146,7 @@ class Evidence:
         if len(means) < 4:
             return None
         alike = np.abs(means - np.median(means, axis=0)).max(axis=1) < STILL * GRAVITY
-        return means[alike].mean(axis=0) if alike.mean() > 0.75 else None  # or else in a hand
+        return means[alike].mean(axis=0) if alike.mean() > 0.75 else None  # otherwise it was in a hand
 
     @functools.cached_property
     def turns(self) -> Turns | None:
@@ -165,7 +165,7 @@ class Evidence:
 
     @functools.cached_property
     def response(self) -> Response | None:
-        """Gyro and accelerometer against the rotors. `None`: not known, as if motors keep their values for long."""
+        """Gyro and accelerometer against the rotors. `None`: unknown, for example if motors were logged too rarely."""
         if self.airframe is None or not self.stretches or self.motor_step > HELD:
             return None
         return rotor_response(self.stretches, self.airframe)

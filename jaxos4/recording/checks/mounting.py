@@ -1,4 +1,4 @@
-"""Checks of how the sensors are mounted, by the rotors, the attitude and the thrust in hover; and of the thrust."""
+"""Checks of the sensors' mounting by the rotors, the attitude and the thrust in hover; and checks of the thrust."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     """Gyro turned about the vertical axis: roll torque pitches the vehicle, and the attitude turns about other axes."""
     rotors, attitude = _by_rotors(evidence), _by_attitude(evidence)
     if tilted_force(evidence):
-        return None  # the angle about z is known when this is corrected
+        return None  # the angle about z is known only after this is corrected
 
     def turned(angle: tuple[float, float] | None) -> bool:
         return angle is not None and abs(angle[0]) > max(ANGLE, STANDARD_ERRORS * angle[1])
@@ -29,14 +29,14 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
         return None
     quantities, angle = INERTIAS, attitude if by_attitude and attitude else rotors or (0.0, 0.0)
     if rotors is None:
-        cause = "the gyro is mounted at an angle about the vertical axis, or the attitude is of other axes"
+        cause = "the gyro is mounted at an angle about the vertical axis, or the attitude has other axes"
         quantities = (*INERTIAS, "attitude")
     elif not by_attitude or attitude is None:
         cause = "the gyro is mounted at an angle about the vertical axis, or `rotor_positions` are"
     elif abs(math.remainder(rotors[0] - attitude[0], math.tau)) < abs(rotors[0]):
         cause = "gyro and accelerometer are mounted at an angle about the vertical axis"
     else:
-        cause, quantities = "the attitude is of axes at an angle about the vertical axis", ("attitude",)
+        cause, quantities = "the attitude has axes turned about the vertical axis", ("attitude",)
     known = {name: each for name, each in (("attitude", attitude), ("rotors", rotors)) if each is not None}
     ways = " and ".join(
         f"{math.degrees(a):.1f} +- {math.degrees(2 * e):.2g} degrees by the {name}" for name, (a, e) in known.items()
@@ -58,7 +58,7 @@ def _rotation_for(evidence: Evidence, turn: Float[Numeric, "3 3"]) -> str:
 
 
 def opposite_yaw(correlation: float | None) -> Finding | None:
-    """The vehicle seems to yaw against the torque, see `jaxos4.recording.motion.opposite_axes`; `None`: it does not."""
+    """A vehicle that yaws against the torque, see `jaxos4.recording.motion.opposite_axes`; `None` if it does not."""
     if correlation is None:
         return None
     return Finding(
@@ -72,8 +72,8 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
     )
 
 
-UNCERTAIN = 0.2  # rad; a rotation by the rotors that is less certain comes from a wrong airframe
-SAME_ANGLE = 0.17  # rad; a rotation turns roll and pitch by the same angle, up to this
+UNCERTAIN = 0.2  # rad; a rotation from the rotors with a larger error comes from a wrong airframe
+SAME_ANGLE = 0.17  # rad; a rotation turns roll and pitch by the same angle to within this
 
 
 def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
@@ -124,14 +124,14 @@ def earth_axes(evidence: Evidence) -> Finding | None:
     )
 
 
-TILT = 0.26  # rad; of the accelerometer against the thrust. Its errors and steady wind reach half of this.
+TILT = 0.26  # rad; of the accelerometer against the thrust; sensor errors and steady wind reach half of this
 STEADY = 0.9  # in a hand or in rolls, the mean vector of the force is shorter than this share of its mean size
 
 
 def thrust_direction(evidence: Evidence) -> Finding | None:
     """The specific force is not along z, or not as large as gravity: at rest before take-off, or else in flight.
 
-    The mean in flight has drag and manoeuvres too. A vehicle that rests on a slope is not tilted in flight.
+    The mean in flight includes drag and manoeuvres. A vehicle that rests on a slope is not tilted in flight.
     """
     flown, rest = evidence.force, evidence.rest
     if not flown.size and rest is None:
@@ -172,7 +172,7 @@ GRAVITY_ERROR = 0.3  # of the mean specific force in flight, which is up to 10 %
 
 
 def _force_scale(evidence: Evidence, size: float) -> Finding | None:
-    """A specific force of this size [m/s^2], of a vehicle at rest or else the mean in flight, that is not gravity."""
+    """A specific force whose `size` [m/s^2], at rest or else the mean in flight, is not gravity."""
     resting = evidence.rest is not None
     gravity = GRAVITY if evidence.airframe is None else float(evidence.airframe.gravity)
     off = abs(size / gravity - 1)
@@ -196,8 +196,8 @@ def tilted_force(evidence: Evidence) -> bool:
     return tilted is not None and tilted.name == "force_direction"
 
 
-# Errors of the airframe's thrust, relative, by measured speeds and by commands. The fit measures the thrust by the
-# accelerometer: errors of 20 % are harmless.
+# Largest relative errors of the airframe's thrust, for measured speeds and for commands. The fit measures the thrust by
+# the accelerometer, so errors of 20 % are harmless.
 THRUST, COMMANDED_THRUST = 0.35, 1.0
 
 
@@ -214,7 +214,7 @@ def wrong_thrust(evidence: Evidence) -> Finding | None:
         return None
     return Finding(
         "wrong_thrust",
-        "`thrust_coefficient`, `mass` or the unit of the motors is wrong: the thrust is not that of the vehicle",
+        "`thrust_coefficient`, `mass` or the unit of the motors is wrong: the thrust does not fit the vehicle",
         f"{ratio:.2f} times {'the specific force' if force.size else 'the weight'}",
         "weigh the vehicle, and give `hover_speed` as `jaxos4 inspect --airframe-out` writes it",
         ("thrust",),
@@ -222,13 +222,13 @@ def wrong_thrust(evidence: Evidence) -> Finding | None:
     )
 
 
-# Differences of the thrust between two logs of one vehicle, relative, by measured speeds and by commands. A battery
-# that empties changes the thrust of a command by up to 30 %.
+# Largest relative differences of the thrust between two logs of one vehicle, for measured speeds and for commands. A
+# battery that empties changes the thrust of a command by up to 30 %.
 VEHICLES, COMMANDED_VEHICLES = 0.1, 0.4
 
 
 def different_thrust(every: Sequence[Evidence]) -> Finding | None:
-    """Recordings that are not of one vehicle: the force that each felt for its rotor speeds.
+    """Recordings that are not of one vehicle, by the measured force for the rotor speeds.
 
     Without an accelerometer, thrust is compared with the weight.
     """

@@ -1,10 +1,10 @@
 """The response of gyro and accelerometer to the rotors: gains, axes and delays.
 
-A controller answers gusts. A cross-spectrum of torque and turns shows the controller then, as well as the vehicle: in
-soft flight, a gyro seems 6 to 14 ms late. Errors of a prediction from the past have no such bias, because no controller
-has answered them yet. Each delay of the gyro is tried, and the one with the smallest errors is right. Nothing answers
-the vertical force as fast, and a cross-spectrum shows the delay of the accelerometer. Damping and inflow are part of
-both, because they shift the phase like a delay.
+Because a controller answers gusts, a cross-spectrum of torque and turns shows the controller as well as the vehicle: in
+gentle flight, a gyro seems 6 to 14 ms late. Errors of predictions from the past have no such bias, because no
+controller has answered them yet. All delays of the gyro are tried, and the one with the smallest errors is taken.
+Nothing answers the vertical force as fast, so a cross-spectrum shows the delay of the accelerometer. Both models
+include damping or inflow, which shift the phase like a delay.
 
 Reference: Ljung 1999, System Identification, ch. 13, the direct method in closed loop.
 """
@@ -28,22 +28,22 @@ from .estimates import BATCHES, Measured, interpolated, peak
 Signals = Float[np.ndarray, "samples _signals"]
 
 
-STEP = 0.012  # s; samples of the gyro; shorter ones would see the start of a filter's answer only
+STEP = 0.012  # s; samples of the gyro; shorter ones would show only the start of a filter's response
 LONGEST = 0.034  # s; the longest step
 ORDER = 5  # samples; the memory of the noise model
-LAGS = 0.01, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1  # s; of rotors that follow commands, of which one is chosen
-DELAYS = -0.12, 0.12  # s; the first and the last of gyro and accelerometer
-PREDICTIONS = 20_000  # that are enough
+LAGS = 0.01, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1  # s; candidates for rotors that follow commands
+DELAYS = -0.12, 0.12  # s; the range that is tried for gyro and accelerometer
+PREDICTIONS = 20_000  # more are not needed
 PASSES = 4  # of the fit of gains and of the noise model in turn
 FORCE_STEP = 0.004  # s; samples of the accelerometer
-SPECTRUM = 2.0  # s; how long the samples of one spectrum last
-BAND = 2.0, 15.0  # Hz; wind and the height's control are slower; rotors, and noise of the gyro, leave little above
+SPECTRUM = 2.0  # s; duration of the samples of one spectrum
+BAND = 2.0, 15.0  # Hz; below are wind and height control; above, the rotors' lag and the gyro's noise leave little
 FORGETS = 2.0
 """Angle and velocity, on which damping and inflow act, are forgotten with this time constant [s]."""
 GAP = 0.05
 """The longest gap that is interpolated [s]."""
 SECONDS = 6.0
-"""The least flight whose response is measured [s]."""
+"""The shortest flight whose response is measured [s]."""
 
 
 class Response(msgspec.Struct, frozen=True):
@@ -53,7 +53,7 @@ class Response(msgspec.Struct, frozen=True):
     - `delays`: of gyro and accelerometer after the rotors, and of the gyro after the accelerometer [s].
     - `explained`: the shares that the rotors explain: of the squared errors with which roll and pitch rate are
       predicted, and of the power of the vertical force. NaN: not measured.
-    - `lag`: of the rotors [s]; 0 if their speeds were measured.
+    - `lag`: lag of the rotors [s]; 0 if their speeds were measured.
     """
 
     turning: Measured
@@ -93,7 +93,7 @@ def rotor_response(
 class _Turning(NamedTuple):
     """The prediction of roll and pitch rate: its step [s], how many past errors count, the first and last delay.
 
-    A rate answers the integrals of both torques, and its slow motion, which has no delay. Delays are in samples.
+    A rate depends on the integrals of both torques, and on its slow motion, which has no delay. Delays are in samples.
     """
 
     step: float
@@ -103,7 +103,7 @@ class _Turning(NamedTuple):
 
     @classmethod
     def of(cls, step: float) -> "_Turning":
-        """That of samples of this step [s]."""
+        """The prediction for samples of this step [s]."""
         return cls(step, ORDER, *(round(delay / step) for delay in DELAYS))
 
     def products(self, every: Sequence[np.ndarray]) -> Float[np.ndarray, "batches columns columns"]:
@@ -113,10 +113,7 @@ class _Turning(NamedTuple):
         return np.array([batch.T @ batch for batch in np.array_split(table, BATCHES)])
 
     def _lagged(self, signals: Signals) -> Float[np.ndarray, "rows columns"]:
-        """Rates and slow motions, now and before; torques from the first delay to the last, and before.
-
-        Only complete rows.
-        """
+        """Complete rows of rates and slow motions, now and before; and of torques at all delays, and before."""
         spans = [(0, self.order)] * 4 + [(self.first, self.last + self.order)] * 2
         signals = signals - np.nan_to_num(signals).sum(axis=0) / np.maximum(np.isfinite(signals).sum(axis=0), 1)
         rows = np.arange(self.last + self.order, len(signals) + self.first)
@@ -136,7 +133,7 @@ class _Turning(NamedTuple):
     ) -> tuple[Float[np.ndarray, "4"], float, Float[np.ndarray, "2"]]:
         """The gains from torques to rates, their delay [s], and the explained shares; NaN: not measured.
 
-        Errors are of predictions, from their past, of the rates less their inputs times their gains.
+        Errors are those of predicting the rates, minus inputs times gains, from their past.
         """
         if not products.any():
             return np.full(4, np.nan), math.nan, np.full(2, np.nan)
@@ -145,7 +142,7 @@ class _Turning(NamedTuple):
         sums = products[places[..., :, None, :, None], places[..., None, :, None, :]]
         sums = sums / (size[..., :, None] * size[..., None, :])[..., None, None]
         noise = np.zeros(places.shape[:2] + places.shape[3:])
-        noise[..., 0], noise[..., 1] = 1.0, -1.0  # torques that are not known add up in rates
+        noise[..., 0], noise[..., 1] = 1.0, -1.0  # unknown torques add up in the rates
         alone, _ = _predicted(np.eye(size.shape[2])[0] + np.zeros(size.shape), sums)
         weights, squares = np.zeros(size.shape), alone
         for _ in range(PASSES):
@@ -153,7 +150,7 @@ class _Turning(NamedTuple):
             squares, noise = _predicted(weights, sums)
         shares = np.where(alone > 0, 1 - squares / np.maximum(alone, 1e-300), 0.0)
         gains = (-weights * size[..., :1] / size)[..., 1:3]
-        # A controller turns the rotors against the motion, and so seems to cause a motion against the torque before it.
+        # A controller's torque opposes the motion, so the motion before it seems to answer with the opposite sign.
         along, across = np.trace(gains, axis1=1, axis2=2), np.abs(gains[:, 0, 1] - gains[:, 1, 0])
         best, after = peak(np.where(along > -across, -np.log1p(-shares).sum(axis=1), 0.0))
         return gains[best].ravel(), (self.first + best + after) * self.step, shares[best]
@@ -194,7 +191,7 @@ def _forced(flown: Recording, airframe: Airframe, lag: float) -> Float[np.ndarra
 
 
 def _forgetting(values: Signals, share: float) -> Signals:
-    """The sum of the values until each sample; a sample later, the share exp(-`share`) of it is left."""
+    """The running sum of the values, of which exp(-`share`) is kept from one sample to the next."""
     kept = np.exp(-share * np.arange(min(math.ceil(20 / share), len(values))))[:, None]
     size = 1 << (len(values) + len(kept)).bit_length()
     spectrum = np.fft.rfft(values, size, axis=0) * np.fft.rfft(kept, size, axis=0)
