@@ -190,7 +190,8 @@ class InitialGuess(NamedTuple):
     """Where a search starts.
 
     - `starts`: the unknowns of each window, the shared ones first; several starts if the likelihood has several maxima.
-    - `off`: how far off each start may be: two standard deviations of the knowledge before the flight.
+    - `off`: how far off each start may be, as a scale for steps: half-widths of brackets, and two standard deviations
+      of the initial state.
     - `known`: the part of each window's initial state that is known, and so not among the unknowns.
     """
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .gains import Channels, Gains, Step, basis
-from .sums import Segments
+from .sums import PerSegment
 
 
 class InputGains(NamedTuple):
@@ -27,14 +27,14 @@ class InputGains(NamedTuple):
 class Feedback(NamedTuple):
     """The parts of a filter that depend on the noise, by channel: its `Gains`, `InputGains`, and fields of `Step`."""
 
-    driven: tuple[Segments, ...]
-    driven_later: tuple[Segments, ...]
-    disturbance_later: tuple[Segments, ...]
-    driven_seen: tuple[Segments, ...]
-    seen: tuple[Segments, ...]
-    kept: tuple[Segments, ...]
-    driven_kept: tuple[Segments, ...]
-    reach: tuple[Segments, ...]
+    driven: tuple[PerSegment, ...]
+    driven_later: tuple[PerSegment, ...]
+    disturbance_later: tuple[PerSegment, ...]
+    driven_seen: tuple[PerSegment, ...]
+    seen: tuple[PerSegment, ...]
+    kept: tuple[PerSegment, ...]
+    driven_kept: tuple[PerSegment, ...]
+    reach: tuple[PerSegment, ...]
     by_input: InputGains
 
     @classmethod

@@ -34,7 +34,7 @@ from .gains import (
     step_of,
 )
 from .scans import FASTEST
-from .sums import LAGS, Innovations, Segments, likelihood
+from .sums import LAGS, Innovations, PerSegment, likelihood
 
 Scalars = tuple[Float[Array, "*#segments"], ...]
 Move = Callable[[State, Forcing, Scalars], State]
@@ -59,14 +59,26 @@ class _Row(NamedTuple):
     restarts_next: Bool[Array, " segments"]
 
 
+class _Explained(NamedTuple):
+    """The parts of the innovations that input innovations explain.
+
+    - `error`: by the feedthroughs, which are estimated. `slopes`: its derivatives in them.
+    - `noise`: by feedthroughs that are known, squared: a variance.
+    """
+
+    error: Series
+    noise: Series
+    slopes: Float[Array, "time channels feedthroughs segments"]
+
+
 class _Known(NamedTuple):
     """The estimates of the filters at the beginning of a sample, by channel.
 
     - `driven`: the rates, then the specific forces besides the model's. `disturbance`: their disturbances.
     """
 
-    driven: tuple[Segments, ...]
-    disturbance: tuple[Segments, ...]
+    driven: tuple[PerSegment, ...]
+    disturbance: tuple[PerSegment, ...]
 
 
 def _advance(
@@ -77,7 +89,7 @@ def _advance(
     feedback: Feedback,
     row: _Row,
     going: Bool[Array, " segments"],
-) -> tuple[_Known, tuple[Segments, ...]]:
+) -> tuple[_Known, tuple[PerSegment, ...]]:
     """The estimates one sample later, and the innovations of this sample. `going`: the segments that have not diverged.
 
     Innovations, rates and their derivatives are computed once, although several results need them.
@@ -85,7 +97,7 @@ def _advance(
     move, average, observe = functions
     seen = tuple(a * d for a, d in zip(feedback.seen, known.disturbance, strict=True))
 
-    def compared() -> tuple[Segments, ...]:
+    def compared() -> tuple[PerSegment, ...]:
         mean = average(State(Rates(*known.driven[:RATE_COUNT])), forcing, scalars).rates
         rates = Rates(*(x + a for x, a in zip(mean, seen, strict=False)))
         outputs = observe(State(rates), forcing, scalars)
@@ -251,11 +263,9 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
     seen = jnp.where(missing[:, None], 0.0, inputs)
     row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, seen, observed.restart, following)
-    explained, known_noise = (
-        jax.vmap(by_inputs, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough)
-    )
-    fed = explained, jnp.square(known_noise), jnp.moveaxis(inputs, 2, 1)
-    data = row, observed.counts, fed, forcing, forcing_tangents
+    error, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough))
+    explained = _Explained(error, jnp.square(as_noise), jnp.moveaxis(inputs, 2, 1))
+    data = row, observed.counts, explained, forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
     def block(i: Count, carry: _Carry) -> _Carry:
@@ -273,14 +283,13 @@ def _filter_rows(
     carry: _Carry,
     row: _Row,
     counts: Bool[Array, "time segments"],
-    fed: tuple[Series, Series, Float[Array, "time channels feedthroughs segments"]],
+    explained: _Explained,
     forcing: Forcing,
     forcing_tangents: Forcing | None,
 ) -> _Carry:
     """The filters after some more rows.
 
-    `steps`: the disturbance over a sample, with its derivatives in the noise. `fed`: the part of the innovations that
-    `feedthrough` explains, the square of the part that `noise_feedthrough` explains, and the derivatives of the first.
+    `steps`: the disturbance over a sample, with its derivatives in the noise.
     """
     count, segments = parameters.shape[0], counts.shape[1]
     scalars, own = tuple(parameters), parameters.shape[1:]
@@ -296,17 +305,17 @@ def _filter_rows(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
-        fed = Feedback.of(gains, steps[0], by_input)
+        feedback = Feedback.of(gains, steps[0], by_input)
         # The noise acts only through the feedback, and the parameters do not act on the feedback.
-        fed_slopes = feedback_slopes(gain_slopes, steps[1], by_input, count)
+        by_unknowns = feedback_slopes(gain_slopes, steps[1], by_input, count)
 
-        def filtered(known: _Known, fed: Feedback, scalars: tuple, forcing: Forcing = forcing):
-            return advance(known, forcing, scalars, fed, row, feasible)
+        def filtered(known: _Known, feedback: Feedback, scalars: tuple, forcing: Forcing = forcing):
+            return advance(known, forcing, scalars, feedback, row, feasible)
 
-        def pushed(slopes: _Known, fed: Feedback, units: tuple, *others: Any) -> Any:
-            return push(slopes, fed, tuple(jnp.broadcast_to(unit, own) for unit in units), *others)
+        def pushed(slopes: _Known, feedback: Feedback, units: tuple, *others: Any) -> Any:
+            return push(slopes, feedback, tuple(jnp.broadcast_to(unit, own) for unit in units), *others)
 
-        at, directions = (known, fed, scalars), (slopes, fed_slopes, units)
+        at, directions = (known, feedback, scalars), (slopes, by_unknowns, units)
         if tangents is not None:
             wide = jax.tree.map(lambda t: jnp.zeros((unknowns, segments), dtype=float).at[positions].set(t), tangents)
             at, directions = (*at, forcing), (*directions, wide)
@@ -319,8 +328,10 @@ def _filter_rows(
     (covariance, known, feasible), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
     (errors, slopes), variance, variance_slopes = found
     counts = row.is_measured & counts[:, None]
-    errors, slopes = errors - fed[0], jnp.concatenate([slopes, -fed[2]], axis=2)
-    noise = slice(count, count + variance_slopes.shape[1])
-    found, last = likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, fed[1], noise)
+    errors, slopes = errors - explained.error, jnp.concatenate([slopes, -explained.slopes], axis=2)
+    by_noise = slice(count, count + variance_slopes.shape[1])
+    found, last = likelihood(
+        counts, variance, variance_slopes, carry.last, feasible, errors, slopes, explained.noise, by_noise
+    )
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)

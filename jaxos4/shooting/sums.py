@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Numeric
 from .gains import Series
 
-Segments = Float[Array, " segments"]
+PerSegment = Float[Array, " segments"]
 
 LAGS = 8
 """The largest lag at which innovations are compared, in samples."""
@@ -28,7 +28,7 @@ class Innovations(NamedTuple):
     - `products`: sums of the products of standardised innovations 0 to `LAGS` samples apart.
     """
 
-    cost: Segments
+    cost: PerSegment
     feasible: Bool[Array, " segments"]
     gradient: Float[Array, "channels unknowns segments"]
     information: Float[Array, "channels unknowns unknowns segments"]
