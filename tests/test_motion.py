@@ -83,6 +83,17 @@ def test_dead_reckoning_follows_a_measured_velocity_without_its_noise():
     assert (velocity_of(noisy)[0] - velocity)[500:].std() == pytest.approx(0.1 * left, rel=0.3)
 
 
+def test_gyro_and_accelerometer_bridge_a_gap_of_the_velocity_and_a_climb_is_no_error():
+    time = np.arange(0.0, 8.0, 0.004)
+    climb = 0.5 * np.cumsum(np.where(time < 4, 1.0, 0.0)) * 0.004  # 0.5 m/s^2 for 4 s, then 2 m/s
+    states, force = np.zeros((time.size, 12)), np.zeros((time.size, 3))
+    states[:, VELOCITY[2]], force[:, 2] = climb, 9.81 + np.where(time < 4, 0.5, 0.0)
+    gap = (time > 2) & (time < 3)
+    states[np.ix_(gap, VELOCITY)] = np.nan
+    velocity, _ = velocity_of(Recording(time, np.full((time.size, 4), 100.0), states, force))
+    assert np.abs(velocity[:, 2] - climb).max() < 0.01
+
+
 @pytest.mark.parametrize("lacking", [RATES, None], ids=["rates", "force"])
 def test_without_gyro_or_accelerometer_a_measured_velocity_is_turned_by_the_attitude(lacking):
     recording, true, _ = trajectory(0.004)

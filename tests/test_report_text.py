@@ -50,7 +50,9 @@ DIVERGED = {"result": "nonfinite_trajectory"}
 def test_the_text_of_a_flight_warns_and_is_short_without_an_answer(changes, said):
     says(printed(identified_flight(**changes)), said)
     for other in ("rls", "AnEstimatorOfYourOwn"):
-        assert "`window`" not in printed(identified_flight(**DIVERGED, estimator=other))
+        text = printed(identified_flight(**DIVERGED, estimator=other))
+        says(text, "No estimate: the model's trajectory diverged")
+        assert "`window`" not in text
     assert printed(identified_flight(result="bracket_invalid")) == ""
     assert printed(identified_vehicle(verdicts={}, **DIVERGED)) == "note: t is not uniform"
 

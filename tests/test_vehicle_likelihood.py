@@ -109,11 +109,18 @@ def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(rows, place):
 
 
 @pytest.mark.parametrize(
-    ("logged", "commanded", "shortest"),
-    [(0.001, False, 0.002), (0.002, False, 0.002), (0.005, False, 0.005), (0.001, True, 0.002), (0.002, True, 0.004)],
+    ("logged", "commands", "shortest"),
+    [
+        (0.001, 0.0, 0.002),
+        (0.002, 0.0, 0.002),
+        (0.005, 0.0, 0.005),
+        (0.0005, 0.0005, 0.002),
+        (0.00101, 0.00101, 0.00202),
+    ]
+    + [(0.00125, 0.00125, 0.00375), (0.002, 0.002, 0.004), (0.001, 0.004, 0.004), (0.005, 0.005, 0.005)],
 )
-def test_the_shortest_samples_hold_single_rows_of_measured_speeds(logged, commanded, shortest):
-    assert finest(logged, commanded=commanded) == pytest.approx(shortest)
+def test_the_shortest_samples_hold_single_rows_of_speeds_and_two_new_commands(logged, commands, shortest):
+    assert finest(logged, commands=commands) == pytest.approx(shortest)
 
 
 def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():

@@ -177,7 +177,7 @@ class IBSS(AbstractSolver[State]):
         return jax.lax.while_loop(lambda carry: (carry[3] < most) & ~carry[4], shoot, first)[:4]
 
     def _judge(self, stage: Stage, state: State, unknowns: WindowUnknowns, model: LocalModel) -> tuple[Flag, Flag]:
-        """Whether the new point is kept, and whether the search has stalled. A point that is worse is not kept."""
+        """Whether the new point is kept, and whether the search has stalled. A clearly worse point is not kept."""
         before, gain = state.model, state.model.cost.sum() - model.cost.sum()
         feasible, was_feasible = model.feasible.all(), before.feasible.all()
         has_stride = jnp.isfinite(stage.unknowns.stride).any()
@@ -189,7 +189,7 @@ class IBSS(AbstractSolver[State]):
         return ~(bad | (stalled & (gain < 0))), stalled
 
     def _is_near(self, stage: Stage, model: LocalModel, steps: PerDirection) -> Flag:
-        """Whether steps, or slopes, which have their size, are short enough to end the stage. The last ends finely."""
+        """Whether steps, or slopes in the same units, are short enough to end the stage. The last ends finely."""
         misfit = stage.misfit(model.cost.sum())
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
         return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))

@@ -81,7 +81,9 @@ def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str,
             check = "check the airframe, or " if name in (*PARAMETER_NAMES, *of_airframe) else ""
             found.append(f"{name} is outside its bracket; {check}give a wider `bracket`")
     resting = (name for name in rows if shares[name] > MAX_PRIOR)
-    return *found, *(f"{100 * shares[name]:.0f} % of the information about {name} is its bracket" for name in resting)
+    return *found, *(
+        f"{100 * shares[name]:.0f} % of the information about {name} comes from its bracket" for name in resting
+    )
 
 
 def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> Quantity:

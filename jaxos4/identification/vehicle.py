@@ -40,7 +40,7 @@ class VehicleSettings:
     - `terms`: of `jaxos4.TERMS`; by default those that the recordings allow.
     - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.
     - `sample_time`: average to samples of this length [s]; by default the best one up to 0.032 s, from 0.002 s
-      (commands: 0.004 s) or the recordings' sample time if it is longer.
+      (commands that change more rarely than twice in that: 0.004 s) or the recordings' sample time if it is longer.
     - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
     """
 
@@ -146,7 +146,7 @@ def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingPro
 def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared) -> InnovationsProblem:
     """The likelihood of a vehicle, padded so that all flights up to the length of the `finest` share a program."""
     recordings = max(prepared.recordings) + 1
-    # All sample times have the same number of segments, so that none is too short at the longest.
+    # All sample times have the same number of segments, each of at least `MIN_SEGMENT` unless recordings are many.
     seconds = float(finest.fitted.dt) * finest.fitted.time.shape[0]
     most = SEGMENTS * max(recordings // RECORDINGS, 1)
     segments = int(np.clip(seconds / MIN_SEGMENT, 2 * recordings if recordings > 1 else 1, most))

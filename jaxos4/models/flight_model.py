@@ -181,7 +181,7 @@ class FlightModel(AbstractModel):
         return self._beside(inputs, self._rotors(inputs.divided, parameters, parts=parts, of_parts=averaged))
 
     def _beside(self, inputs: Inputs, rotors: Forcing) -> Forcing:
-        """The forcing by the rotors, completed by recording and velocity."""
+        """The forcing by the rotors, with the recording and the velocity of each sample."""
         own, velocity = jnp.zeros(inputs.omega.shape[0], dtype=int), inputs.velocity
         if inputs.stretches is not None:
             own = of_stretches(self.recordings, inputs.stretches.number)

@@ -78,7 +78,7 @@ class Forcing(NamedTuple):
     - `spin_up`: Omega_r' [rad/s^2].
     - `specific_thrust`: U_c/m around the time of the sample [m/s^2], as an accelerometer measures it.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
-    - `velocity`: along the body's axes, measured or by dead reckoning [m/s].
+    - `velocity`: along the body's axes, see `Flight.body_velocity` [m/s].
     - `early`: the forcing weighted by the time that remains in the sample, for its effect on a mean over the sample.
       `None`: measurements are instants.
     """

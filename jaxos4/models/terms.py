@@ -144,7 +144,8 @@ _CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, a
 DAMPED = "1/s is more than rotors give (1)"
 """The cause of a damping that contradicts physics."""
 _SPARSE = DAMPED, "log motors at 100 Hz or more, on board; else the model lacks an effect"
-_DAMPED = _limits((-_INF, 2.5, *_SPARSE))
+# The search of yaw_damping ends at 2.5 1/s.
+_DAMPED = [_limits((-_INF, most, *_SPARSE)) for most in (2.5, 2.5, 2.0)]
 _OFF = "m/s^2: a levelled accelerometer is off by less than 0.6, so the thrust does not match the weight"
 _LEVEL = _limits((-0.6, 0.6, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
 
@@ -212,8 +213,8 @@ _OWN: dict[str, Term] = {
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
         # Thrust damps roll and pitch. Yaw is damped by the drag of rotors, about 0.3 1/s, times m r^2 / Iz, about 2.
         tuple(
-            Parameter(f"{x}_damping", "1/s", half_width, center=center, nonnegative=True, contradiction=_DAMPED)
-            for x, center, half_width in zip(MOTIONS, (0.0, 0.0, 0.5), (5.0, 5.0, 0.5), strict=True)
+            Parameter(f"{x}_damping", "1/s", half_width, center=center, nonnegative=True, contradiction=most)
+            for x, center, half_width, most in zip(MOTIONS, (0.0, 0.0, 0.5), (5.0, 5.0, 0.5), _DAMPED, strict=True)
         ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
         quantity="damping",

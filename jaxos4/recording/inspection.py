@@ -71,7 +71,7 @@ class Inspection(msgspec.Struct, frozen=True):
 
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
     """Describe a log that was read with this airframe and `full_scale=1.0`. Torques are unknown without an airframe."""
-    seconds = fair_share([recording], finest(recording.dt, commanded=recording.commanded))
+    seconds = fair_share([recording], finest(recording.dt, commands=recording.dt * recording.commanded))
     evidence, parts = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
         excited = {} if stretch.reason else excitation(cut(evidence.plausible.recording, stretch), airframe)

@@ -207,7 +207,7 @@ LEVELS = 2.0, 8.0
 
 FOLLOWS = 0.5  # s; dead reckoning follows a measured velocity, whose noise would hide the drag, with this time constant
 # s; dead reckoning forgets its velocity with these time constants. Where motion along z has a period of a few seconds,
-# what is forgotten in 2 s looks like thrust: z_drag is 15 % too large. Without attitude, 20 s sum up too many errors.
+# what is forgotten in 2 s looks like thrust: z_drag is 17 % too large. Without attitude, 20 s sum up too many errors.
 FORGETS, FORGETS_WITHOUT_ATTITUDE = 20.0, 2.0
 
 
@@ -216,24 +216,25 @@ def velocity_of(
 ) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
     """The motion of a vehicle through still air; `None` if the log does not say enough.
 
-    The velocity is dead reckoned from gyro and accelerometer, v' = force - g up - rates x v, and follows the measured
-    velocity if there is one. Without, slow errors of this sum, and slow changes of the velocity, are forgotten; torque
-    and thrust answer faster ones.
+    The velocity is dead reckoned from gyro and accelerometer, v' = force - g up - rates x v. It follows a measured
+    velocity if the log has one, and the attitude. Otherwise slow errors of this sum, and slow changes of the velocity,
+    are forgotten; torque and thrust answer faster ones. Without gyro or accelerometer, it is the measured velocity.
 
     **Arguments:**
 
     - `recording`: of one stretch.
-    - `forgets`: time constant with which a velocity that is not measured is forgotten [s].
+    - `forgets`: the time constant with which a velocity that is not measured is forgotten [s]. By default 20 s, or 2 s
+      without attitude.
 
     **Returns:** the velocity along the body's axes [m/s], and the upright direction in these axes by each time
     constant. Both are the same if the attitude was measured.
     """
-    angles, velocity = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY))
+    angles, velocity, rates = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY, RATES))
     to_body = None if angles is None else rotations_to_body(angles)
     up, measured = None if to_body is None else to_body[:, :, 2], None
     if to_body is not None and velocity is not None:
         measured = np.einsum("tij,tj->ti", to_body, velocity)
-    rates, force = _gapless(recording, RATES), recording.specific_force
+    force = recording.specific_force
     if rates is None or force is None or np.isnan(force).all(axis=0).any():
         return None if measured is None or up is None else (measured, (up, up))
     force = filled(force)
@@ -241,10 +242,14 @@ def velocity_of(
         fast, slow = (_upright(rates, force, recording.dt, level) for level in LEVELS)
     else:
         fast = slow = up
+    push = force - GRAVITY * fast
     if measured is not None:
-        return _dead_reckoned(rates, force, fast, recording.dt, FOLLOWS, measured), (fast, slow)
+        follows = np.where(np.isnan(recording.states[:, VELOCITY]).any(axis=1), np.inf, FOLLOWS)
+        return _dead_reckoned(rates, push, recording.dt, follows, measured), (fast, slow)
+    push -= (push * fast).sum(axis=1).mean() * fast  # a flight does not climb for ever
     forgets = forgets or (FORGETS_WITHOUT_ATTITUDE if up is None else FORGETS)
-    return _dead_reckoned(rates, force, fast, recording.dt, forgets, np.zeros(force.shape)), (fast, slow)
+    follows, still = np.full(force.shape[0], forgets), np.zeros(force.shape)
+    return _dead_reckoned(rates, push, recording.dt, follows, still), (fast, slow)
 
 
 def measures_velocity(recording: Recording) -> bool:
@@ -276,26 +281,24 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
 
 def _dead_reckoned(
     rates: Float[np.ndarray, "samples 3"],
-    force: Float[np.ndarray, "samples 3"],
-    up: Float[np.ndarray, "samples 3"],
+    push: Float[np.ndarray, "samples 3"],
     dt: float,
-    follows: float,
+    follows: Float[np.ndarray, " samples"],
     velocity: Float[np.ndarray, "samples 3"],
 ) -> Float[np.ndarray, "samples 3"]:
     """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays.
 
-    It is drawn to a given `velocity` with the time constant `follows` [s].
+    `push`: the specific force without gravity [m/s^2]. `follows`: the time constant with which a given `velocity` is
+    followed [s].
     """
-    push = force - GRAVITY * up
-    push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
-    kept = math.exp(-dt / follows)
-    drawn, (vx, vy, vz), velocities = (1 - kept) * velocity, velocity[0].tolist(), []
-    for (p, q, r), (ax, ay, az), (x, y, z) in zip(rates.tolist(), push.tolist(), drawn.tolist(), strict=True):
+    kept = np.exp(-dt / follows)[:, None]
+    drawn, (vx, vy, vz), velocities = np.hstack([kept, (1 - kept) * velocity]), velocity[0].tolist(), []
+    for (p, q, r), (ax, ay, az), (k, x, y, z) in zip(rates.tolist(), push.tolist(), drawn.tolist(), strict=True):
         velocities.append((vx, vy, vz))
         vx, vy, vz = (
-            kept * (vx + dt * (ax - q * vz + r * vy)) + x,
-            kept * (vy + dt * (ay - r * vx + p * vz)) + y,
-            kept * (vz + dt * (az - p * vy + q * vx)) + z,
+            k * (vx + dt * (ax - q * vz + r * vy)) + x,
+            k * (vy + dt * (ay - r * vx + p * vz)) + y,
+            k * (vz + dt * (az - p * vy + q * vx)) + z,
         )
     return np.array(velocities)
 

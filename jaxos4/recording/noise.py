@@ -36,7 +36,7 @@ LEAST_NOISE = 0.5  # share of the noise from second differences
 
 
 def force_noise(recording: Recording) -> Float[np.ndarray, "3"]:
-    """A lower limit of the white noise of means over a second [m/s^2], from second differences and the sensor's count.
+    """A lower limit of the white noise of means over a second [m/s^2], by second differences and the resolution.
 
     Vibration is not smooth from row to row. Without this limit, a fit may take it for a disturbance.
     """

@@ -31,8 +31,8 @@ _NEARLY = 1.01  # sample times that differ by less than this factor count as equ
 WINDOW = 0.25  # s
 MIN_SAMPLES = 4  # of a window
 # The shortest sample by default [s]. A fast controller responds to single rows of a log, which a mean does not hold: in
-# samples of 4 ms instead of 2, Ix is 1 to 3 % and the damping 0.2 /s larger. Commands of a log without two rows in 2 ms
-# hold too little of the controller to gain from that.
+# samples of 4 ms instead of 2, Ix is 1 to 3 % and the damping 0.2 /s larger. Commands that change less than twice in
+# 2 ms hold too little of the controller to gain from that.
 SHORTEST, SHORTEST_OF_COMMANDS = 0.002, 0.004
 LONGEST = 0.032  # s; the longest sample at which an answer is compared with that of shorter ones
 # A given sample time becomes a multiple of the log's if that changes it by less than this share.
@@ -127,7 +127,8 @@ def prepare(
         if any(recording.same_data(earlier) for earlier in recordings[:number]):
             raise InputError(f"{recording.name}: given twice; give each log once.")
     commanded = any(each.commanded for each in recordings)
-    step = finest(max(each.dt for each in recordings), sample_time, commanded=commanded)
+    logged = max(each.dt for each in recordings)
+    step = finest(logged, sample_time, commands=logged * commanded)
     seconds = math.inf if predicted else fair_share(recordings, step)
     evidences = [Evidence(each, airframe, seconds=seconds) for each in recordings]
     every = [_cleaned(each, airframe, begin, end, predicted=predicted) for each in evidences]
@@ -145,7 +146,9 @@ def prepare(
             how = f"{noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
             notes.append(f"{recording.name}: rotor speeds are noisy ({how}) and were smoothed")
     slowest = max(stretch.dt for _, stretch in stretched)
-    steps = _sample_times(recordings[0].name, slowest, sample_time, commanded=commanded, predicted=predicted)
+    motor_step = max(slowest, *(each.evidence.motor_step for each in every))
+    commands = motor_step * commanded
+    steps = _sample_times(recordings[0].name, slowest, sample_time, commands=commands, predicted=predicted)
     coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
     numbers = [number for number, _ in stretched]
     vibrates = {name: at for each in every for name, at in vibrating_rates(each.stretches).items()}
@@ -156,7 +159,7 @@ def prepare(
             notes=tuple(notes),
             findings=tuple(found),
             log_step=slowest,
-            motor_step=max(slowest, *(each.evidence.motor_step for each in every)),
+            motor_step=motor_step,
             vibrates=vibrates,
         )
         for step, flown in zip(steps, coarse, strict=True)
@@ -247,9 +250,9 @@ def _richest(evidence: Evidence, parts: Sequence[Stretch]) -> tuple[list[Recordi
 
 
 def _sample_times(
-    name: str, slowest: float, sample_time: float | None, *, commanded: bool, predicted: bool
+    name: str, slowest: float, sample_time: float | None, *, commands: float, predicted: bool
 ) -> list[float]:
-    """The sample times at which answers are compared [s], the shortest first. `slowest`: of the logs."""
+    """The sample times at which answers are compared [s], the shortest first. `slowest`, `commands`: see `finest`."""
     if slowest > _NEARLY * WINDOW / MIN_SAMPLES:
         least = f"log at {MIN_SAMPLES / WINDOW:g} Hz or more"
         raise InputError(f"{name}: has one sample every {slowest:.4g} s, too few for a vehicle; {least}.")
@@ -260,16 +263,19 @@ def _sample_times(
                 f"{sample_time:.4g} s; give `sample_time` {slowest:.4g}, or another `validate`."
             )
         raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
-    shortest = finest(slowest, sample_time, commanded=commanded, predicted=predicted)
+    shortest = finest(slowest, sample_time, commands=commands, predicted=predicted)
     doublings = 0 if predicted else math.floor(math.log2(LONGEST * _NEARLY / shortest))
     return [shortest * 2**k for k in range(max(doublings, 0) + 1)]
 
 
 def finest(
-    slowest: float, sample_time: float | None = None, *, commanded: bool = False, predicted: bool = False
+    slowest: float, sample_time: float | None = None, *, commands: float = 0.0, predicted: bool = False
 ) -> float:
-    """The shortest sample time [s] at which logs are fitted, or `sample_time`. `slowest`: of the logs."""
-    default = SHORTEST_OF_COMMANDS if commanded and 2 * slowest > SHORTEST * _NEARLY else SHORTEST
+    """The shortest sample time [s] at which logs are fitted, or `sample_time`.
+
+    `slowest`: the longest time between rows [s]. `commands`: between new commands; 0: speeds were measured.
+    """
+    default = SHORTEST_OF_COMMANDS if 2 * commands > SHORTEST * _NEARLY else SHORTEST
     shortest = max(default if sample_time is None else sample_time, slowest)
     whole = max(round(shortest / slowest), 1) * slowest  # samples of whole rows
     is_near = sample_time is None or abs(whole - shortest) < WHOLE * shortest

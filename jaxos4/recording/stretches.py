@@ -1,4 +1,4 @@
-"""Divides a flight into stretches that can be used for identification, and others with the reason.
+"""Divides a flight into stretches that can be used for identification and unusable ones, with the reason.
 
 A stretch is usable if the rotors carry the vehicle and the accelerometer feels it, no rotor rests or is at its limit
 for longer than a moment, no samples are lost, and the vehicle does not crash.

@@ -29,7 +29,7 @@ RATE_COUNT = CHANNELS["rates"]
 """The number of body rates, which come first among the channels."""
 # Standard deviation of the rates before the first measurement of a segment [rad/s]: as good as unknown.
 _UNKNOWN_RATE = 1e3
-# Nodes of the quadrature over each part of a sample: exact to nine digits if it is shorter than four time constants.
+# Nodes of the quadrature over each part of a sample: exact to nine digits, as a part has at most four time constants.
 _NODES = 8
 # The time constant of the low-pass filter of a force that has none [s].
 _NO_FILTER = 1e-9

@@ -163,8 +163,8 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
 
 
 DELAY = 0.01  # s; a longer delay between two sensors is noted; damping and inflow make errors of up to 8 ms
-# s; a longer delay between two sensors contradicts: 20 ms change inertias by 10 %. The filter of an accelerometer can
-# be 10 ms later than the gyro's.
+# s; a longer delay between two sensors contradicts the quantities: 20 ms change inertias by 10 %. The filter of an
+# accelerometer can be 10 ms later than the gyro's.
 LATE = 0.015
 LATE_ATTITUDE = 0.025  # s after the gyro; filters and cameras are late by up to 20 ms
 # Standard deviations of delays that are no clock errors [s]: by filters, by varying damping, and by the rotors' lag and
