@@ -205,7 +205,6 @@ def _response(flown: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndar
 LEVELS = 2.0, 8.0
 
 
-FOLLOWS = 0.5  # s; dead reckoning follows a measured velocity, whose noise would hide the drag, with this time constant
 # s; dead reckoning forgets its velocity with these time constants. Where motion along z has a period of a few seconds,
 # what is forgotten in 2 s looks like thrust: z_drag is 17 % too large. Without attitude, 20 s sum up too many errors.
 FORGETS, FORGETS_WITHOUT_ATTITUDE = 20.0, 2.0
@@ -216,40 +215,32 @@ def velocity_of(
 ) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
     """The motion of a vehicle through still air; `None` if the log does not say enough.
 
-    The velocity is dead reckoned from gyro and accelerometer, v' = force - g up - rates x v. It follows a measured
-    velocity if the log has one, and the attitude. Otherwise slow errors of this sum, and slow changes of the velocity,
-    are forgotten; torque and thrust answer faster ones. Without gyro or accelerometer, it is the measured velocity.
+    A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
+    this sum, and slow changes of the velocity, are forgotten; torque and thrust answer faster ones.
 
     **Arguments:**
 
     - `recording`: of one stretch.
-    - `forgets`: the time constant with which a velocity that is not measured is forgotten [s]. By default 20 s, or 2 s
-      without attitude.
+    - `forgets`: the time constant with which dead reckoning forgets its velocity [s]. By default 20 s, or 2 s without
+      attitude.
 
     **Returns:** the velocity along the body's axes [m/s], and the upright direction in these axes by each time
     constant. Both are the same if the attitude was measured.
     """
-    angles, velocity, rates = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY, RATES))
+    angles, velocity = (_gapless(recording, columns) for columns in (ANGLES, VELOCITY))
     to_body = None if angles is None else rotations_to_body(angles)
-    up, measured = None if to_body is None else to_body[:, :, 2], None
     if to_body is not None and velocity is not None:
-        measured = np.einsum("tij,tj->ti", to_body, velocity)
-    force = recording.specific_force
+        return np.einsum("tij,tj->ti", to_body, velocity), (to_body[:, :, 2], to_body[:, :, 2])
+    rates, force = _gapless(recording, RATES), recording.specific_force
     if rates is None or force is None or np.isnan(force).all(axis=0).any():
-        return None if measured is None or up is None else (measured, (up, up))
+        return None
     force = filled(force)
-    if up is None:
-        fast, slow = (_upright(rates, force, recording.dt, level) for level in LEVELS)
+    if to_body is None:
+        up, slow = (_upright(rates, force, recording.dt, level) for level in LEVELS)
     else:
-        fast = slow = up
-    push = force - GRAVITY * fast
-    if measured is not None:
-        follows = np.where(np.isnan(recording.states[:, VELOCITY]).any(axis=1), np.inf, FOLLOWS)
-        return _dead_reckoned(rates, push, recording.dt, follows, measured), (fast, slow)
-    push -= (push * fast).sum(axis=1).mean() * fast  # a flight does not climb for ever
-    forgets = forgets or (FORGETS_WITHOUT_ATTITUDE if up is None else FORGETS)
-    follows, still = np.full(force.shape[0], forgets), np.zeros(force.shape)
-    return _dead_reckoned(rates, push, recording.dt, follows, still), (fast, slow)
+        up = slow = to_body[:, :, 2]
+    forgets = forgets or (FORGETS_WITHOUT_ATTITUDE if to_body is None else FORGETS)
+    return _dead_reckoned(rates, force, up, recording.dt, forgets), (up, slow)
 
 
 def measures_velocity(recording: Recording) -> bool:
@@ -281,24 +272,21 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
 
 def _dead_reckoned(
     rates: Float[np.ndarray, "samples 3"],
-    push: Float[np.ndarray, "samples 3"],
+    force: Float[np.ndarray, "samples 3"],
+    up: Float[np.ndarray, "samples 3"],
     dt: float,
-    follows: Float[np.ndarray, " samples"],
-    velocity: Float[np.ndarray, "samples 3"],
+    forgets: float,
 ) -> Float[np.ndarray, "samples 3"]:
-    """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays.
-
-    `push`: the specific force without gravity [m/s^2]. `follows`: the time constant with which a given `velocity` is
-    followed [s].
-    """
-    kept = np.exp(-dt / follows)[:, None]
-    drawn, (vx, vy, vz), velocities = np.hstack([kept, (1 - kept) * velocity]), velocity[0].tolist(), []
-    for (p, q, r), (ax, ay, az), (k, x, y, z) in zip(rates.tolist(), push.tolist(), drawn.tolist(), strict=True):
+    """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays."""
+    push = force - GRAVITY * up
+    push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
+    kept, (vx, vy, vz), velocities = math.exp(-dt / forgets), (0.0, 0.0, 0.0), []
+    for (p, q, r), (ax, ay, az) in zip(rates.tolist(), push.tolist(), strict=True):
         velocities.append((vx, vy, vz))
         vx, vy, vz = (
-            k * (vx + dt * (ax - q * vz + r * vy)) + x,
-            k * (vy + dt * (ay - r * vx + p * vz)) + y,
-            k * (vz + dt * (az - p * vy + q * vx)) + z,
+            kept * (vx + dt * (ax - q * vz + r * vy)),
+            kept * (vy + dt * (ay - r * vx + p * vz)),
+            kept * (vz + dt * (az - p * vy + q * vx)),
         )
     return np.array(velocities)
 

@@ -39,7 +39,7 @@ FORCE_STEP = 0.004  # s; samples of the accelerometer
 SPECTRUM = 2.0  # s; duration of the samples of one spectrum
 BAND = 2.0, 15.0  # Hz; below are wind and height control; above, the rotors' lag and the gyro's noise leave little
 FORGETS = 2.0
-"""Angle and velocity, on which damping and inflow act, are forgotten with this time constant [s], unless measured."""
+"""Angle and velocity, on which damping and inflow act, are forgotten with this time constant [s]."""
 GAP = 0.05
 """The longest gap that is interpolated [s]."""
 SECONDS = 6.0
