@@ -19,7 +19,7 @@ import jaxos4
 # ## A log to begin with
 #
 # This page must run without your drone, so it flies a simulated one: a quadrotor of 27 g under
-# a controller, for 20 s in gusts. Its log has columns that jaxos4 does not know. With a log of
+# a controller, for 30 s in gusts. Its log has columns that jaxos4 does not know. With a log of
 # your own, skip this cell.
 
 # %%
@@ -33,9 +33,12 @@ truth = jaxos4.Airframe(
     rotor_inertia=2e-8,
     max_rotor_speed=2500.0,
 )
-references = jaxos4.random_references(duration=20.0, dt=0.004, key=jax.random.key(0))
+references = jaxos4.random_references(duration=30.0, dt=0.004, key=jax.random.key(0))
 flown = jaxos4.fly_closed_loop(
-    jaxos4.ClosedLoop(truth, gust=2.0), references, dt=0.004, key=jax.random.key(1)
+    jaxos4.ClosedLoop(truth, gust=2.0, thrust_curve=0.85),
+    references,
+    dt=0.004,
+    key=jax.random.key(1),
 )
 log = {"time_ms": 1000 * flown.time}
 log |= {f"motor{i + 1}_percent": 100 * flown.omega[:, i] / 2500.0 for i in range(4)}
