@@ -160,7 +160,7 @@ def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: P
     negative = {
         row.name: (value, std) for row, value, std in _rows(before) if row.nonnegative and value < -NEGATIVE * std
     }
-    if not negative:
+    if not negative or not before.converged:  # away from a minimum, signs and standard deviations mean nothing
         return before
     progress("fitting again without what came out negative")
     places = [before.unknowns.names.index(name) for name in negative]
