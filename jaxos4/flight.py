@@ -191,6 +191,8 @@ SIGNALS: dict[str, Signal] = {
     field.name: field.metadata["signal"] for field in dataclasses.fields(Flight) if "signal" in field.metadata
 }
 """The fields of `Flight` with one row a sample, besides the time."""
+UNITS = {name: unit for signal in SIGNALS.values() for name, unit in signal.columns.items()}
+"""The unit of each column of a signal in a log."""
 
 
 def with_force(states: Any, force: Any, numpy: Any) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..airframe import STANDARD_GRAVITY
-from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES
+from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES, UNITS
 from .sampling import filled
 from .table import Recording, Table
 
@@ -62,7 +62,7 @@ COLUMNS = {
     "t": ColumnLimits("s", -1e11, 1e11, _TIME, others={"ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
     **dict.fromkeys(SPEED_NAMES, ColumnLimits("rad/s", 0, 1e5, _SPEED, _SIGN, others=_TURNING)),
     **dict.fromkeys(COMMAND_NAMES, ColumnLimits("of full scale", 0, 1, _COMMAND, others={"%": 0.01, PWM: 1e-3})),
-    **{name: _OF_UNIT[unit] for signal in SIGNALS.values() for name, unit in signal.columns.items()},
+    **{name: _OF_UNIT[unit] for name, unit in UNITS.items()},
 }
 """The columns that a log can have: the time, the rotors, and those of the signals of a flight."""
 _RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)

@@ -188,11 +188,8 @@ def _end(specification: str) -> list[Markup]:
 
 def draw(scenario: ScenarioData, *, several: bool = False) -> dict[str, Figure]:
     """The figures whose data are present. `several`: their names end with the scenario's number."""
-    kinds = (
-        {"intervals": study_of_one_flight.intervals}
-        if study_of_one_flight.is_of_one(scenario.data)
-        else SCENARIO_FIGURES
-    )
+    of_one = study_of_one_flight.is_of_one(scenario.data)
+    kinds = {"intervals": study_of_one_flight.intervals} if of_one else SCENARIO_FIGURES
     found = {name: make(scenario.data) for name, make in kinds.items()}
     suffix = f"-{scenario.number}" if several else ""
     return {name: figure._replace(stem=f"{name}{suffix}") for name, figure in found.items() if figure is not None}

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
-from ..flight import SIGNALS
+from ..flight import SIGNALS, UNITS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities, possible
@@ -35,12 +35,10 @@ _SIGNIFICANCE = 0.01
 _COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
 
 _COMMANDS = "of full scale (commands)"
+_TOGETHER = ["p q r", "phi theta psi", "x y z", "vx vy vz"]
+_TOGETHER += [" ".join(signal.columns) for name, signal in SIGNALS.items() if signal.columns and name != "states"]
 # The unit of channels that are shown together.
-_STATES = "p q r", "phi theta psi", "x y z", "vx vy vz"
-_OTHERS = [name for name, signal in SIGNALS.items() if signal.columns and name != "states"]
-_UNITS = {names: SIGNALS["states"].columns[names.split()[0]] for names in _STATES}
-_UNITS |= {" ".join(SIGNALS[name].columns): next(iter(SIGNALS[name].columns.values())) for name in _OTHERS}
-_UNITS["rotor1 rotor2 rotor3 rotor4"] = "rad/s"
+_UNITS = {names: UNITS[names.split()[0]] for names in _TOGETHER} | {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 
 Section = Iterator[str | Listing]
 

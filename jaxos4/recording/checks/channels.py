@@ -6,11 +6,10 @@ import numpy as np
 
 from ...airframe import AXES, INERTIAS
 from ...errors import percent
-from ...flight import FORCE_NAMES, RATES
+from ...flight import RATES, UNITS
 from ...logs.table import counted
 from .evidence import HELD, Evidence, Finding
 
-_UNITS: dict[str, str] = {**dict.fromkeys("pqr", "rad/s"), **dict.fromkeys(FORCE_NAMES, "m/s^2")}
 # Clipped thrust seems too weak, and moments of inertia are proportional to it.
 _CLIPPED = {axis.rate: (axis.inertia,) for axis in AXES} | {"az": ("thrust", *INERTIAS)}
 
@@ -60,7 +59,7 @@ def clipped_values(evidence: Evidence) -> Finding | None:
     found = evidence.plausible.clipped
     if not found:
         return None
-    each = [f"{n}: {count} ({percent(share)}) at {end:.4g} {_UNITS[n]}" for n, (count, share, end) in found.items()]
+    each = [f"{n}: {count} ({percent(share)}) at {end:.4g} {UNITS[n]}" for n, (count, share, end) in found.items()]
     many = bool(max(share for _, share, _ in found.values()) > MANY_CLIPPED)
     return Finding(
         "clipped_values",
