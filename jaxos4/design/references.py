@@ -80,15 +80,15 @@ def _response(
     scale = np.sqrt(np.diagonal(base))
     scale[: len(INERTIAS)] = 1  # their bounds are relative already
     unit = np.outer(scale, scale)
-    # The answers in the last period, in which the beginning is forgotten.
+    # The responses in the last period, in which the beginning is forgotten.
     last = np.conj(turns[-tones.period :]) * 2 / tones.period
     signals = {}
     for name, columns in (("angle", ANGLES), ("rate", RATES)):
         left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
         if (left <= 0).any():
             raise _too_gusty(name)
-        answers = np.einsum("kta,tk->ak", states[:number, -tones.period :, columns], last) / _SMALL[:3, None]
-        moving = _parts(answers[:, None] * tones.turns(_POINTS))
+        responses = np.einsum("kta,tk->ak", states[:number, -tones.period :, columns], last) / _SMALL[:3, None]
+        moving = _parts(responses[:, None] * tones.turns(_POINTS))
         signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
     relative = np.square(largest / _SMALL)[:, None, None, None]
     return {"base": jnp.asarray(base / unit), "added": jnp.asarray(relative * each / unit), "signals": signals}
@@ -110,6 +110,8 @@ class ReferenceTask(task.AbstractTask):
     starts: ClassVar[int] = 8
     first: ClassVar[float] = 0.85
 
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
     envelope: Envelope
     scale: Float[Numeric, "3"]
     unexcited: Float[Numeric, " parameters"]
@@ -124,16 +126,6 @@ class ReferenceTask(task.AbstractTask):
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_references)
-
-    @property
-    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """Ix, Iy and Iz, and the model's other parameters."""
-        return self.fleet.inertias_first(INERTIAS, self.fleet.model.parameter_names)
-
-    @property
-    def units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """Of `names`."""
-        return self.fleet.inertias_first(("kg m^2",) * len(INERTIAS), self.fleet.model.parameter_units)
 
     @property
     def size(self) -> int:
@@ -231,6 +223,8 @@ def design_references(
     tones = Tones.up_to(bandwidth, samples, dt)
     progress("flying tones")
     references = ReferenceTask(
+        names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
+        units=fleet.inertias_first(("kg m^2",) * len(INERTIAS), fleet.model.parameter_units),
         envelope=envelope,
         scale=np.asarray(loop.airframe.inertia),
         unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
