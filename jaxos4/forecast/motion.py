@@ -13,13 +13,11 @@ from ..analysis.prediction import Filtered, filtered, gyro_bias, open_loop
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
+from ..rotations import Quaternion, Vector, conjugate, deviation, quaternion_product, rotated
 from ..shooting import FASTEST
 from ..shooting.gains import Covariance, LogNoise, Transition, first_covariance, is_rate, next_gains, step_of
 from ..simulation import runge_kutta
 
-_Samples = Float[Numeric, "*samples"]
-Vector = tuple[_Samples, _Samples, _Samples]
-Quaternion = tuple[_Samples, _Samples, _Samples, _Samples]
 PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10], "rates": np.r_[10:13]}
 """The places of the parts of a state in an array of 13. The attitude is the quaternion w, x, y, z, body to earth."""
 
@@ -73,43 +71,6 @@ class Futures(NamedTuple):
     gusts: Filtered
 
 
-def product(a, b) -> Quaternion:
-    """The quaternion of the rotation `b`, and then `a`. NumPy and JAX."""
-    (w, x, y, z), (k, j, m, n) = a, b
-    return (
-        w * k - x * j - y * m - z * n,
-        w * j + x * k + y * n - z * m,
-        w * m - x * n + y * k + z * j,
-        w * n + x * m - y * j + z * k,
-    )
-
-
-def inverse(a) -> Quaternion:
-    """The quaternion of the rotation back."""
-    w, x, y, z = a
-    return w, -x, -y, -z
-
-
-def turned(a, vector) -> Vector:
-    """A vector turned by a quaternion: from the body's axes to the earth's, if that is the attitude."""
-    w, *axis = a
-    b = cross(axis, vector)
-    x, y, z = (v + 2 * (w * c + d) for v, c, d in zip(vector, b, cross(axis, b), strict=True))
-    return x, y, z
-
-
-def cross(a, b) -> Vector:
-    """The cross product."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def deviation(a, b) -> Vector:
-    """Twice the vector part of the rotation from attitude `a` to `b`, in the axes of `a`: [rad] if it is small."""
-    w, *vector = product(inverse(a), b)
-    x, y, z = (2 * x * (1 - 2 * (w < 0)) for x in vector)
-    return x, y, z
-
-
 def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
@@ -138,11 +99,11 @@ def _fly_future(
 
         @jax.jit  # traced once for the four stages of a step
         def derivative(motion: Motion) -> Motion:
-            row = forcing._replace(velocity=turned(inverse(motion.attitude), motion.velocity))
+            row = forcing._replace(velocity=rotated(conjugate(motion.attitude), motion.velocity))
             accelerations = _sum(model.angular_acceleration(motion.rates, row, scalars), turning)
             force = _sum(model.specific_force(row.thrust, row, scalars), pushing)
-            x, y, z = turned(motion.attitude, force)
-            spin = product(motion.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in motion.rates)))
+            x, y, z = rotated(motion.attitude, force)
+            spin = quaternion_product(motion.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in motion.rates)))
             return Motion(motion.velocity, (x, y, z - model.airframe.gravity), spin, Rates(*accelerations))
 
         moved = runge_kutta(derivative, motion, dt)

@@ -23,11 +23,12 @@ from ..models.flight_model import FlightModel, without_recording
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording.prepared import Prepared, prepare
 from ..result_file import vehicle_result
+from ..rotations import rotated
 from ..shooting import capacity_of, pad_flight
 from ..shooting.gains import Covariance, LogNoise
 from .flight_prediction import FlightPrediction
 from .measured import Measured, constant_rates, regressed
-from .motion import PARTS, PUSH, Futures, fly_chunk, known_at_samples, settled, turned
+from .motion import PARTS, PUSH, Futures, fly_chunk, known_at_samples, settled
 
 DRAWS = 64  # futures of a start for the band
 HALF_BAND = 1.9977  # standard deviations of this many futures from the middle of a 95 % band to its end (Student)
@@ -152,22 +153,7 @@ def predict(
         raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
     vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
     recording = as_recording(flight, airframe=vehicle.model.airframe)
-    prepared = _prepare(vehicle, recording, sample_time)
-    fitted = found.problem if isinstance(found, Identification) else None
-    trained = None if fitted is None else Measured.of(fitted.flight)
-    return _predicted(vehicle, recording.name, prepared, trained, horizon, spacing, seed)
-
-
-def _predicted(
-    vehicle: Vehicle,
-    name: str,
-    prepared: Prepared,
-    trained: Measured | None,
-    horizon: float,
-    spacing: float,
-    seed: int,
-) -> FlightPrediction:
-    """The prediction of a flight of this name. The regression is fitted to `trained`, or to the flight's first half."""
+    name, prepared = recording.name, _prepare(vehicle, recording, sample_time)
     measured, flight = Measured.of(prepared.fitted), _padded(prepared.fitted)
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     for option, value in (("horizon", horizon), ("spacing", spacing)):
@@ -178,8 +164,9 @@ def _predicted(
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
     begin, states, spread = _predict_states(vehicle, flight, measured, start, missing, noise, steps, seed)
-    ahead, trained = start[:, None] + np.arange(1, steps + 1), measured.first_half if trained is None else trained
-    gravity = float(vehicle.model.airframe.gravity)
+    fitted = found.problem if isinstance(found, Identification) else None
+    trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
+    ahead, gravity = start[:, None] + np.arange(1, steps + 1), float(vehicle.model.airframe.gravity)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
     sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(
@@ -262,7 +249,7 @@ def _predict_states(
     state, samples, noise = measured.states.copy(), len(measured.stretch), jax.tree.map(as_float, noise)
     if "velocity" in missing:
         reckoned = np.asarray(flight.body_velocity)[:samples].T
-        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
+        state[:, PARTS["velocity"]] = np.stack(rotated(state[:, PARTS["attitude"]].T, reckoned), 1)
     if "position" in missing:
         state[:, PARTS["position"]] = 0.0
     accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
