@@ -59,11 +59,9 @@ def export(
     else:
         write_file(out, written.text)
         typer.echo(f"{out}: {target.label}")
-    for doubt in found.doubts:
-        typer.echo(options.as_typed(doubt), err=True)
-    for note in written.notes:
-        typer.echo(options.as_typed(f"note: {note}"), err=True)
-    end(found.result)
+    for line in (*found.identification.warnings, *(f"note: {note}" for note in written.notes)):
+        typer.echo(options.as_typed(line), err=True)
+    end(found.identification.result)
 
 
 def _check_folder(folder: Path) -> list[str]:
