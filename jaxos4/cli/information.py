@@ -28,7 +28,7 @@ def inspect(
     with stages("loading the library") as progress:
         from ..recording import read_recording
         from ..recording.inspection import airframe_draft, inspect_log
-        from ..report.terminal import print_inspection
+        from ..report.log_page import print_inspection
 
         progress("reading")
         vehicle = None if airframe is None else jaxos4.load_airframe(airframe)

@@ -1,4 +1,4 @@
-"""Identifications, the contents of logs, and what a flight of an OS4 can identify, as text for a terminal."""
+"""Identifications, and what a flight of an OS4 can identify, as text for a terminal."""
 
 import io
 import math
@@ -6,9 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 
-from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
-from ..flight import SIGNALS, UNITS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities, possible
@@ -23,7 +21,6 @@ from ..identification.verdict import (
     reason_lines,
     statuses_of,
 )
-from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
 from .text import DASH, Listing, plain, say
 
@@ -33,12 +30,6 @@ _SIGNIFICANCE = 0.01
 
 # Of the sentences of the headline, on terminals that have colours.
 _COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
-
-_COMMANDS = "of full scale (commands)"
-_TOGETHER = ["p q r", "phi theta psi", "x y z", "vx vy vz"]
-_TOGETHER += [" ".join(signal.columns) for name, signal in SIGNALS.items() if signal.columns and name != "states"]
-# The unit of channels that are shown together.
-_UNITS = {names: UNITS[names.split()[0]] for names in _TOGETHER} | {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 
 Section = Iterator[str | Listing]
 
@@ -264,55 +255,6 @@ def share(value: float | None) -> str:
     if value is None:
         return DASH
     return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"
-
-
-def unit_of(channel: str, commands: bool) -> str:
-    """The unit of a channel. `commands`: whether rotors have commands."""
-    unit = next(unit for names, unit in _UNITS.items() if channel in names.split())
-    return _COMMANDS if commands and channel.startswith("rotor") else unit
-
-
-def print_inspection(console: Console, found: Inspection, label: str, *, most: int = 14) -> None:
-    """Prints the channels of a log, the findings of its checks, and the `most` longest parts. `label`: its format."""
-    console.print(
-        f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
-        f"one every {1e3 * found.sample_time:.4g} ms",
-        soft_wrap=True,
-    )
-    for refusal in found.refusals:
-        console.print(f"cannot identify a vehicle: {refusal}.", soft_wrap=True)
-    for each in found.findings:
-        verb = "contradicts" if each.contradicted else "concerns"
-        console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
-    for names, unit in _UNITS.items():
-        measured = {name: found.measured[name] for name in names.split() if name in found.measured}
-        if not measured:
-            continue
-        largest = max(abs(end) for channel in measured.values() for end in (channel.least, channel.most))
-        rate = min(channel.rate for channel in measured.values())
-        gap = max(channel.longest_gap for channel in measured.values())
-        gaps = f", at most {1e3 * gap:.3g} ms apart" if gap > 1.5 * found.sample_time else ""
-        commands = "rotor1" in names and 0 < largest <= 1
-        size = f"up to {largest:.3g} {_COMMANDS if commands else unit}"
-        console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
-    for note in found.notes:
-        console.print(f"note: {note}")
-    rows = part_rows(found, most)
-    headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
-    Listing(headings, rows, numbers).print_on(console)
-    if len(found.parts) > len(rows):
-        console.print(f"and {len(found.parts) - len(rows)} shorter parts")
-    console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
-
-
-def part_rows(found: Inspection, most: int) -> list[tuple[str, ...]]:
-    """The cells of the `most` longest parts of a log, in order of time: from, to, use, and the excitation by axis."""
-    rows = []
-    longest = sorted(found.parts, key=lambda part: part.begin - part.end)[:most]
-    for part in sorted(longest, key=lambda part: part.begin):
-        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
-        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
-    return rows
 
 
 def print_information(console: Console, found: FlightInformation) -> None:
