@@ -15,7 +15,7 @@ class Correlations(Arrays, frozen=True, eq=False):
 
     - `own`: at 1, 2, ... samples apart.
     - `with_torque`: at lags from -`lags` to `lags`; at a positive lag, the residual is the later one. A controller
-      answers residuals, so a vehicle has correlations at negative lags.
+      responds to residuals, so a vehicle has correlations at negative lags.
     - `bound`: larger than 95 % of `own` if residuals are white. `torque_bound`: larger than 95 % of `with_torque` if no
       torque causes the residuals, white or coloured.
     """
