@@ -115,7 +115,8 @@ def test_the_csv_has_every_number(study):
 
 
 def units_of(table):
-    return dict(heading[:-1].split(" [") for heading in table.headings[1:])
+    _, headings, *_ = table
+    return dict(heading[:-1].split(" [") for heading in headings[1:])
 
 
 def test_the_unit_in_a_head_is_that_of_the_cells_below_it():

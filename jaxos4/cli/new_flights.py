@@ -149,12 +149,10 @@ def design(
         found = _find(asked, progress)
         progress("writing")
         found.task.write(found.designed, out)
-    from ..report.design import print_design, write_design
-
     if figure is not None:
         with stages("drawing"):
-            write_design(found, asked["accuracy"] / 100, figure)
-    print_design(console(), found, asked["accuracy"] / 100)
+            jaxos4.report.write_design_figure(figure, found, asked["accuracy"] / 100)
+    jaxos4.report.print_design(console(), found, asked["accuracy"] / 100)
     samples = f"{found.designed.inputs.shape[0]} samples of {asked['dt']:g} s"
     kind, seconds = found.task.kind if closed_loop else f"{asked['model']} model", time.perf_counter() - begin
     typer.echo(f"{out}: {samples}, {kind}, criterion {found.task.criterion}, {seconds:.0f} s")

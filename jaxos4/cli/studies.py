@@ -32,22 +32,20 @@ def study(
     if dry_run:
         _print_plan(wanted, out)
         return
-    from ..report.study_tables import count_outcomes
-
     if scheduler is None:
         dataset = run_with_bar(wanted, out)
     else:
         with _connected(scheduler) as client:
             run = partial(jaxos4.study.run_on_cluster, client=client)
             dataset = run_with_bar(wanted, out, device="Dask cluster", run=run)
-    typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
+    typer.echo(f"{out}: {jaxos4.report.count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
 
 
 def run_with_bar(wanted: "jaxos4.study.Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
-    """The Dataset of `jaxos4.study.carry_out`, with a progress bar. `device`: by default those of this process."""
+    """The Dataset of `jaxos4.study.run_study`, with a progress bar. `device`: by default those of this process."""
     try:
         with stages("compiling", wanted.count) as progress:
-            return jaxos4.study.carry_out(wanted, out, device or jaxos4.study.device_name(), progress=progress, **how)
+            return jaxos4.study.run_study(wanted, out, device or jaxos4.study.device_name(), progress=progress, **how)
     except KeyboardInterrupt:
         typer.echo(f"jaxos4: {out}: interrupted; run the same command again to continue.", err=True)
         raise
@@ -160,7 +158,6 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
     add_flags(brief=quick)
     with stages("loading the library"):
-        from ..report.study_tables import count_outcomes
         from ..report.text import print_whole
 
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
@@ -168,7 +165,7 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     with stages("drawing"):
         page, *_ = jaxos4.report.write_report(dataset, directory)
     print_whole(console(), jaxos4.report.error_table(dataset))
-    typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
+    typer.echo(f"{jaxos4.report.count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")
 
 

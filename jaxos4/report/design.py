@@ -1,7 +1,7 @@
 """A design of a flight beside the standard inputs: the table that `jaxos4 design` prints, and its figure."""
 
 import math
-from pathlib import Path
+import os
 
 import numpy as np
 from rich.console import Console
@@ -33,7 +33,7 @@ _WORDS = {
 
 
 def print_design(console: Console, found: Design, accuracy: float) -> None:
-    """Print the table, the gain, the use of limits, and how long to fly for an `accuracy`, as a share of each scale."""
+    """Prints the table, the gain, the use of limits, and how long to fly for an `accuracy`: a share of each scale."""
     task, rows = found.task, []
     unexcited, targets, compared, _ = _WORDS[task.kind]
     every = {"designed": found.designed, **found.standard}
@@ -66,10 +66,10 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
     console.print(f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}.")
 
 
-def write_design(found: Design, accuracy: float, out: Path) -> None:
-    """Write the figure as SVG: above what to fly, below the bound of each target against the time of flight.
+def write_design_figure(path: str | os.PathLike[str], found: Design, accuracy: float) -> None:
+    """Writes the figure as SVG: above what to fly, below the bound of each target against the time of flight.
 
-    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds).
+    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds). Raises `OSError`.
     """
     task, designed, in_percent = found.task, found.designed, found.task.kind == "references"
     every, panels = {"designed": designed, **found.standard}, []
@@ -94,7 +94,7 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
             marks.append(Line(seconds, bound, *_look(looks[kind]), name=kind))
         title = f"{name}: bound [{'%' if in_percent else unit}]"
         panels.append(Panel(title, marks, x, Scale("log"), _WIDTH, _HEIGHT))
-    write_file(out, as_file(Figure("design", panels, columns=4)))
+    write_file(path, as_file(Figure("design", panels, columns=4)))
 
 
 def _look(look: Style) -> tuple[str, float, Dash]:

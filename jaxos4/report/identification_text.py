@@ -41,13 +41,15 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
     parameters.
     """
     notes = [f"note: {note}" for note in notes_of(found)]
-    parts = [*warning_lines(found), *notes]
+    parts: list[str | Listing] = [*warning_lines(found), *notes]
     if not found.has_answer:
         parts = [*notes, *_failure(found)]
     elif isinstance(found, OS4Identification):
         parts += [*_parameters(found), *_fit(found), *_inertias(found), *_validation(found)]
     elif isinstance(found, VehicleIdentification):
-        parts = [*_quantities(found), *parts]
+        if rows := quantity_rows(physical_quantities(found)):
+            headings = ("quantity", "estimate", "95 % interval", "unit", "note")
+            parts.insert(0, Listing(headings, rows, ("estimate",)))
         parts += [*_parameters(found), *_held(found), *_inertias(found), *_of_vehicle(found)] if verbose else []
     if found.has_answer:
         parts += [_summary(found), *next_lines(found)]
@@ -76,11 +78,6 @@ def quantity_rows(quantities: Sequence[PhysicalQuantity]) -> list[tuple[str, ...
         unit = "" if each.unit == "1" else each.unit
         rows.append((each.name, f"{each.value:.4g}", " to ".join(f"{end:.4g}" for end in each.ci95), unit, note))
     return rows
-
-
-def _quantities(found: Identification) -> Section:
-    if rows := quantity_rows(physical_quantities(found)):
-        yield Listing(("quantity", "estimate", "95 % interval", "unit", "note"), rows, ("estimate",))
 
 
 def warning_lines(found: Identification) -> list[str]:

@@ -34,24 +34,21 @@ def is_share(recording: Recording) -> bool:
 
 def logged(recording: Recording, found: Inspection) -> tuple[str, int]:
     """All signals of a log for the time axis, grey where it is not usable, and the `thinned` samples of a block."""
-    panels, width = [], 0
     motor = ("command" if is_share(recording) else "motor [rad/s]", recording.omega, tuple("1234"))
     groups = [(title, _sensed(recording, which), names) for title, which, names in _SIGNALS]
     groups = [groups[0], motor, *groups[1:]]
     if recording.voltage is not None:
         groups.append(("battery [V]", recording.voltage[:, None], ("battery",)))
-    groups = [group for group in groups if np.isfinite(group[1]).any()]
-    every = [
-        timeline.thinned(recording.time, bridged(recording.time, column)[:, None], _SAMPLES)
-        for _, measured, _ in groups
-        for column in measured.T
-    ]
-    time, _, block = every[0]
-    values = np.hstack([fewer for _, fewer, _ in every])
-    for title, _, names in groups:
-        columns = ((name, values[:, width + i], style(i)) for i, name in enumerate(names))
-        panels.append(timeline.panel(title, [timeline.line(*each) for each in columns if np.isfinite(each[1]).any()]))
-        width += len(names)
+    panels, time, block = [], recording.time, 1
+    for title, measured, names in groups:
+        lines = []
+        for i, (name, column) in enumerate(zip(names, measured.T, strict=True)):
+            if np.isfinite(column).any():
+                values = bridged(recording.time, column)[:, None]
+                time, values, block = timeline.thinned(recording.time, values, _SAMPLES)
+                lines.append(timeline.line(name, values[:, 0], style(i)))
+        if lines:
+            panels.append(timeline.panel(title, lines))
     axis = timeline.Axis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
     begin = recording.time[0]
     shaded = [(part.begin - begin, part.end - begin) for part in found.stretches if not part.usable]

@@ -1,5 +1,6 @@
 """The contents of a log, before anything is fitted: the text and the page of `jaxos4 inspect`."""
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -94,37 +95,22 @@ def write_log_page(
     given = isinstance(log, Recording | Flight)
     recording = as_recording(log) if given else read_recording(log, airframe, full_scale=1.0)
     found = inspect_log(recording, airframe) if found is None else found
-    full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     plausible = Evidence(recording, airframe).plausible.recording
     flown = [cut(plausible, Stretch(part.begin, part.end)) for part in found.stretches if part.usable]
-    band = None
-    if flown and not is_share(recording):
-        speeds, rare = np.concatenate([each.omega for each in flown]), (1 - _USUAL) / 2
-        low, high = np.quantile(speeds, [rare, 1 - rare]) / (2 * np.pi)
-        band = float(low), float(high)
-    shown, block = logged(recording, found)
+    full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     label = recording.facts.format.label if recording.facts.format else "recording"
     sampled = f"{found.samples} samples, one every {plain(1e3 * found.sample_time)} ms"
     top = [
         text(verdict(found), f"verdict{' warning' if found.refusals else ''}"),
         text([f"Cannot identify a vehicle: {line}." for line in found.refusals]),
     ]
-    caption = (
-        "Horizontal: time [s]. Grey: not usable, for the reason in the table of parts. The options above the figure "
-        "name the part that is in sight, for jaxos4 estimate."
-    )
-    if block > 1:
-        blocks = f"{plain(1e3 * recording.dt * block)} ms"
-        caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
-    seen = signals(shown, caption, names_part=True)
-    commands = recording.commanded and full == 1
     sections = [
-        Section("signals", "Logged signals", [seen, text(fitted(recording, airframe), id="fitted")], "Signals"),
+        Section("signals", "Logged signals", _signals(recording, airframe, found), "Signals"),
         Section("checks", "Failed checks", _checks(found), "Checks"),
         Section("parts", "Parts that can be used", [_parts(found)], "Parts"),
-        Section("measured", "Sampling, gaps and ranges", [_measured(found, commands)], "Measured"),
+        Section("measured", "Sampling, gaps and ranges", [_measured(found, is_share(recording))], "Measured"),
         Section("motors", "Motors and their limits", _motors(flown, full), "Motors"),
-        Section("spectra", "Vibration", _spectra(flown, band), "Spectra"),
+        Section("spectra", "Vibration", _spectra(flown, full), "Spectra"),
     ]
     write_page(
         path,
@@ -137,6 +123,18 @@ def write_log_page(
         provenance=[("log", recording.name)],
         has_signals=True,
     )
+
+
+def _signals(recording: Recording, airframe: Airframe | None, found: Inspection) -> list[Markup]:
+    drawn, block = logged(recording, found)
+    caption = (
+        "Horizontal: time [s]. Grey: not usable, for the reason in the table of parts. The options above the figure "
+        "name the part that is in sight, for jaxos4 estimate."
+    )
+    if block > 1:
+        blocks = f"{plain(1e3 * recording.dt * block)} ms"
+        caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
+    return [signals(drawn, caption, names_part=True), text(fitted(recording, airframe), id="fitted")]
 
 
 def _checks(found: Inspection) -> list[Markup]:
@@ -181,12 +179,17 @@ def _motors(flown: Sequence[Recording], full: float) -> list[Markup]:
     return [picture(motors(flown, full), caption)]
 
 
-def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> list[Markup]:
-    if not flown or (figure := spectra(flown, band)) is None:
+def _spectra(flown: Sequence[Recording], full: float) -> list[Markup]:
+    if not flown:
         return []
-    turns = (
-        f" The rotors turn {band[0]:.0f} to {band[1]:.0f} Hz; their blades pass twice as often or more." if band else ""
-    )
+    band, turns = None, ""
+    if full != 1:
+        speeds, rare = np.concatenate([each.omega for each in flown]), (1 - _USUAL) / 2
+        low, high = np.quantile(speeds, [rare, 1 - rare]).tolist()
+        band = low / (2 * math.pi), high / (2 * math.pi)
+        turns = f" The rotors turn {band[0]:.0f} to {band[1]:.0f} Hz; their blades pass twice as often or more."
+    if (figure := spectra(flown, band)) is None:
+        return []
     caption = (
         f"Amplitude spectral density in the usable parts.{turns} Motion of a vehicle lies below about 20 Hz. A peak "
         "above is vibration; vibration above half the sampling rate folds down into the motion, and no setting removes "

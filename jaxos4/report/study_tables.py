@@ -5,7 +5,6 @@ import io
 import itertools
 import json
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -29,15 +28,8 @@ _PHRASES = {
 _MARKS = ("", "†", "‡")
 _MOST_LISTED = 20
 Rows = list[str | tuple[str, ...]]
-
-
-class Table(NamedTuple):
-    """A table of the page, see `page.table`."""
-
-    caption: str
-    headings: Sequence[str]
-    rows: Sequence[str | Sequence[str]]
-    notes: Sequence[str] = ()
+Table = tuple[str, Sequence[str], Rows, list[str]]
+"""The caption, the headings, the rows and the notes of a table; see `page.table`."""
 
 
 def scenarios(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
@@ -95,7 +87,7 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     def table(name: str, measure: str, found: xr.Dataset, headings: list[str], caption: str) -> Table:
         source = f"From estimate, truth, {'bound' if name == 'efficiency' else 'half_width'}, result (metrics.{name})."
         rows = _by_estimator(data, lambda at: _with_intervals(found.isel(at), measure))
-        return Table(caption, ("estimator", *headings), rows, [source])
+        return caption, ("estimator", *headings), rows, [source]
 
     ratio = "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do"
     held = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
@@ -144,7 +136,7 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         headings.append(f"{name} [{'%' if not any(marked) else unit if all(marked) else f'%; marked: {unit}'}]")
     caption = "RMS error [% of the truth; where marked, in the parameter's unit]"
     source = "From estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)."
-    return Table(caption, headings, rows, [*notes, source])
+    return caption, headings, rows, [*notes, source]
 
 
 def _result_table(data: xr.Dataset) -> Table:
@@ -160,7 +152,7 @@ def _result_table(data: xr.Dataset) -> Table:
     caption = "Flights by result, mean rollouts, and the hybrid's seed brackets that contain the truth [%]"
     source = "From result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)."
     headings = ("estimator", *headings, "rollouts", "seed hits")
-    return Table(caption, headings, _by_estimator(data, cells), [source])
+    return caption, headings, _by_estimator(data, cells), [source]
 
 
 def _estimate_table(data: xr.Dataset) -> Table:
@@ -182,7 +174,7 @@ def _estimate_table(data: xr.Dataset) -> Table:
                 rows.append((estimator, plain(value, 4), ends, plain(bound, 4), plain(ratio, 2)))
     headings = ("estimator", "estimate", "interval", "bound", "error / bound")
     caption = f"Each estimate with its interval of {100 * level:g} %, and the truth"
-    return Table(caption, headings, rows, ["From estimate, truth, half_width, bound, result."])
+    return caption, headings, rows, ["From estimate, truth, half_width, bound, result."]
 
 
 def ended(data: xr.Dataset) -> list[str]:
@@ -304,12 +296,12 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
     parts: list[RenderableType] = []
     notes: dict[str, None] = {}
     for label, data in scenarios(dataset):
-        table, rows = _error_table(data, digits=2), []
-        headings = [heading.partition(" [")[0] for heading in table.headings[1:]]
+        (_, headings, cells, explained), rows = _error_table(data, digits=2), []
+        headings = [heading.partition(" [")[0] for heading in headings[1:]]
         blank = [""] * len(headings)
-        for row in table.rows:
+        for row in cells:
             rows += [["", *blank]] * bool(rows) + [[row, *blank]] if isinstance(row, str) else [row]
         listing = Listing(["", *headings], rows, headings, apart=1)  # 80 columns must do
         parts += [Text(f"RMS error [%], {label}"), listing.table()]
-        notes |= dict.fromkeys(table.notes[:-1])  # the last one says how the page's numbers are computed
+        notes |= dict.fromkeys(explained[:-1])  # the last one says how the page's numbers are computed
     return Group(*parts, *(Text(note) for note in notes))

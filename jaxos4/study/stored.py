@@ -1,4 +1,4 @@
-"""The door of a study's Dataset: what `results.nc` must hold for a report, checked before anything is drawn."""
+"""Reads the Dataset of a study, and checks that `results.nc` holds what a report needs."""
 
 import json
 import os
