@@ -1,7 +1,5 @@
 """Which parameters a flight can identify, and for each of the others the reason why not."""
 
-from typing import ClassVar
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,6 +10,7 @@ from ..results import NINETY_FIVE
 from .evaluation import Evaluation, evaluate, inverse
 
 PerParameter = Float[np.ndarray, " parameters"]
+_PARTNER = 0.2  # a parameter with this share of a weakly determined direction is named as a partner
 
 
 class Identifiability(eqx.Module):
@@ -24,10 +23,7 @@ class Identifiability(eqx.Module):
     - `eigenvalues`: of the information in units of half-widths, in increasing order. Below 1 the flight contains less
       information about that direction than the bracket.
     - `directions`: the eigenvectors in half-widths, one in each column.
-    - `partner`: the smallest share of a weakly determined direction with which a parameter is named as a partner.
     """
-
-    partner: ClassVar[float] = 0.2
 
     nominal: PerParameter
     half_width: PerParameter
@@ -63,7 +59,7 @@ class Identifiability(eqx.Module):
                 vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
                 weakest = np.abs(vectors[:, np.argmax(np.abs(vectors[i]))])
                 share = weakest / weakest.max()  # that changes together with least effect on the flight
-                partners = np.flatnonzero((share > self.partner) & (np.arange(share.size) != i)).tolist()
+                partners = np.flatnonzero((share > _PARTNER) & (np.arange(share.size) != i)).tolist()
                 partners = partners or [int(np.argsort(share)[-2])]
                 return f"not identifiable: only together with {', '.join(names[j] for j in partners)}"
             if self.noise_limit[i] < 1 and self.nominal[i] != 0:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float
 from ..airframe import INERTIAS
@@ -102,7 +102,7 @@ class ReferenceTask(task.AbstractTask):
       each reference. Both are about the inertias first.
     - `signals`: the angles and rates of an axis by a unit of the coefficients of its reference, cosines first, as a
       share of the part of the limit that gusts leave; by the name of the limit.
-    - `largest`: the largest value of each reference. `basis`: the tones at the points of a period.
+    - `largest`: the largest value of each reference.
     """
 
     kind: ClassVar[str] = "references"
@@ -120,7 +120,6 @@ class ReferenceTask(task.AbstractTask):
     added: Float[Numeric, "references tones unknowns unknowns"]
     signals: dict[str, Float[Numeric, "axes points coefficients"]]
     largest: Float[Numeric, "4"]
-    basis: Float[Array, "points coefficients"]
     tones: Tones = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
@@ -142,7 +141,7 @@ class ReferenceTask(task.AbstractTask):
         """See `AbstractTask`."""
         each = coefficients.reshape(4, -1)
         moved = {name: jnp.einsum("apk,ak->pa", some, each[:3]) for name, some in self.signals.items()}
-        return moved | {"reference": self.basis @ each.T}
+        return moved | {"reference": as_float(_parts(self.tones.turns(_POINTS))) @ each.T}
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`. The references have their largest values, or are reduced to a share of them."""
@@ -230,7 +229,6 @@ def design_references(
         unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
         largest=largest,
-        basis=as_float(_parts(tones.turns(_POINTS))),
         tones=tones,
         samples=samples,
         criterion=criterion,

@@ -42,12 +42,12 @@ class Known(NamedTuple):
 
     - `state`: as measured, as in `PARTS`.
     - `filters`: rates and unexplained specific forces [rad/s; m/s^2], and what drives these [rad/s^2; m/s^2].
-    - `unsure`: the standard deviation of each offset, see `Futures`.
+    - `offset_std`: the standard deviation of each offset, see `Futures`.
     """
 
     state: Float[Numeric, "... 13"]
     filters: Filtered
-    unsure: Float[Numeric, "... 6"]
+    offset_std: Float[Numeric, "... 6"]
 
 
 class Futures(NamedTuple):
@@ -84,7 +84,7 @@ def _fly_future(
     steps = future.gusts.driven.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    error, absorbed = start.unsure * future.off
+    error, absorbed = start.offset_std * future.off
     measured = Filtered(jnp.zeros(noise.strength.size).at[:3].set(w), jnp.zeros(noise.strength.size))
     known = jax.tree.map(lambda x, y, e: jnp.where(future.filtered, x, y) + e, start.filters, measured, future.errors)
     known = known._replace(disturbance=known.disturbance.at[:3].add(absorbed[:3]))
@@ -167,7 +167,7 @@ def known_at_samples(
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
     kept = jnp.exp(-flight.dt / MEMORY)
     sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), velocity_noise])
-    weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt)
+    weight, offset_std = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt)
 
     def of_future(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
@@ -186,7 +186,7 @@ def known_at_samples(
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     seen = jnp.concatenate([rates, force], axis=1)
     filters, _ = filtered(noise, seen, modelled, flight.stretch_numbers, flight.dt)
-    return Known(state, filters, unsure), forcing, offset
+    return Known(state, filters, offset_std), forcing, offset
 
 
 def _offset_weights(

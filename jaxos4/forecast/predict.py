@@ -68,9 +68,9 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     name = f"{file.estimator}, {file.model} model" if given else printable(Path(found).name)
     with named("" if given else found):
         used = file.provenance
-        if strangers := [term for term in used.terms or () if term not in TERMS]:
+        if unknown := [term for term in used.terms or () if term not in TERMS]:
             raise InputError(
-                f"the term {shortened(strangers[0], 40)} is not of this version; run `jaxos4 estimate` again."
+                f"the term {shortened(unknown[0], 40)} is not of this version; run `jaxos4 estimate` again."
             )
         model = FlightModel(file.airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
         known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
@@ -154,7 +154,11 @@ def predict(
     vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
     recording = as_recording(flight, airframe=vehicle.model.airframe)
     name, prepared = recording.name, _prepare(vehicle, recording, sample_time)
-    measured, flight = Measured.of(prepared.fitted), _padded(prepared.fitted)
+    measured, padded = Measured.of(prepared.fitted), prepared.fitted
+    if padded.body_velocity is None:  # the model's forcing has one
+        padded = dataclasses.replace(padded, body_velocity=np.zeros((padded.time.size, 3)))
+    if (capacity := capacity_of(padded.time.size)) != padded.time.size:
+        padded = pad_flight(padded, capacity)
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     for option, value in (("horizon", horizon), ("spacing", spacing)):
         if 0 < value < dt / 2:
@@ -163,7 +167,7 @@ def predict(
     start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    begin, states, spread = _predict_states(vehicle, flight, measured, start, missing, noise, steps, seed)
+    begin, states, spread = _predict_states(vehicle, padded, measured, start, missing, noise, steps, seed)
     fitted = found.problem if isinstance(found, Identification) else None
     trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
     ahead, gravity = start[:, None] + np.arange(1, steps + 1), float(vehicle.model.airframe.gravity)
@@ -200,14 +204,6 @@ def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) 
         if lacking := (TERMS[term].needs & _INPUTS) - prepared.available:
             raise InputError(f"{name}: has no {' and '.join(sorted(lacking))}, which the term {term} needs; log it.")
     return prepared
-
-
-def _padded(flight: Flight) -> Flight:
-    """The flight with the velocity that the model's forcing has, with room for more samples."""
-    if flight.body_velocity is None:
-        flight = dataclasses.replace(flight, body_velocity=np.zeros((flight.time.size, 3)))
-    capacity = capacity_of(flight.time.size)
-    return flight if capacity == flight.time.size else pad_flight(flight, capacity)
 
 
 def _starts(
@@ -264,8 +260,8 @@ def _predict_states(
     gusts = _pairs(added, generator.standard_normal((DRAWS, steps, channels, 2)))
     off = generator.standard_normal((DRAWS, 6))
     drawn = errors, np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
-    surely = jax.tree.map(lambda x: as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])), drawn)
-    futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
+    certain = jax.tree.map(lambda x: as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])), drawn)
+    futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *certain)
 
     chunks = (np.minimum(np.arange(i, i + CHUNK), start.size - 1) for i in range(0, start.size, CHUNK))
     found = [fly_chunk(vehicle.model, futures, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]
