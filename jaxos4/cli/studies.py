@@ -85,30 +85,29 @@ def report(
         raise InputError(
             f"{source}: is not there; give the folder of a `jaxos4 study`, or a file of `jaxos4 estimate --out`."
         )
-    if not source.is_dir() and csv is not None:
-        raise InputError(
-            f"--csv: {source} is a result; `found.to_dataframe()` in Python makes its table. Leave it out."
-        )
-    if not source.is_dir():
-        if pdf:
-            raise InputError(f"--pdf: {source} is a result, which has a page alone; leave it out.")
-        out = source.with_suffix(".html") if out is None else out
-        check_outputs(source, out=out)
-    elif out is not None:
-        raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
-    with stages("loading the library") as progress:
-        progress("reading")
-        if out is None:
+    if source.is_dir():
+        if out is not None:
+            raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
+        with stages("loading the library") as progress:
+            progress("reading")
             dataset = jaxos4.study.read_results(source)
             progress("drawing")
             if csv is not None:
                 check_outputs(source / "results.nc", csv=csv)
                 write_file(csv, jaxos4.report.error_csv(dataset))
             page, *figures = jaxos4.report.write_report(dataset, source, pdf=pdf)
-        else:
+    else:
+        if csv is not None:
+            table = "`found.to_dataframe()` in Python makes its table"
+            raise InputError(f"--csv: {source} is a result; {table}. Leave it out.")
+        if pdf:
+            raise InputError(f"--pdf: {source} is a result, which has a page alone; leave it out.")
+        page, figures = source.with_suffix(".html") if out is None else out, []
+        check_outputs(source, out=page)
+        with stages("loading the library") as progress:
+            progress("reading")
             found = jaxos4.read_result(source)
             progress("drawing")
-            page, figures = out, []
             jaxos4.report.write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:

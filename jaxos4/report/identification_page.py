@@ -70,7 +70,6 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
             for name, x in msgspec.to_builtins(used).items()
             if name not in _ELSEWHERE
         ],
-        has_signals=bool(drawn),
     )
 
 

@@ -92,7 +92,7 @@ def warning_lines(found: Identification) -> list[str]:
 
 
 def notes_of(found: Identification) -> list[str]:
-    """What was changed and noticed, and the clock of the motors if it is not the gyro's."""
+    """The notes on the data, and the clock of the motors if it is not the gyro's."""
     return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
 
 
@@ -159,10 +159,10 @@ def _fit(found: OS4Identification) -> Section:
     tests = {"free of the inputs (cross-correlation)": {name: row.input_p for name, row in found.fit.items()}}
     if found.provenance.windows == 1:  # the free initial states of windows mislead the test
         tests = {"white (Ljung-Box)": {name: row.white_p for name, row in found.fit.items()}} | tests
-    for property_, p_values in tests.items() if found.fit else ():
+    for claim, p_values in tests.items() if found.fit else ():
         failed = [name for name, p_value in p_values.items() if p_value * len(p_values) < _SIGNIFICANCE]
-        answer = f"not those of {', '.join(failed)}" if failed else "all"
-        yield f"residuals {property_}, tests at {100 * _SIGNIFICANCE:.0f} %: {answer}."
+        passed = f"not those of {', '.join(failed)}" if failed else "all"
+        yield f"residuals {claim}, tests at {100 * _SIGNIFICANCE:.0f} %: {passed}."
 
 
 def why_no_value(row: Constant) -> str:
@@ -243,7 +243,7 @@ def _summary(found: Identification) -> str:
 
 
 def next_lines(found: Identification) -> list[str]:
-    """What to fly next, if anything was judged."""
+    """Advice on the next flight, if anything was judged."""
     return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
 
 

@@ -87,7 +87,7 @@ def write_log_page(
     """Writes the page of a log, completely or not at all.
 
     - `log`: a recording, or the path of a log. `airframe`: of its vehicle; without it, torques are unknown.
-    - `found`: of `inspect_log`, if it was computed before. `command`: that makes the page again.
+    - `found`: the inspection, if it was made before. `command`: the one that makes the page again.
 
     **Raises:** `OSError` if the page cannot be written; `InputError` if the log cannot be read.
     """
@@ -121,7 +121,6 @@ def write_log_page(
         command=command,
         end=[text(found.notes)],
         provenance=[("log", recording.name)],
-        has_signals=True,
     )
 
 

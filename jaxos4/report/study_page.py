@@ -48,7 +48,7 @@ def write_report(dataset: xr.Dataset, directory: Path, *, pdf: bool = False) -> 
     folder.mkdir(exist_ok=True)
     if specification:
         write_file(directory / _SPECIFICATION, specification)
-    for figure in () if pdf else drawn:  # those of another run would not be of these figures
+    for figure in () if pdf else drawn:  # from an earlier run: other figures
         (folder / f"{figure.stem}.pdf").unlink(missing_ok=True)
     for path, content in files.items():
         write_file(path, content)

@@ -105,8 +105,8 @@ def view(
 ) -> dict[str, Any]:
     """Panels of the same samples, packed.
 
-    - `time`: of each sample on the axis [s], see `Axis.place`.
-    - `start`: of a prediction from many starts, the number of that of each sample. Those from a chosen one are drawn.
+    - `time`: the place of each sample on the axis [s], see `Axis.place`.
+    - `start`: for predictions from many starts, the number of each sample's start. One start is drawn at a time.
     """
     kept = np.isfinite(time)
     order = np.flatnonzero(kept)[np.argsort(time[kept], kind="stable")]
