@@ -60,10 +60,10 @@ class AxisResponse(Arrays, frozen=True, eq=False):
 
     - `frequency`: [Hz].
     - `gain`: measured over modelled angular acceleration.
-    - `phase`: of the measured before the modelled one [rad]. A measured response that comes late has a negative phase.
+    - `phase`: lead of the measured over the modelled acceleration [rad]: negative if the vehicle responds late.
     - `coherence`: the power of the modelled acceleration, as a share of itself and the disturbance's, 0 to 1. It does
       not depend on the gain.
-    - `covariance`: of the gain's logarithm at each pair of frequencies.
+    - `covariance`: covariance of the gain's logarithm between frequencies.
     - `averages`: how many seconds were compared, over the inverse of the resolution in frequency.
     """
 
@@ -93,7 +93,7 @@ class AxisResponse(Arrays, frozen=True, eq=False):
 
     @property
     def error(self) -> Float[np.ndarray, " frequencies"]:
-        """Standard deviation of the gain's logarithm, and about that of the phase [rad]."""
+        """Standard deviation of the gain's logarithm, and approximately of the phase [rad]."""
         return np.sqrt(np.diagonal(self.covariance))
 
     @property

@@ -17,10 +17,10 @@ class Identifiability(eqx.Module):
     """The information that a flight contains about each parameter, compared with its bracket.
 
     - `nominal`: the value of each parameter that the airframe implies.
-    - `half_width`: of the bracket.
+    - `half_width`: half-widths of the bracket.
     - `std`: the Cramer-Rao bound, as standard deviations in the units of the parameters.
     - `std_alone`: the Cramer-Rao bound if all other parameters were known.
-    - `eigenvalues`: of the information in units of half-widths, in increasing order. Below 1 the flight contains less
+    - `eigenvalues`: of the information in half-widths, in increasing order. Below 1 the flight contains less
       information about that direction than the bracket.
     - `directions`: the eigenvectors in half-widths, one in each column.
     """

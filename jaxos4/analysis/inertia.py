@@ -28,7 +28,7 @@ class InertiaFit(eqx.Module):
     """The rigid body that explains eight alphas best; or one for each row of a batch.
 
     - `constants`: Ix, Iy, Iz, J_R [kg m^2].
-    - `covariance`: of the constants.
+    - `covariance`: covariance of the constants.
     - `mismatch`: (alpha - alpha(constants))^T C^-1 (alpha - alpha(constants)). If the alphas are those of a rigid body,
       it is chi-squared distributed with four degrees of freedom.
     - `p_value`: the probability that the alphas of a rigid body have this mismatch or a larger one.
