@@ -24,7 +24,7 @@ def command() -> str:
 
 
 def console() -> Any:
-    """Where texts of the library are printed, with the options of this command in them."""
+    """A console that prints texts of the library with the options of this command in them."""
     from rich.console import Console
 
     class Shown(Console):

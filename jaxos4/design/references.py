@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..flight import ANGLES, RATES
 from . import task
 from .envelope import Envelope, Uses
-from .fleet import LANES, Fleet, batch_of, fly_batch, model_of
+from .fleet import LANES, Fleet, batch_of, fly_batch, inertias_first, model_of
 from .task import Coefficients, Designed, Flown
 
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
@@ -156,7 +156,7 @@ class ReferenceTask(task.AbstractTask):
             for name, share in uses.items():
                 if still[name] >= 1:
                     raise _too_gusty(name)
-                if share > 1:  # the share beyond that of gusts grows about linearly with the references
+                if share > 1:  # the share that gusts do not use grows about linearly with the references
                     steps.append((_TARGET - still[name]) / (share - still[name]))
             factor *= max(min(steps), _LEAST_STEP)
             uses = self.fleet.uses(factor * inputs, self.envelope)
@@ -222,8 +222,8 @@ def design_references(
     tones = Tones.up_to(bandwidth, samples, dt)
     progress("flying tones")
     references = ReferenceTask(
-        names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
-        units=fleet.inertias_first(("kg m^2",) * len(INERTIAS), fleet.model.parameter_units),
+        names=inertias_first(INERTIAS, fleet.model.parameter_names),
+        units=inertias_first(("kg m^2",) * len(INERTIAS), fleet.model.parameter_units),
         envelope=envelope,
         scale=np.asarray(loop.airframe.inertia),
         unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),

@@ -69,8 +69,9 @@ class Measured(NamedTuple):
         Sensors contradict each other by noise of any colour, or by shifted clocks; the accelerometer's mean error does
         not count.
 
-        **Returns:** the standard deviation after each step, without what the white noise of gyro and accelerometer
-        causes, and at least that of the start and the end; that alone for fewer than `fewest` starts.
+        **Returns:** the standard deviation after each step, less the part that the white noise of gyro and
+        accelerometer causes. It is at least the noise of start and end together, and equal to it for fewer than
+        `fewest` starts.
         """
         rows, dt, down = start[:, None] + np.arange(steps + 1), self.dt, np.array([0.0, 0.0, gravity])
         begin, rates = self.states[start], self.states[rows[:, 1:], 10:]

@@ -53,13 +53,13 @@ class Known(NamedTuple):
 class Futures(NamedTuple):
     """Several futures of each start.
 
-    - `parameters`: of the model. `forcing`: of these parameters, one row for each sample.
-    - `offset`: what p', q', r' [rad/s^2] and the specific force [m/s^2] have in this recording besides the model, from
+    - `parameters`: of the model. `forcing`: with these parameters, one row for each sample.
+    - `offset`: p', q', r' [rad/s^2] and specific force [m/s^2] that the model lacks in this recording, estimated from
       the past of each sample.
     - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
-    - `errors`: of the filters at the start.
+    - `errors`: errors of the filters at the start.
     - `off`: errors of the offsets, and what they make of the disturbances at the start, in standard deviations.
-    - `gusts`: what each channel gains in each step besides the model.
+    - `gusts`: random increments of each channel in each step.
     """
 
     parameters: Float[Array, "futures parameters"]
@@ -156,11 +156,11 @@ def known_at_samples(
 ) -> tuple[Known, Forcing, Float[Array, "futures samples 6"]]:
     """The knowledge at each sample, by the first row of `parameters`; forcing and offsets of each row: see `Futures`.
 
-    The velocity is left out of the forcing: it will be that of the prediction.
+    The forcing has no velocity: a prediction has its own.
 
     - `length`: the samples of the flight that are no padding.
     - `measured`: states, accelerations and the white noise of velocity: see `jaxos4.forecast.measured.Measured`.
-    - `noise`: of the filters. `prior`: the standard deviation of each offset before the flight.
+    - `noise`: levels of the filters. `prior`: the standard deviation of each offset before the flight.
     """
     state, accelerations, velocity_noise = measured
     rates, inputs = flight.states[:, RATES], flight.inputs._replace(length=length)

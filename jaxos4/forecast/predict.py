@@ -39,13 +39,13 @@ CHUNK = 32  # starts that fly in one call of a program
 class Vehicle(NamedTuple):
     """The vehicle that predicts.
 
-    - `name`: of the result's file. Without a file: the estimator and the model.
-    - `model`: of one recording.
-    - `parameters`, `covariance`: of the model. The mean of the recordings, if each had its own value.
-    - `offset`: how far an offset of p', q', r' may be from the parameter in another recording, as a standard deviation
-      [rad/s^2]; 0 if the model has none.
-    - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
-    - `sample_time`: of the fit [s].
+    - `name`: the name of the result's file, or the estimator and the model.
+    - `model`: for one recording.
+    - `parameters`, `covariance`: estimates of the model's parameters; their mean, if each recording had its own value.
+    - `offset`: how much the offsets of p', q', r' vary from recording to recording, as standard deviations [rad/s^2];
+      0 if the model has none.
+    - `noise`: levels of the body rates, then of the specific forces along `model.force_axes`.
+    - `sample_time`: sample time of the fit [s].
     - `result`: the name of the result code.
     - `notes`: why the estimate cannot be trusted, and which parameters were not identified; one line each.
     """
@@ -136,10 +136,10 @@ def predict(
     - `found`: the identification of a vehicle, the file that `jaxos4 estimate --out` wrote, or its
       `jaxos4.forecast.vehicle_of`.
     - `flight`: or the path of a log. It has body rates and attitude at least. Without a velocity, predictions begin
-      with that of dead reckoning, or at rest; what was not measured is not compared.
+      with one from dead reckoning, or at rest; what was not measured is not compared.
     - `horizon`: how far ahead [s]. `spacing`: the time between two starts [s]; 0: at each sample.
-    - `sample_time`: the log is averaged to it [s]. Default: that of the fit.
-    - `seed`: of the draws.
+    - `sample_time`: the log is averaged to it [s]; by default to the sample time of the fit.
+    - `seed`: random seed of the draws.
 
     The regression for comparison is fitted to the flight of an identification, or else to the first half of `flight`.
 
@@ -192,7 +192,7 @@ def predict(
 
 
 def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) -> Prepared:
-    """The usable parts of a log with the sample time of the fit, or that of the log if it is longer."""
+    """The usable parts of a log, averaged to the sample time of the fit if the log's is shorter."""
     name, airframe = recording.name, vehicle.model.airframe
     if np.isnan(recording.states[:, [6, 8, 10]]).all(axis=0).any():
         raise InputError(f"{name}: a prediction begins with the attitude; log phi, theta and psi.")
@@ -236,7 +236,7 @@ def _predict_states(
 ]:
     """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures.
 
-    A position that was not measured is 0, a velocity that of dead reckoning, without an offset of the force.
+    Without measurements, the position is 0, and the velocity comes from dead reckoning and has no offset of the force.
     """
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, flight.dt
     root = covariance_root(vehicle.covariance)
