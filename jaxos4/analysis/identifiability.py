@@ -6,8 +6,9 @@ from jaxtyping import Bool, Float
 
 from .._custom_types import as_float
 from ..bracket import Bracket, is_identifiable
+from ..linalg import inverses
 from ..results import NINETY_FIVE
-from .evaluation import Evaluation, evaluate, inverse
+from .evaluation import Evaluation, evaluate
 
 PerParameter = Float[np.ndarray, " parameters"]
 _PARTNER = 0.2  # a parameter with this share of a weakly determined direction is named as a partner
@@ -93,7 +94,7 @@ def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability
     diagonal = np.diagonal(information)
     with np.errstate(divide="ignore"):
         alone = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 0.0)), np.inf)
-    std = np.sqrt(np.diagonal(inverse(information)))
+    std = np.sqrt(np.diagonal(inverses(information)))
     if not feasible:
         std = alone = np.full_like(std, np.inf)
     return Identifiability(nominal, half_width, std, alone, np.maximum(eigenvalues, 0.0), directions)
