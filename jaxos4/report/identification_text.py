@@ -31,7 +31,7 @@ _SIGNIFICANCE = 0.01
 # Of the sentences of the headline, on terminals that have colours.
 _COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
 
-Section = Iterator[str | Listing]
+Lines = Iterator[str | Listing]
 
 
 def print_identification(console: Console, found: Identification, *, verbose: bool = False) -> None:
@@ -96,7 +96,7 @@ def notes_of(found: Identification) -> list[str]:
     return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
 
 
-def _failure(found: Identification) -> Section:
+def _failure(found: Identification) -> Lines:
     if found.result != "nonfinite_trajectory" or found.is_vehicle:
         return
     kind = ESTIMATORS.get(found.estimator)
@@ -108,7 +108,7 @@ def _failure(found: Identification) -> Section:
     )
 
 
-def _parameters(found: Identification) -> Section:
+def _parameters(found: Identification) -> Lines:
     of_os4 = not found.is_vehicle
     digits = 5 if of_os4 else 4
     rows = []
@@ -135,14 +135,14 @@ def _parameters(found: Identification) -> Section:
         yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
 
 
-def _held(found: VehicleIdentification) -> Section:
+def _held(found: VehicleIdentification) -> Lines:
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
         reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
     yield from (f"fixed, {reason}: {', '.join(held)}." for reason, held in reasons.items())
 
 
-def _fit(found: OS4Identification) -> Section:
+def _fit(found: OS4Identification) -> Lines:
     percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
     yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
     coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
@@ -170,7 +170,7 @@ def why_no_value(row: Constant) -> str:
     return "below noise" if abs(row.estimate) <= NINETY_FIVE * row.std else "impossible"
 
 
-def _inertias(found: Identification) -> Section:
+def _inertias(found: Identification) -> Lines:
     body = found.rigid_body
     inertias = [
         f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
@@ -190,7 +190,7 @@ def _inertias(found: Identification) -> Section:
         yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}{verdict}."
 
 
-def _validation(found: OS4Identification) -> Section:
+def _validation(found: OS4Identification) -> Lines:
     if found.validation is None:
         return
     flight, fit = found.validation.flight, found.validation.fit
@@ -201,7 +201,7 @@ def _validation(found: OS4Identification) -> Section:
     yield f"validation on {flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
 
 
-def _of_vehicle(found: VehicleIdentification) -> Section:
+def _of_vehicle(found: VehicleIdentification) -> Lines:
     rows = []
     for each in found.sample_times:
         chosen = " (chosen)" if math.isclose(each.sample_time, found.provenance.sample_time) else ""

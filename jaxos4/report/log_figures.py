@@ -49,7 +49,7 @@ def logged(recording: Recording, found: Inspection) -> tuple[str, int]:
                 lines.append(timeline.line(name, values[:, 0], style(i)))
         if lines:
             panels.append(timeline.panel(title, lines))
-    axis = timeline.Axis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
+    axis = timeline.TimeAxis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
     begin = recording.time[0]
     shaded = [(part.begin - begin, part.end - begin) for part in found.stretches if not part.usable]
     return timeline.signals(axis, [timeline.view("", time - begin, panels)], shaded=shaded), block
