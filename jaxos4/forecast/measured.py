@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..flight import STATE_NAMES, Flight
+from ..flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY, Flight
 from ..recording.noise import white_noise
 from ..rotations import attitude_quaternion, conjugate, quaternion_product, rotated
 from .flight_prediction import known_mean
@@ -32,10 +32,7 @@ class Measured(NamedTuple):
     def of(cls, flight: Flight) -> "Measured":
         """The measurements of a flight."""
         recorded = np.asarray(flight.states)
-        position, velocity, angles, rates = (
-            recorded[:, [STATE_NAMES.index(name) for name in names.split()]]
-            for names in ("x y z", "vx vy vz", "phi theta psi", "p q r")
-        )
+        position, velocity, angles, rates = (recorded[:, places] for places in (POSITION, VELOCITY, ANGLES, RATES))
         attitude = np.stack(attitude_quaternion(angles), axis=1)
         columns = np.concatenate([position, velocity, angles, rates], axis=1).T
         noise = np.nan_to_num([white_noise(column, 4) for column in columns])

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import Parameters, as_float
+from ..airframe import MOTIONS
 from ..analysis.prediction import Filtered
 from ..errors import InputError, named, printable, shortened
-from ..flight import FORCE_NAMES, Flight
+from ..flight import ANGLES, FORCE_NAMES, Flight
 from ..identification import Identification
 from ..linalg import covariance_root
 from ..logs import Recording, Source, as_recording
@@ -96,7 +97,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
             model,
             np.array(values),
             shares @ np.array(file.covariance) @ shares.T,
-            np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
+            np.array([width.get(f"{axis}_offset", 0.0) for axis in MOTIONS]),
             LogNoise(*np.log(np.maximum(table, 1e-9)).T),  # finite
             used.sample_time,
             file.result,
@@ -194,7 +195,7 @@ def predict(
 def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) -> Prepared:
     """The usable parts of a log, averaged to the sample time of the fit if the log's is shorter."""
     name, airframe = recording.name, vehicle.model.airframe
-    if np.isnan(recording.states[:, [6, 8, 10]]).all(axis=0).any():
+    if np.isnan(recording.states[:, ANGLES]).all(axis=0).any():
         raise InputError(f"{name}: a prediction begins with the attitude; log phi, theta and psi.")
     if sample_time is not None and not sample_time >= 0.99 * recording.dt:
         raise InputError(f"`sample_time` {sample_time:g}: {name} has one sample every {recording.dt:.4g} s; give that.")

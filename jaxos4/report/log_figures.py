@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..airframe import MOTIONS
-from ..flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY
+from ..flight import ANGLES, CHANNEL_NAMES, FORCE_NAMES, POSITION, RATES, STATE_NAMES, VELOCITY
 from ..logs import Recording
 from ..logs.sampling import filled
 from ..recording.inspection import Inspection
@@ -18,9 +18,10 @@ _SAMPLES = 5000  # of each signal at most; a page then has less than 600 kB
 _SEGMENT = 1.0  # s; spectra are means of segments of this length
 _SLOWEST = 1.0  # Hz; the lowest frequency of a spectrum
 _BINS = 60  # of the motors' speeds
+_FORCE = np.arange(len(STATE_NAMES), len(CHANNEL_NAMES))
 _SIGNALS = (
     ("rate [rad/s]", RATES, ("p", "q", "r")),
-    ("force [m/s²]", np.arange(12, 15), ("ax", "ay", "az")),
+    ("force [m/s²]", _FORCE, FORCE_NAMES),
     ("attitude [rad]", ANGLES, MOTIONS),
     ("velocity [m/s]", VELOCITY, ("vx", "vy", "vz")),
     ("position [m]", POSITION, ("x", "y", "z")),
@@ -96,7 +97,7 @@ def motors(flown: Sequence[Recording], full: float) -> Figure:
 
 def spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> Figure | None:
     """Amplitude spectral densities of gyro and accelerometer; band: how often the rotors turn."""
-    kinds = {"gyro [rad/s/√Hz]": RATES, "accelerometer [m/s²/√Hz]": np.arange(12, 15)}
+    kinds = {"gyro [rad/s/√Hz]": RATES, "accelerometer [m/s²/√Hz]": _FORCE}
     sensed = (np.hstack([_sensed(each, which) for which in kinds.values()]) for each in flown)
     frequency, whole = amplitude_density(sensed, flown[0].dt)
     x, panels = Scale("log", (_SLOWEST, float(frequency[-1])), label="frequency [Hz]"), []
