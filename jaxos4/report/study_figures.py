@@ -41,13 +41,15 @@ def intervals(data: xr.Dataset) -> Figure | None:
 def errors(data: xr.Dataset) -> Figure | None:
     """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
     data = positive_scales(data)
-    found, best, x, panels = metrics.estimator_error(data), metrics.bound_error(data), data["scale"].values, []
+    errors_and_bounds = metrics.estimator_error(data), metrics.bound_error(data)
+    found, best = (each.transpose("parameter", "estimator", "scale") for each in errors_and_bounds)
+    x, panels = data["scale"].values, []
     if not found["absolute"].notnull().any():
         return None
     seen_by, dots = bounds(data), {"marker": "" if len(x) > 1 else "s", "size": 4}
     for place, name in enumerate(names(data, "parameter")):
         kind, unit, why = error_unit(data, place)
-        values, least = (_by(each[kind].isel(parameter=place), "estimator", "scale") for each in (found, best))
+        values, least = (each[kind].values[place] for each in (found, best))
         marks = [_line(data, i, look, x, values[i]) for i, look in _looks(data)]
         marks += [
             Line(x, least[estimator], width=1.5, dash=dash, name=f"bound, {seen}", **dots)
@@ -61,10 +63,11 @@ def errors(data: xr.Dataset) -> Figure | None:
 def efficiency(data: xr.Dataset) -> Figure | None:
     """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
     data = positive_scales(data)
-    found, scales, panels = metrics.efficiency(data), data["scale"].values, []
+    found = metrics.efficiency(data).transpose("parameter", "estimator", "scale")
     if not found["efficiency"].notnull().any():
         return None
-    values, low, high = (_by(found[each], "parameter", "estimator", "scale") for each in ("efficiency", "low", "high"))
+    scales, panels = data["scale"].values, []
+    values, low, high = (found[each].values for each in ("efficiency", "low", "high"))
     for place, name in enumerate(names(data, "parameter")):
         marks = [Line(_EVERYWHERE, (1, 1), width=1.5)]
         for i, look in _looks(data):
@@ -77,17 +80,13 @@ def efficiency(data: xr.Dataset) -> Figure | None:
     return Figure("efficiency", panels, columns=4)
 
 
-def _by(values: xr.DataArray, *axes: str) -> np.ndarray:
-    return values.transpose(*axes).values
-
-
 def coverage(data: xr.Dataset) -> Figure | None:
     """Share of intervals that contain the truth against the level that they claim, at each noise scale."""
-    found, panels = metrics.mean_coverage(data), []
+    found, panels = metrics.mean_coverage(data).transpose("scale", "estimator", "level"), []
     if not found["coverage"].notnull().any():
         return None
     estimators, levels = names(data, "estimator"), data["level"].values
-    share, low, high = (_by(found[each], "scale", "estimator", "level") for each in ("coverage", "low", "high"))
+    share, low, high = (found[each].values for each in ("coverage", "low", "high"))
     lowest, places = min(float(np.nanmin(low)), float(levels.min())) - 0.04, np.arange(len(levels))
     y = Scale(ends=(lowest, 1.02), ticks={x / 10: f"{10 * x} %" for x in range(11)})
     ticks: dict[float, str] = {k: f"{100 * x:g} %" for k, x in enumerate(levels.tolist())}
