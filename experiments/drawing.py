@@ -1,6 +1,5 @@
 """Matplotlib's figures in the style of this library: grids of panels, logarithmic axes, and reproducible files."""
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from jaxos4._files import write_file
-from jaxos4.report.matplotlib_figures import drawing
+from jaxos4.report.matplotlib_figures import drawing, rendered
 from jaxos4.report.style import Style
 
 
@@ -74,13 +73,6 @@ def draw_spread(panel: Axes, x: np.ndarray, values: xr.DataArray, look: Style, l
     panel.plot(x, np.exp(logarithm.mean("parameter").values), label=label, **line(look))
     low, high = (end.values[finite] for end in (values.min("parameter"), values.max("parameter")))
     panel.vlines(x[finite], low, high, color=look.color, linewidth=1.0)
-
-
-def rendered(figure: Figure, kind: str) -> bytes:
-    """The figure as a file: `"svg"` or `"pdf"`. The same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, metadata={"Date" if kind == "svg" else "CreationDate": None})
-    return buffer.getvalue()
 
 
 def plotter(read: Callable[[Path], Any], drawn: dict[str, Callable[[Any], Figure | None]]) -> Callable[..., None]:

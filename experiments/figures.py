@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from experiments import figures_of_flights
 from experiments.drawing import draw_spread, grid, legend, line, log_axis, name_axis, plotter, scale_axis
 from experiments.shared import load_results
-from jaxos4.report import study_page
+from jaxos4.report import study_figures
 from jaxos4.report.matplotlib_figures import as_matplotlib
 from jaxos4.report.study_tables import error_unit
 from jaxos4.report.style import FAINT, INK, PAPER, styles
@@ -234,7 +234,7 @@ def bracket_and_seeds(studies: dict[str, xr.Dataset]) -> Figure:
     for seed, data in enumerate(studies.values()):
         data = squeezed(data, "width", "estimator")
         widths = data["width"].values
-        x = study_page.dodged(widths, seed, len(studies)) if len(studies) > 1 else widths
+        x = study_figures.dodged(widths, seed, len(studies)) if len(studies) > 1 else widths
         for name, look in styles(list(data["estimator"].values)).items():
             one, drawn = data.sel(estimator=name), line(look, linewidth=0.9)
             above.plot(x, metrics.efficiency(one)["efficiency"].max("parameter"), label=name, **drawn)
@@ -281,7 +281,7 @@ def report(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-ERRORS, EFFICIENCY, COVERAGE = map(of_study, (study_page.errors, study_page.efficiency, study_page.coverage))
+ERRORS, EFFICIENCY, COVERAGE = map(of_study, (study_figures.errors, study_figures.efficiency, study_figures.coverage))
 SCRIPTS = {
     "benchmarks.plot": plotter(report, {"benchmarks": figures_of_flights.benchmarks}),
     "bracket_and_seeds.plot": plotter(each_study, {"bracket_and_seeds": bracket_and_seeds}),

@@ -9,10 +9,11 @@ import numpy as np
 
 import jaxos4
 from experiments.monte_carlo import LOST, Row, groups, print_table, results_of, statistics
+from jaxos4.airframe import AXES
 from jaxos4.errors import InputError
 from jaxos4.recording import read_recording
 
-INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}  # with the parameters that are their inverses
+INERTIAS = {axis.inertia: axis.inverse for axis in AXES}  # with the parameters that are their inverses
 THRUST = "thrust"
 # The errors of the airframe that is given, as shares. Flights have both signs in turn.
 WRONG_THRUST, WRONG_INERTIA = 0.2, 0.25

@@ -89,12 +89,12 @@ def run_studies(studies: dict[str, Study], out: Path) -> None:
 
 def study_lines(name: str, dataset: xr.Dataset) -> Iterator[tuple[str, ...]]:
     """The lines of a study, for each scenario, noise scale and estimator; `name`: begins the first cell of each."""
-    several = sum(1 for _ in scenarios(dataset)) > 1
-    for one in scenarios(dataset):
-        label = ", ".join(filter(None, (name, one.label if several else "")))
-        ratio, held = metrics.efficiency(one.data)["efficiency"], metrics.mean_coverage(one.data).sel(level=0.95)
-        spent, results = metrics.mean_rollouts(one.data), metrics.result_counts(one.data)
-        for scale, estimator in itertools.product(one.data["scale"].values, one.data["estimator"].values):
+    every = scenarios(dataset)
+    for label, data in every:
+        label = ", ".join(filter(None, (name, label if len(every) > 1 else "")))
+        ratio, held = metrics.efficiency(data)["efficiency"], metrics.mean_coverage(data).sel(level=0.95)
+        spent, results = metrics.mean_rollouts(data), metrics.result_counts(data)
+        for scale, estimator in itertools.product(data["scale"].values, data["estimator"].values):
             at = {"scale": scale, "estimator": estimator}
             counts = {str(code): int(n) for code, n in results.sel(at).to_series().items() if n}
             yield (

@@ -102,6 +102,27 @@ def unit_directions(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return joint_factor(information[None], information.shape[0]).basis[0]
 
 
+def inverses(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
+    """The inverses of symmetric positive semidefinite matrices, whatever the units of their rows. NumPy."""
+    scale, values, vectors = unit_eigen(information)
+    unit = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return unit / scale[..., :, None] / scale[..., None, :]
+
+
+def unit_eigen(
+    matrix: Float[np.ndarray, "*batch n n"],
+) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n n"]]:
+    """The scale that makes the diagonal 1, and eigenvalues and eigenvectors of the scaled matrix.
+
+    An eigenvalue below the rounding errors counts as large as these.
+    """
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where((diagonal > 0) & np.isfinite(diagonal), diagonal, 1.0))
+    unit = matrix / scale[..., :, None] / scale[..., None, :]
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(unit), unit, 0.0))
+    return scale, np.maximum(values, values.shape[-1] * np.finfo(float).eps), vectors
+
+
 def covariance_root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """A matrix B with B B^T = covariance, which may be singular, whatever the units of its rows."""
     std = np.sqrt(np.diagonal(covariance))

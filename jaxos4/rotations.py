@@ -11,6 +11,11 @@ from ._custom_types import Numeric
 HALF_TURN = np.array([1.0, -1.0, -1.0])
 """About x: from x forward, y right, z down to x forward, y left, z up."""
 
+_Samples = Float[Numeric, "*samples"]
+Vector = tuple[_Samples, _Samples, _Samples]
+Quaternion = tuple[_Samples, _Samples, _Samples, _Samples]
+"""w, x, y, z. An attitude rotates from the axes of the body to the earth's."""
+
 
 def rotation(angles: Float[Numeric, "3 *samples"]) -> Float[Numeric, "3 3 *samples"]:
     """R_z(psi) R_y(theta) R_x(phi) of the angles phi, theta, psi [rad]: from the axes of the body to the earth's."""
@@ -33,6 +38,50 @@ def angles_of(matrix: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
     """Roll, pitch and yaw [rad] of a rotation."""
     roll, yaw = math.atan2(matrix[2, 1], matrix[2, 2]), math.atan2(matrix[1, 0], matrix[0, 0])
     return roll, -math.asin(min(max(matrix[2, 0], -1.0), 1.0)), yaw
+
+
+def attitude_quaternion(angles: Float[np.ndarray, "samples 3"]) -> Quaternion:
+    """The attitude of roll, pitch and yaw [rad]."""
+    half, zero = np.stack([np.cos(angles / 2), np.sin(angles / 2)]), np.zeros(len(angles))
+    roll, pitch, yaw = ((half[0, :, i], *np.insert([zero, zero], i, half[1, :, i], axis=0)) for i in range(3))
+    return quaternion_product(yaw, quaternion_product(pitch, roll))
+
+
+def quaternion_product(a, b) -> Quaternion:
+    """The quaternion of the rotation `b`, and then `a`. NumPy and JAX."""
+    (w, x, y, z), (k, j, m, n) = a, b
+    return (
+        w * k - x * j - y * m - z * n,
+        w * j + x * k + y * n - z * m,
+        w * m - x * n + y * k + z * j,
+        w * n + x * m - y * j + z * k,
+    )
+
+
+def conjugate(a) -> Quaternion:
+    """The quaternion of the rotation back."""
+    w, x, y, z = a
+    return w, -x, -y, -z
+
+
+def rotated(a, vector) -> Vector:
+    """A vector turned by a quaternion: from the body's axes to the earth's, if that is the attitude."""
+    w, *axis = a
+    b = cross(axis, vector)
+    x, y, z = (v + 2 * (w * c + d) for v, c, d in zip(vector, b, cross(axis, b), strict=True))
+    return x, y, z
+
+
+def cross(a, b) -> Vector:
+    """The cross product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def deviation(a, b) -> Vector:
+    """Twice the vector part of the rotation from attitude `a` to `b`, in the axes of `a`: [rad] if it is small."""
+    w, *vector = quaternion_product(conjugate(a), b)
+    x, y, z = (2 * x * (1 - 2 * (w < 0)) for x in vector)
+    return x, y, z
 
 
 def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarray, "*samples 3"]:

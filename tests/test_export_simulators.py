@@ -5,6 +5,7 @@ import json
 
 import equinox as eqx
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 from helpers import ROOT, blocks
@@ -209,7 +210,9 @@ def test_a_vehicle_flies_the_predicted_flight(mujoco, predicted_flight, fly):
     flown = fly(found, omega[: len(predicted) - 1], predicted[0])
     assert np.abs(departures(predicted[1:], flown)).max() < 1e-6
     assert np.abs(departures(predicted[:1], flown))[-1].min() > 0.05  # it flies somewhere
-    heavier = found._replace(airframe=eqx.tree_at(lambda a: a.mass, found.airframe, 1.001 * found.airframe.mass))
+    own = found.identification
+    heavy = eqx.tree_at(lambda a: a.mass, own.airframe, 1.001 * own.airframe.mass)
+    heavier = found._replace(identification=msgspec.structs.replace(own, airframe=heavy))
     assert np.abs(departures(predicted[1:], fly(heavier, omega[: len(predicted) - 1], predicted[0]))).max() > 1e-3
 
 

@@ -22,7 +22,8 @@ from jaxos4.logs import LogFacts
 from jaxos4.recording.inspection import ASSUMED_FULL_SCALE, airframe_draft, inspect_log
 from jaxos4.recording.motion import rotor_signs
 from jaxos4.report import write_log_page
-from jaxos4.report.log_page import amplitude_density, fitted, logged
+from jaxos4.report.log_figures import amplitude_density, logged
+from jaxos4.report.log_page import fitted
 from jaxos4.report.timeline import thinned
 
 EVIL = "</script><script>alert(1)</script>"
@@ -206,7 +207,7 @@ def test_the_page_of_a_log_shows_what_would_be_fitted(tmp_path):
     levels = np.frombuffer(base64.b64decode(levels), "<i2")
     np.testing.assert_allclose(middle + step * levels, flight.states[:, RATES[0]], atol=step)
     begin, end = drawn["shaded"][0]
-    assert (begin, end) == pytest.approx((found.parts[0].begin, found.parts[0].end))
+    assert (begin, end) == pytest.approx((found.stretches[0].begin, found.stretches[0].end))
 
 
 def test_commands_without_full_scale_are_refused_on_the_page_as_by_the_fit():

@@ -14,7 +14,7 @@ from jaxos4.recording.inspection import inspect_log
 from jaxos4.recording.prepared import finest, prepare
 from jaxos4.recording.richest import fair_share
 from jaxos4.recording.stretches import Stretch
-from jaxos4.report.log_page import logged, spectra
+from jaxos4.report.log_figures import logged, spectra
 
 DT, HOVER = 0.01, float(CRAZYFLIE.hover_speed)
 ROLL, PITCH, YAW = np.sign(np.asarray(CRAZYFLIE.mixer)[:3])
@@ -84,7 +84,7 @@ def test_checks_and_inspection_see_the_parts_that_are_fitted(two_minutes):
     assert sum(each.time.size for each in whole.stretches) > 590 / DT
     np.testing.assert_array_equal(evidence.rest, whole.rest)  # before take-off, which is not fitted
     assert evidence.rest is not None
-    assert sum(part.end - part.begin for part in inspect_log(long, CRAZYFLIE).parts if part.usable) > 590
+    assert sum(part.end - part.begin for part in inspect_log(long, CRAZYFLIE).stretches if part.usable) > 590
 
 
 def test_equal_parts_are_taken_in_the_order_of_time_and_as_one():

@@ -18,7 +18,7 @@ from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.estimators import ESTIMATORS as REGISTRY
-from jaxos4.report import error_csv, error_table, study_page, write_report
+from jaxos4.report import error_csv, error_table, study_figures, study_page, write_report
 from jaxos4.report.matplotlib_figures import as_pdf
 from jaxos4.report.study_tables import scenario_tables, scenarios
 from jaxos4.report.style import styles
@@ -115,7 +115,8 @@ def test_the_csv_has_every_number(study):
 
 
 def units_of(table):
-    return dict(heading[:-1].split(" [") for heading in table.headings[1:])
+    _, headings, *_ = table
+    return dict(heading[:-1].split(" [") for heading in headings[1:])
 
 
 def test_the_unit_in_a_head_is_that_of_the_cells_below_it():
@@ -131,7 +132,7 @@ def test_the_unit_in_a_head_is_that_of_the_cells_below_it():
 
 def test_no_line_hides_another_and_a_title_says_who_sees_which_channels(study, report):
     data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
-    for figure in (study_page.errors(data), study_page.overview(data)):
+    for figure in (study_figures.errors(data), study_figures.overview(data)):
         widths = [next(mark.width for mark in figure.panels[0].marks if mark.group == i) for i in range(4)]
         assert widths == sorted(widths, reverse=True)
         assert len({*widths}) == 4
@@ -281,8 +282,8 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
-    (scenario,) = scenarios(study)
-    figure = study_page.coverage(scenario.data)
+    ((_, data),) = scenarios(study)
+    figure = study_figures.coverage(data)
     before = as_pdf(figure)
     assert before.startswith(b"%PDF")
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):

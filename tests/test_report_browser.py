@@ -23,7 +23,7 @@ from jaxos4 import PublishedOS4, compare_results
 from jaxos4.design import Design
 from jaxos4.design.task import Designed
 from jaxos4.report import write_comparison, write_flight_page, write_log_page, write_report
-from jaxos4.report.design import write_design
+from jaxos4.report.design import write_design_figure
 
 pytestmark = pytest.mark.slow
 
@@ -86,7 +86,7 @@ def files(tmp_path_factory):
         write_log_page(files["late"], flight._replace(time=1234.3 + flight.time), CRAZYFLIE)
         write_comparison(files["comparison"], compare_results(long))
         for name, given in DESIGNS.items():
-            write_design(synthetic_design(*given), 0.01, files[name])
+            write_design_figure(files[name], synthetic_design(*given), 0.01)
     return files
 
 

@@ -14,9 +14,9 @@ from synthetic_study import synthetic_study
 
 from jaxos4 import compare_results
 from jaxos4.analysis.inertia import CenterOfMass
-from jaxos4.report import identification_figures, study_of_one_flight, study_page
+from jaxos4.report import identification_figures, study_figures
 from jaxos4.report.comparison import forest
-from jaxos4.report.log_page import motors, spectra
+from jaxos4.report.log_figures import motors, spectra
 from jaxos4.report.panels import Band, Figure, Line, Panel, Scale, Words, spread
 from jaxos4.report.study_tables import scenarios
 from jaxos4.report.style import INK, styles
@@ -144,10 +144,11 @@ def of_pages():
     log = flown(CRAZYFLIE, 0)
     yield motors([log], float(CRAZYFLIE.max_rotor_speed))
     yield spectra([log], (10.0, 20.0))
-    (study,) = scenarios(synthetic_study(flights=8))
-    yield from (draw(study.data) for draw in study_page.SCENARIO_FIGURES.values())
-    (one,) = scenarios(synthetic_study(flights=1, spoiled=False))
-    yield study_of_one_flight.intervals(one.data)
+    ((_, study),) = scenarios(synthetic_study(flights=8))
+    ((_, one),) = scenarios(synthetic_study(flights=1, spoiled=False))
+    drawn = study_figures.draw(study) | study_figures.draw(one)
+    assert drawn.keys() == study_figures.FIGURES.keys()
+    yield from drawn.values()
 
 
 def test_no_mark_of_a_page_is_outside_of_its_axes_and_each_series_has_a_name():

@@ -12,13 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxos4
-from experiments.drawing import rendered
 from experiments.real_flights import PENDULUM
 from jaxos4._files import write_file
 from jaxos4.estimators.solver import before_search
 from jaxos4.identification.verdict import ADVICE
 from jaxos4.report.identification_figures import vehicle
-from jaxos4.report.matplotlib_figures import draw, drawing
+from jaxos4.report.matplotlib_figures import draw, drawing, rendered
 from jaxos4.report.style import style
 from jaxos4.results import NINETY_FIVE
 

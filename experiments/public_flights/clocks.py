@@ -9,8 +9,8 @@ import numpy as np
 import jaxos4
 from jaxos4.flight import STATE_NAMES
 from jaxos4.forecast.measured import Measured
-from jaxos4.forecast.motion import deviation
 from jaxos4.recording import Recording
+from jaxos4.rotations import deviation
 
 # Half of the time over which turns are compared, and the largest lag [samples]; an error of more medians is an outlier.
 HALF, MOST, OUTLIER = 5, 6, 3.0

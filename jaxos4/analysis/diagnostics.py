@@ -15,7 +15,7 @@ class Correlations(Arrays, frozen=True, eq=False):
 
     - `own`: at 1, 2, ... samples apart.
     - `with_torque`: at lags from -`lags` to `lags`; at a positive lag, the residual is the later one. A controller
-      answers residuals, so a vehicle has correlations at negative lags.
+      responds to residuals, so a vehicle has correlations at negative lags.
     - `bound`: larger than 95 % of `own` if residuals are white. `torque_bound`: larger than 95 % of `with_torque` if no
       torque causes the residuals, white or coloured.
     """
@@ -37,7 +37,7 @@ class Diagnostics(eqx.Module):
     - `percent`: 100 (1 - |y - x| / |y - mean y|). 100: a perfect prediction. 0: as good as the mean, or no motion.
     - `level`: mean square of the weighted residuals (the *normalised innovation level*). `level_p`: p-value of a level
       of 1, two-sided (chi-squared).
-    - `autocorrelation`: of residuals 1, 2, ... samples apart. `colour`: that of the first lag with measured pairs.
+    - `autocorrelation`: of residuals 1, 2, ... samples apart. `colour`: its value at the first lag with measured pairs.
     - `white_p`: p-value of white residuals (Ljung and Box 1978; by measured pairs, Stoffer and Toloi 1992). 1 for
       several windows, whose fitted initial states correlate the residuals.
     - `input_correlation`: with the roll, pitch and yaw torques, each at the lag with the largest correlation.
@@ -112,14 +112,9 @@ def residual_correlations(
     measured = np.isfinite(errors)
     errors = np.where(measured, errors, 0.0)
     own, pairs = (x[:, lags + 1 :] for x in _correlations(errors, errors, measured, measured, lags))
-    crossed = [_with_torque(errors, measured, own, torque, lags) for torque in _moves(torques).T]
-    known = np.maximum(measured.sum(axis=0), 1)
-    return Correlations(
-        own,
-        np.stack([correlation for correlation, _ in crossed], axis=1),
-        NINETY_FIVE / np.sqrt(known),
-        NINETY_FIVE * np.stack([error[:, lags] for _, error in crossed], axis=1),
-    )
+    crossed, deviations = _with_torques(errors, measured, own, _moves(torques), lags)
+    bound = NINETY_FIVE / np.sqrt(np.maximum(measured.sum(axis=0), 1))
+    return Correlations(own, crossed, bound, NINETY_FIVE * deviations[:, :, lags])
 
 
 def _moves(torques: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
@@ -127,17 +122,21 @@ def _moves(torques: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "sample
     return np.append(torques[:-1] - torques[:-1].mean(axis=0), np.zeros((1, 3)), axis=0)
 
 
-def _with_torque(
-    errors: np.ndarray, measured: np.ndarray, autocorrelation: np.ndarray, torque: np.ndarray, lags: int
-) -> tuple[Float[np.ndarray, "size both"], Float[np.ndarray, "size both"]]:
-    """The correlation with a torque at each lag, and its standard deviation if there is no dependence."""
-    column, taper = torque[:, None], 1 - np.arange(1, lags + 1) / (lags + 1)
-    drives = np.arange(len(column))[:, None] < len(column) - 1
-    correlation, pairs = _correlations(errors, column, measured, drives, lags)
-    own = _correlations(column, column, drives, drives, lags)[0][0, lags + 1 :]
-    # Variance of the correlation of two coloured series, relative to white ones; at least 1.
-    inflation = np.maximum(1 + 2 * (autocorrelation * (taper * own)).sum(axis=1), 1.0)
-    return correlation, np.sqrt(inflation[:, None] / np.maximum(pairs, 1e-9))
+def _with_torques(
+    errors: np.ndarray, measured: np.ndarray, autocorrelation: np.ndarray, torques: np.ndarray, lags: int
+) -> tuple[Float[np.ndarray, "size 3 both"], Float[np.ndarray, "size 3 both"]]:
+    """The correlation with each torque at each lag, and its standard deviation if there is no dependence."""
+    taper, found = 1 - np.arange(1, lags + 1) / (lags + 1), []
+    drives = np.arange(len(torques))[:, None] < len(torques) - 1
+    for torque in torques.T:
+        column = torque[:, None]
+        correlation, pairs = _correlations(errors, column, measured, drives, lags)
+        own = _correlations(column, column, drives, drives, lags)[0][0, lags + 1 :]
+        # Variance of the correlation of two coloured series, relative to white ones; at least 1.
+        inflation = np.maximum(1 + 2 * (autocorrelation * (taper * own)).sum(axis=1), 1.0)
+        found.append((correlation, np.sqrt(inflation[:, None] / np.maximum(pairs, 1e-9))))
+    correlations, deviations = (np.stack(each, axis=1) for each in zip(*found, strict=True))
+    return correlations, deviations
 
 
 def _dependence(
@@ -152,16 +151,13 @@ def _dependence(
     from scipy.special import ndtr
 
     moves = _moves(torques)
-    torques = np.where(np.abs(moves).max(axis=0) > rounding * np.abs(torques[:-1]).max(axis=0), moves, 0.0)
-    found, worst = [], []
-    for torque in torques.T:
-        correlation, error = _with_torque(errors, measured, autocorrelation, torque, lags)
-        deviations = np.abs(correlation) / error
-        at = np.argmax(deviations, axis=1)[:, None]
-        found.append(np.take_along_axis(correlation, at, axis=1)[:, 0])
-        worst.append(2 * ndtr(-np.take_along_axis(deviations, at, axis=1)[:, 0]))
-    p = np.minimum((2 * lags + 1) * np.min(worst, axis=0), 1.0)
-    return np.stack(found, axis=1), np.minimum(3 * p, 1.0)
+    moves = np.where(np.abs(moves).max(axis=0) > rounding * np.abs(torques[:-1]).max(axis=0), moves, 0.0)
+    correlations, deviations = _with_torques(errors, measured, autocorrelation, moves, lags)
+    ratios = np.abs(correlations) / deviations
+    at = ratios.argmax(axis=2)[:, :, None]
+    largest, worst = (np.take_along_axis(each, at, axis=2)[:, :, 0] for each in (correlations, ratios))
+    p = np.minimum((2 * lags + 1) * np.min(2 * ndtr(-worst), axis=1), 1.0)
+    return largest, np.minimum(3 * p, 1.0)
 
 
 def _correlations(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Covariance, InitialStates, Parameters, as_float
-from ..linalg import covariance_of_shared
+from ..linalg import covariance_of_shared, inverses
 from ..models.state import CHANNELS
 from ..shooting import FASTEST, ShootingProblem, padded
 
@@ -81,14 +81,14 @@ class Evaluation(NamedTuple):
         """J^T W^2 J in the parameters, which all windows share; free initial states are eliminated."""
         information, count = self.information, self.parameters.size
         cross, own = information[:, count:, :count], information[:, count:, count:]
-        left = (information[:, :count, :count] - np.swapaxes(cross, 1, 2) @ inverse(own) @ cross).sum(axis=0)
+        left = (information[:, :count, :count] - np.swapaxes(cross, 1, 2) @ inverses(own) @ cross).sum(axis=0)
         return (left + left.T) / 2  # rounding makes the inverse asymmetric, and solvers read one half of a matrix
 
     @property
     def covariance(self) -> Spread:
         """The Cramer-Rao bound of the parameters; infinite if the trajectory is not feasible."""
         count = self.parameters.size
-        return inverse(self.fisher_information) if self.feasible else np.full((count, count), np.inf)
+        return inverses(self.fisher_information) if self.feasible else np.full((count, count), np.inf)
 
 
 def evaluate(
@@ -171,7 +171,7 @@ def robust_covariance(evaluation: Evaluation) -> Spread:
     jacobian, information, shared = evaluation.jacobian, evaluation.information, evaluation.covariance
     cross, own = information[:, count:, :count], information[:, count:, count:]
     sensitivity = np.concatenate(
-        [np.broadcast_to(shared, (len(cross), count, count)), -inverse(own) @ cross @ shared], 1
+        [np.broadcast_to(shared, (len(cross), count, count)), -inverses(own) @ cross @ shared], 1
     )
     # The change of each estimated parameter with each weighted residual.
     moves = np.swapaxes(jacobian, 1, 2) @ sensitivity
@@ -216,27 +216,3 @@ def _window_by_window(errors: np.ndarray, measured: np.ndarray, moves: np.ndarra
     following = contribution(1)
     # Bartlett's weight of neighbours is one half.
     return contribution(0) + (following + following.T) / 2
-
-
-def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
-    """The inverse of symmetric positive semidefinite matrices in any units.
-
-    A direction without information gets a variance that is huge, but neither infinite nor negative.
-    """
-    scale, values, vectors = unit_eigen(information)
-    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return inverse / scale[..., :, None] / scale[..., None, :]
-
-
-def unit_eigen(
-    matrix: Float[np.ndarray, "*batch n n"],
-) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n n"]]:
-    """The scale that makes the diagonal 1, and eigenvalues and eigenvectors of the scaled matrix.
-
-    An eigenvalue below the rounding errors counts as large as these.
-    """
-    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-    scale = np.sqrt(np.where((diagonal > 0) & np.isfinite(diagonal), diagonal, 1.0))
-    unit = matrix / scale[..., :, None] / scale[..., None, :]
-    values, vectors = np.linalg.eigh(np.where(np.isfinite(unit), unit, 0.0))
-    return scale, np.maximum(values, values.shape[-1] * np.finfo(float).eps), vectors

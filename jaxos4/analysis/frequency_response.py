@@ -32,8 +32,8 @@ class Agreement(NamedTuple):
 
     Each frequency weighs as much as is known about the response there.
 
-    - `ratio`: 1 if the model is right, 2 if the vehicle answers twice as strongly as the model says. NaN: no part of
-      the band has a clear response.
+    - `ratio`: 1 if the model is right, 2 if the vehicle responds twice as strongly as the model says. NaN: no part
+      of the band has a clear response.
     - `error`: standard deviation of the ratio's logarithm.
     - `low`, `high`: the first and the last frequency that counted [Hz].
     """
@@ -60,10 +60,10 @@ class AxisResponse(Arrays, frozen=True, eq=False):
 
     - `frequency`: [Hz].
     - `gain`: measured over modelled angular acceleration.
-    - `phase`: of the measured before the modelled one [rad]. A measured response that comes late has a negative phase.
+    - `phase`: lead of the measured over the modelled acceleration [rad]: negative if the vehicle responds late.
     - `coherence`: the power of the modelled acceleration, as a share of itself and the disturbance's, 0 to 1. It does
       not depend on the gain.
-    - `covariance`: of the gain's logarithm at each pair of frequencies.
+    - `covariance`: covariance of the gain's logarithm between frequencies.
     - `averages`: how many seconds were compared, over the inverse of the resolution in frequency.
     """
 
@@ -75,7 +75,7 @@ class AxisResponse(Arrays, frozen=True, eq=False):
     averages: float
 
     def agreement(self, low: float = LOW, high: float = HIGH) -> Agreement:
-        """How strongly the vehicle answers compared with the model, from `low` to `high` [Hz]."""
+        """How strongly the vehicle responds compared with the model, from `low` to `high` [Hz]."""
         clear = self.clear & (self.frequency >= low) & (self.frequency <= high)
         if not clear.any():
             return Agreement(*[math.nan] * 4)
@@ -93,7 +93,7 @@ class AxisResponse(Arrays, frozen=True, eq=False):
 
     @property
     def error(self) -> Float[np.ndarray, " frequencies"]:
-        """Standard deviation of the gain's logarithm, and about that of the phase [rad]."""
+        """Standard deviation of the gain's logarithm, and approximately of the phase [rad]."""
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
@@ -126,9 +126,9 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     rates over the sample time, less what the model says about these rates: in the input, that would bring the gyro's
     noise to both sides. If the rates are means, the input is averaged over the same times.
 
-    The flight controller answers disturbances, so in a ratio of spectra the vehicle seems to answer 25 to 40 % too
+    The flight controller responds to disturbances, so in a ratio of spectra the vehicle seems to respond 25 to 40 % too
     strongly. Here the output is predicted from the past (`response`): what remains of it is new, so that no controller
-    has answered it yet. A fit of the same flight has been compared with these data: a ratio other than 1 shows that
+    has responded to it yet. A fit of the same flight has been compared with these data: a ratio other than 1 shows that
     the model is wrong, a ratio of 1 does not show that it is right.
 
     **Arguments:** a problem, and the parameters of a fit.
@@ -136,9 +136,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     rates = np.asarray(problem.flight.states)[:, RATES]
     dt = float(problem.flight.dt)
     known = ~np.isnan(rates.sum(axis=1))
-    caused, damped = map(
-        np.asarray, _parts(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0)))
-    )
+    caused, damped = map(np.asarray, _parts(problem, as_float(parameters)))
     measured = np.diff(rates, axis=0) / dt - damped
     usable = known[1:] & known[:-1] & np.isfinite(caused).all(axis=1)
     if problem.flight.stretch is not None:
@@ -151,32 +149,25 @@ def significant(values: Float[np.ndarray, "..."], digits: int) -> Float[np.ndarr
     return np.array([float(f"{x:.{digits - 1}e}") for x in values.ravel()]).reshape(values.shape)
 
 
-def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[np.ndarray, "steps 3"]:
-    """The model's angular acceleration from each sample to the next at the measured rates [rad/s^2].
-
-    A rate that was not measured counts as 0.
-    """
-    rates = np.asarray(problem.flight.states)[:, RATES]
-    known = ~np.isnan(rates.sum(axis=1))
-    return np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
-
-
 @compiled_cheaply
-def _modelled(
-    problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
-) -> Float[Array, "steps 3"]:
-    """The model's angular acceleration from each sample to the next, at the mean of their rates [rad/s^2]."""
+def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[Array, "steps 3"]:
+    """The model's angular acceleration from each sample to the next, at the mean of their measured rates [rad/s^2]."""
+    rates = _measured_rates(problem)
     forcing = jax.tree.map(lambda leaf: leaf[:-1], problem.forcing(parameters))
     middle = Rates(*((rates[1:] + rates[:-1]) / 2).T)
     return jnp.stack(problem.model.angular_acceleration(middle, forcing, tuple(parameters)), axis=1)
 
 
+def _measured_rates(problem: ShootingProblem) -> Float[Array, "samples 3"]:
+    """The measured rates, and 0 in a sample that lacks one."""
+    rates = jnp.asarray(problem.flight.states)[:, RATES]
+    return jnp.where(jnp.isnan(rates).any(axis=1, keepdims=True), 0.0, rates)
+
+
 @compiled_cheaply
-def _parts(
-    problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
-) -> tuple[Float[Array, "steps 3"], Float[Array, "steps 3"]]:
+def _parts(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[Array, "steps 3"], Float[Array, "steps 3"]]:
     """The model's change of the measured rates over each step [rad/s^2]: by the rotors, and by the rates."""
-    forcing = problem.model.mean_forcing(problem.flight.inputs, parameters)
+    rates, forcing = _measured_rates(problem), problem.model.mean_forcing(problem.flight.inputs, parameters)
 
     def at(rates: Array, forcing: Forcing) -> Array:
         return jnp.stack(problem.model.angular_acceleration(Rates(*rates.T), forcing, tuple(parameters)), axis=1)
@@ -191,9 +182,9 @@ def _parts(
 
 
 RESOLUTION = 1.0  # Hz; between frequencies
-MEMORY = 0.1  # s; as long as the flight controller's answer. A longer one finds the same, less precisely.
+MEMORY = 0.1  # s; as long as the flight controller's response. A longer one finds the same, less precisely.
 MIN_LAGS = 4  # samples of a memory
-ANSWER = 0.016  # s; for this long, rotors and controller show what the controller knows and the log does not
+REACTION = 0.016  # s; for this long, rotors and controller show what the controller knows and the log does not
 SAMPLES = 8  # for each coefficient of the regression, at the least
 
 
@@ -206,8 +197,8 @@ def response(
     """The frequency response from u to y, in closed loop too.
 
     A regression predicts y - u from its own past, A(z) (y - u) = B(z) u + e with white noise e, so that the response is
-    1 + B / A (the direct method, Ljung, System Identification, section 13.5). A controller that answers e within its
-    sample, or that measures more often than the log, biases the first coefficients of B. So the errors contain what
+    1 + B / A (the direct method, Ljung, System Identification, section 13.5). A controller that responds to e within
+    its sample, or that measures more often than the log, biases the first coefficients of B. So the errors contain what
     changes without these coefficients.
 
     **Arguments:** signals with one sample every `dt` [s], and which of them are `usable`.
@@ -234,14 +225,14 @@ def response(
         root = np.sqrt(variance) * inverse_root[:-1]
         return np.log(1 + b / a), slopes @ root, variance / np.abs(a) ** 2
 
-    (whole, spread, disturbed), (late, *_) = regression(0), regression(max(round(ANSWER / dt), 1))
-    answered = np.real(late - whole)
+    (whole, spread, disturbed), (late, *_) = regression(0), regression(max(round(REACTION / dt), 1))
+    reacted = np.real(late - whole)
     caused = np.real(np.einsum("fi,ij,fj->f", shift.conj(), np.cov(u[before].T), shift)) / (lags + 1)
     return AxisResponse(
         frequency,
         np.exp(np.real(whole)),
         np.imag(whole),
         caused / (caused + disturbed),
-        np.real(spread) @ np.real(spread).T + np.outer(answered, answered),
+        np.real(spread) @ np.real(spread).T + np.outer(reacted, reacted),
         rows.size * dt * apart,
     )

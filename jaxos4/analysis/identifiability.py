@@ -1,33 +1,30 @@
 """Which parameters a flight can identify, and for each of the others the reason why not."""
 
-from typing import ClassVar
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
 from .._custom_types import as_float
 from ..bracket import Bracket, is_identifiable
+from ..linalg import inverses
 from ..results import NINETY_FIVE
-from .evaluation import Evaluation, evaluate, inverse
+from .evaluation import Evaluation, evaluate
 
 PerParameter = Float[np.ndarray, " parameters"]
+_PARTNER = 0.2  # a parameter with this share of a weakly determined direction is named as a partner
 
 
 class Identifiability(eqx.Module):
     """The information that a flight contains about each parameter, compared with its bracket.
 
     - `nominal`: the value of each parameter that the airframe implies.
-    - `half_width`: of the bracket.
+    - `half_width`: half-widths of the bracket.
     - `std`: the Cramer-Rao bound, as standard deviations in the units of the parameters.
     - `std_alone`: the Cramer-Rao bound if all other parameters were known.
-    - `eigenvalues`: of the information in units of half-widths, in increasing order. Below 1 the flight contains less
+    - `eigenvalues`: of the information in half-widths, in increasing order. Below 1 the flight contains less
       information about that direction than the bracket.
     - `directions`: the eigenvectors in half-widths, one in each column.
-    - `partner`: the smallest share of a weakly determined direction with which a parameter is named as a partner.
     """
-
-    partner: ClassVar[float] = 0.2
 
     nominal: PerParameter
     half_width: PerParameter
@@ -63,7 +60,7 @@ class Identifiability(eqx.Module):
                 vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
                 weakest = np.abs(vectors[:, np.argmax(np.abs(vectors[i]))])
                 share = weakest / weakest.max()  # that changes together with least effect on the flight
-                partners = np.flatnonzero((share > self.partner) & (np.arange(share.size) != i)).tolist()
+                partners = np.flatnonzero((share > _PARTNER) & (np.arange(share.size) != i)).tolist()
                 partners = partners or [int(np.argsort(share)[-2])]
                 return f"not identifiable: only together with {', '.join(names[j] for j in partners)}"
             if self.noise_limit[i] < 1 and self.nominal[i] != 0:
@@ -97,7 +94,7 @@ def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability
     diagonal = np.diagonal(information)
     with np.errstate(divide="ignore"):
         alone = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 0.0)), np.inf)
-    std = np.sqrt(np.diagonal(inverse(information)))
+    std = np.sqrt(np.diagonal(inverses(information)))
     if not feasible:
         std = alone = np.full_like(std, np.inf)
     return Identifiability(nominal, half_width, std, alone, np.maximum(eigenvalues, 0.0), directions)

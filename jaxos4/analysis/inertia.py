@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
 from ..airframe import INVERSES, PITCH, ROLL, Airframe
+from ..linalg import inverses, unit_eigen
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
-from .evaluation import inverse, unit_eigen
 
 # The definitions below Eq. (13): alpha_i = (_OFFSET + _NUMERATOR @ constants)_i / constants[_DENOMINATOR_i], with
 # J_R in multiples of the model's gyroscopic factor.
@@ -28,7 +28,7 @@ class InertiaFit(eqx.Module):
     """The rigid body that explains eight alphas best; or one for each row of a batch.
 
     - `constants`: Ix, Iy, Iz, J_R [kg m^2].
-    - `covariance`: of the constants.
+    - `covariance`: covariance of the constants.
     - `mismatch`: (alpha - alpha(constants))^T C^-1 (alpha - alpha(constants)). If the alphas are those of a rigid body,
       it is chi-squared distributed with four degrees of freedom.
     - `p_value`: the probability that the alphas of a rigid body have this mismatch or a larger one.
@@ -74,7 +74,7 @@ def fit_inertia(
     whiten = np.swapaxes(vectors, -1, -2) / np.sqrt(values)[..., :, None] / scale[..., None, :]
     with np.errstate(all="ignore"):
         constants, curvature, residuals = _gauss_newton(alpha, whiten, inertia)
-        spread = inverse(curvature)
+        spread = inverses(curvature)
         mismatch = np.square(residuals).sum(axis=-1)
     fitted = usable & np.isfinite(spread).all(axis=(-2, -1)) & np.isfinite(mismatch) & (constants[..., :3] > 0).all(-1)
     in_factors = np.array([1, 1, 1, factor])
@@ -118,7 +118,7 @@ def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) ->
     for _ in range(20):
         slopes, curvature, residuals = linearised(constants)
         gradient = np.swapaxes(slopes, -1, -2) @ residuals[..., None]
-        constants = constants + (inverse(curvature) @ gradient)[..., 0]
+        constants = constants + (inverses(curvature) @ gradient)[..., 0]
     return constants, *linearised(constants)[1:]
 
 

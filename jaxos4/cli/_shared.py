@@ -1,13 +1,9 @@
 """Shared by the commands: progress, the exit code, and files."""
 
 import contextlib
-import errno
 import json
-import os
 import re
-import secrets
 import shlex
-import shutil
 import sys
 import threading
 import time
@@ -17,7 +13,7 @@ from typing import Any
 
 import typer
 
-from .._files import check_writable, read_json, write_file
+from .._files import check_writable, write_file
 from ..errors import InputError, printable
 from .options import as_typed
 
@@ -28,7 +24,7 @@ def command() -> str:
 
 
 def console() -> Any:
-    """Where texts of the library are printed, with the options of this command in them."""
+    """A console that prints texts of the library with the options of this command in them."""
     from rich.console import Console
 
     class Shown(Console):
@@ -115,58 +111,6 @@ def end(result: str) -> None:
     if result != "successful":
         typer.echo(f"jaxos4: {result}: {meaning(result)}", err=True)
         raise typer.Exit(1)
-
-
-MANIFEST = "manifest.json"
-
-
-def check_folder(folder: Path) -> list[str]:
-    """Refuses a folder to write that cannot be made, or that holds files besides those that its manifest lists.
-
-    Returns the names of the files that it holds.
-    """
-    if not os.path.lexists(folder):
-        check_writable(folder)
-        return []
-    if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder; give the output another name.")
-    if not os.access(folder, os.W_OK):
-        raise PermissionError(errno.EACCES, "is not writable", str(folder))
-    ours = {MANIFEST}
-    with contextlib.suppress(OSError, InputError, LookupError, TypeError):
-        ours |= {each["file"] for each in read_json(folder / MANIFEST, "")["vehicles"]}
-    names = sorted(each.name for each in folder.iterdir())
-    complete = MANIFEST in names and len(ours) > 1
-    others = [name for name in names if not complete or name not in ours or not (folder / name).is_file()]
-    if others:
-        raise InputError(
-            f"{folder}: holds {others[0]}, which no manifest there lists; give another folder, or empty it."
-        )
-    return names
-
-
-def write_folder(texts: dict[str, str], folder: Path) -> None:
-    """Writes text files, by name; the last is the manifest. A new folder appears when all files are in it.
-
-    In a folder that `check_folder` allows, new files replace those of the manifest, which is gone until all are there.
-    """
-    old, exists = check_folder(folder), folder.exists()
-    beside = (folder if exists else folder.parent) / f".{folder.name[:40]}.{secrets.token_hex(4)}.part"
-    try:
-        beside.mkdir()
-        for name, text in texts.items():
-            (beside / name).write_text(text, encoding="utf-8")
-        if exists:
-            for name in sorted(old, key=lambda name: name != MANIFEST):
-                (folder / name).unlink()
-            for name in texts:
-                (beside / name).rename(folder / name)
-        else:
-            beside.rename(folder)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(folder)) from None
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
 
 
 def write_json(report: dict[str, Any], out: Path) -> None:

@@ -1,24 +1,22 @@
 """`jaxos4 export` and `jaxos4 predict`: an identified vehicle as a model for a simulator, and on another flight."""
 
+import contextlib
+import errno
+import os
+import secrets
+import shutil
+from pathlib import Path
+
 import typer
 
 import jaxos4
 
-from .._files import write_file
+from .._files import check_writable, read_json, write_file
 from ..errors import InputError
 from . import options
-from ._shared import (
-    MANIFEST,
-    check_folder,
-    check_outputs,
-    command,
-    console,
-    end,
-    json_text,
-    stages,
-    write_folder,
-    write_json,
-)
+from ._shared import check_outputs, command, console, end, json_text, stages, write_json
+
+_MANIFEST = "manifest.json"
 
 
 def export(
@@ -40,7 +38,7 @@ def export(
     folder = out if samples > 0 else None
     check_outputs(result, out=out if folder is None else None)
     if folder is not None:
-        check_folder(folder)
+        _check_folder(folder)
     with stages("loading the library") as progress:
         from ..export import TARGETS, export_vehicle, read_result
 
@@ -55,17 +53,64 @@ def export(
         typer.echo(written.text, nl=False)
     elif folder is not None:
         files = (each["file"] for each in written.manifest["vehicles"])
-        write_folder(dict(zip(files, written.samples, strict=True)) | {MANIFEST: json_text(written.manifest)}, folder)
+        _write_folder(dict(zip(files, written.samples, strict=True)) | {_MANIFEST: json_text(written.manifest)}, folder)
         again = f"; {written.impossible} draws that no vehicle can have were repeated" if written.impossible else ""
         typer.echo(f"{out}: {samples} vehicles, {target.label}, drawn with seed {seed}{again}")
     else:
         write_file(out, written.text)
         typer.echo(f"{out}: {target.label}")
-    for doubt in found.doubts:
-        typer.echo(options.as_typed(doubt), err=True)
-    for note in written.notes:
-        typer.echo(options.as_typed(f"note: {note}"), err=True)
-    end(found.result)
+    for line in (*found.identification.warnings, *(f"note: {note}" for note in written.notes)):
+        typer.echo(options.as_typed(line), err=True)
+    end(found.identification.result)
+
+
+def _check_folder(folder: Path) -> list[str]:
+    """Refuses a folder to write that cannot be made, or that holds files besides those that its manifest lists.
+
+    Returns the names of the files that it holds.
+    """
+    if not os.path.lexists(folder):
+        check_writable(folder)
+        return []
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; give the output another name.")
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(errno.EACCES, "is not writable", str(folder))
+    ours = {_MANIFEST}
+    with contextlib.suppress(OSError, InputError, LookupError, TypeError):
+        ours |= {each["file"] for each in read_json(folder / _MANIFEST, "")["vehicles"]}
+    names = sorted(each.name for each in folder.iterdir())
+    complete = _MANIFEST in names and len(ours) > 1
+    others = [name for name in names if not complete or name not in ours or not (folder / name).is_file()]
+    if others:
+        raise InputError(
+            f"{folder}: holds {others[0]}, which no manifest there lists; give another folder, or empty it."
+        )
+    return names
+
+
+def _write_folder(texts: dict[str, str], folder: Path) -> None:
+    """Writes text files, by name; the last is the manifest. A new folder appears when all files are in it.
+
+    In a folder that `_check_folder` allows, new files replace those of the manifest, which is gone until all are there.
+    """
+    old, exists = _check_folder(folder), folder.exists()
+    beside = (folder if exists else folder.parent) / f".{folder.name[:40]}.{secrets.token_hex(4)}.part"
+    try:
+        beside.mkdir()
+        for name, text in texts.items():
+            (beside / name).write_text(text, encoding="utf-8")
+        if exists:
+            for name in sorted(old, key=lambda name: name != _MANIFEST):
+                (folder / name).unlink()
+            for name in texts:
+                (beside / name).rename(folder / name)
+        else:
+            beside.rename(folder)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 def predict(

@@ -28,7 +28,6 @@ def inspect(
     with stages("loading the library") as progress:
         from ..recording import read_recording
         from ..recording.inspection import airframe_draft, inspect_log
-        from ..report.terminal import print_inspection
 
         progress("reading")
         vehicle = None if airframe is None else jaxos4.load_airframe(airframe)
@@ -44,7 +43,7 @@ def inspect(
         with stages("drawing"):
             jaxos4.report.write_log_page(report, recording, vehicle, found=found, command=command())
     shown = console()
-    print_inspection(shown, found, recording.facts.format.label if recording.facts.format else "")
+    jaxos4.report.print_inspection(shown, found, recording.facts.format.label if recording.facts.format else "")
     if report is not None:
         shown.print(f"report: {report}", soft_wrap=True)
     if airframe_out is not None:
@@ -70,7 +69,6 @@ def identifiability(
     with stages("loading the library") as progress:
         from ..models import MODELS
         from ..recording import read_recording
-        from ..report.terminal import print_information
 
         progress("reading")
         subject = MODELS[model](jaxos4.load_airframe(airframe))
@@ -89,4 +87,4 @@ def identifiability(
     shown = console()
     for note in recording.notes:
         shown.print(f"note: {note}")
-    print_information(shown, found)
+    jaxos4.report.print_information(shown, found)

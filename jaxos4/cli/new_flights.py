@@ -142,19 +142,17 @@ def design(
     if result is not None:
         if airframe != _PRESET:
             raise InputError(f"--airframe: {result} has its own; leave it out.")
-        asked["gust"] = gust  # that of the result, if none is given
+        asked["gust"] = gust  # by default the result's
     check_outputs(result, None if result else airframe, bracket, out=out, figure=figure)
     begin = time.perf_counter()
     with stages("loading the library") as progress:
         found = _find(asked, progress)
         progress("writing")
         found.task.write(found.designed, out)
-    from ..report.design import print_design, write_design
-
     if figure is not None:
         with stages("drawing"):
-            write_design(found, asked["accuracy"] / 100, figure)
-    print_design(console(), found, asked["accuracy"] / 100)
+            jaxos4.report.write_design_figure(figure, found, asked["accuracy"] / 100)
+    jaxos4.report.print_design(console(), found, asked["accuracy"] / 100)
     samples = f"{found.designed.inputs.shape[0]} samples of {asked['dt']:g} s"
     kind, seconds = found.task.kind if closed_loop else f"{asked['model']} model", time.perf_counter() - begin
     typer.echo(f"{out}: {samples}, {kind}, criterion {found.task.criterion}, {seconds:.0f} s")
@@ -183,7 +181,7 @@ def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "jaxos4.Des
 
 
 def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a command with the defaults of its kind of flight. Refuses those of the other, or out of range."""
+    """The options of a command, with defaults. Refuses options of the other kind of flight, and values out of range."""
     own, others = (_CLOSED, _OPEN) if closed_loop else (_OPEN, _CLOSED)
     for name, value in options.given(**asked).items():
         if name in others and name not in own:
@@ -196,7 +194,7 @@ def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def make_loop(asked: Mapping[str, Any]) -> "jaxos4.ClosedLoop":
-    """The vehicle in closed loop with these options; that of a result, if there is one."""
+    """The vehicle in closed loop with these options, from a result if there is one."""
     settings = options.given(
         rotor_lag=asked["lag"],
         rotor_delay=asked["delay"],

@@ -32,22 +32,20 @@ def study(
     if dry_run:
         _print_plan(wanted, out)
         return
-    from ..report.study_tables import count_outcomes
-
     if scheduler is None:
         dataset = run_with_bar(wanted, out)
     else:
         with _connected(scheduler) as client:
             run = partial(jaxos4.study.run_on_cluster, client=client)
             dataset = run_with_bar(wanted, out, device="Dask cluster", run=run)
-    typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
+    typer.echo(f"{out}: {jaxos4.report.count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
 
 
 def run_with_bar(wanted: "jaxos4.study.Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
-    """The Dataset of `jaxos4.study.carry_out`, with a progress bar. `device`: by default those of this process."""
+    """The Dataset of `jaxos4.study.run_study`, with a progress bar. `device`: by default those of this process."""
     try:
         with stages("compiling", wanted.count) as progress:
-            return jaxos4.study.carry_out(wanted, out, device or jaxos4.study.device_name(), progress=progress, **how)
+            return jaxos4.study.run_study(wanted, out, device or jaxos4.study.device_name(), progress=progress, **how)
     except KeyboardInterrupt:
         typer.echo(f"jaxos4: {out}: interrupted; run the same command again to continue.", err=True)
         raise
@@ -87,30 +85,29 @@ def report(
         raise InputError(
             f"{source}: is not there; give the folder of a `jaxos4 study`, or a file of `jaxos4 estimate --out`."
         )
-    if not source.is_dir() and csv is not None:
-        raise InputError(
-            f"--csv: {source} is a result; `found.to_dataframe()` in Python makes its table. Leave it out."
-        )
-    if not source.is_dir():
-        if pdf:
-            raise InputError(f"--pdf: {source} is a result, which has a page alone; leave it out.")
-        out = source.with_suffix(".html") if out is None else out
-        check_outputs(source, out=out)
-    elif out is not None:
-        raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
-    with stages("loading the library") as progress:
-        progress("reading")
-        if out is None:
+    if source.is_dir():
+        if out is not None:
+            raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
+        with stages("loading the library") as progress:
+            progress("reading")
             dataset = jaxos4.study.read_results(source)
             progress("drawing")
             if csv is not None:
                 check_outputs(source / "results.nc", csv=csv)
                 write_file(csv, jaxos4.report.error_csv(dataset))
             page, *figures = jaxos4.report.write_report(dataset, source, pdf=pdf)
-        else:
+    else:
+        if csv is not None:
+            table = "`found.to_dataframe()` in Python makes its table"
+            raise InputError(f"--csv: {source} is a result; {table}. Leave it out.")
+        if pdf:
+            raise InputError(f"--pdf: {source} is a result, which has a page alone; leave it out.")
+        page, figures = source.with_suffix(".html") if out is None else out, []
+        check_outputs(source, out=page)
+        with stages("loading the library") as progress:
+            progress("reading")
             found = jaxos4.read_result(source)
             progress("drawing")
-            page, figures = out, []
             jaxos4.report.write_flight_page(page, found)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
@@ -160,7 +157,6 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
     add_flags(brief=quick)
     with stages("loading the library"):
-        from ..report.study_tables import count_outcomes
         from ..report.text import print_whole
 
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
@@ -168,7 +164,7 @@ def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     with stages("drawing"):
         page, *_ = jaxos4.report.write_report(dataset, directory)
     print_whole(console(), jaxos4.report.error_table(dataset))
-    typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
+    typer.echo(f"{jaxos4.report.count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")
 
 

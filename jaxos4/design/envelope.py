@@ -56,8 +56,8 @@ class Envelope(eqx.Module):
 
     def limited(self, limits: Mapping[str, Any]) -> "Envelope":
         """This envelope with some limits replaced. Raises `InputError` if one of them is impossible."""
-        if strangers := [name for name in limits if name not in vars(self)]:
-            raise InputError(f"`limits`: knows no `{strangers[0]}`; the limits are {', '.join(vars(self))}.")
+        if unknown := [name for name in limits if name not in vars(self)]:
+            raise InputError(f"`limits`: knows no `{unknown[0]}`; the limits are {', '.join(vars(self))}.")
         with named("the envelope"):
             return Envelope(**vars(self) | dict(limits))
 

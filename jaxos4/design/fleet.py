@@ -87,6 +87,11 @@ def fly_batch(loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt
     return eqx.filter_vmap(one)(loops, references, jax.random.split(key, LANES))
 
 
+def inertias_first(of_inertias: tuple, of_parameters: tuple) -> tuple:
+    """Items for Ix, Iy and Iz, then items for the parameters of a `FlightModel` that are not their reciprocals."""
+    return (*of_inertias, *(one for i, one in enumerate(of_parameters) if i not in INVERSES))
+
+
 class Fleet(eqx.Module):
     """A vehicle in gusts, and vehicles with moments of inertia that are drawn from a bracket, and gusts of their own.
 
@@ -119,10 +124,6 @@ class Fleet(eqx.Module):
         parameters = np.array([float(known.get(name, value)) for name, value in zip(names, alpha, strict=True)])
         return cls(loop, loops, model, jnp.asarray(parameters), prior, dt, jax.random.fold_in(key, 1))
 
-    def inertias_first(self, of_inertias: tuple, of_parameters: tuple) -> tuple:
-        """Something of Ix, Iy and Iz, then the same of the model's parameters that are not their reciprocals."""
-        return (*of_inertias, *(one for i, one in enumerate(of_parameters) if i not in INVERSES))
-
     def about_inertias(self, information: Float[Numeric, "*some n n"]) -> Float[np.ndarray, "*some n n"]:
         """From information about the model's unknowns to that about log Ix, log Iy, log Iz, and the others."""
         alpha, slopes = np.asarray(self.parameters), np.eye(information.shape[-1])
@@ -130,7 +131,7 @@ class Fleet(eqx.Module):
             slopes[place, place] = -alpha[place]
             if "thrust_gain" in self.model.parameter_names:
                 slopes[place, self.model.parameter_names.index("thrust_gain")] = alpha[place]
-        slopes = slopes[:, self.inertias_first(tuple(INVERSES), tuple(range(len(slopes))))]
+        slopes = slopes[:, inertias_first(tuple(INVERSES), tuple(range(len(slopes))))]
         return slopes.T @ np.asarray(information) @ slopes
 
     def with_prior(self, information: Float[Numeric, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -152,7 +153,8 @@ class Fleet(eqx.Module):
     ) -> tuple[Float[Array, "flights n n"], Float[Array, "flights channels parameters parameters"]]:
         """The Fisher information of each flight's innovations: all that the design knows of filter error.
 
-        **Returns:** that about parameters and noise, with its weak prior; that of each channel about the parameters.
+        **Returns:** the information about parameters and noise, with its weak prior; and from each channel the
+        information about the parameters.
         """
         loop, count = self.loop, self.parameters.shape[0]
         strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), _LEAST_GUST)

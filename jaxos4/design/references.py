@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float
 from ..airframe import INERTIAS
@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..flight import ANGLES, RATES
 from . import task
 from .envelope import Envelope, Uses
-from .fleet import LANES, Fleet, batch_of, fly_batch, model_of
+from .fleet import LANES, Fleet, batch_of, fly_batch, inertias_first, model_of
 from .task import Coefficients, Designed, Flown
 
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
@@ -80,15 +80,15 @@ def _response(
     scale = np.sqrt(np.diagonal(base))
     scale[: len(INERTIAS)] = 1  # their bounds are relative already
     unit = np.outer(scale, scale)
-    # The answers in the last period, in which the beginning is forgotten.
+    # The responses in the last period, in which the beginning is forgotten.
     last = np.conj(turns[-tones.period :]) * 2 / tones.period
     signals = {}
     for name, columns in (("angle", ANGLES), ("rate", RATES)):
         left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
         if (left <= 0).any():
             raise _too_gusty(name)
-        answers = np.einsum("kta,tk->ak", states[:number, -tones.period :, columns], last) / _SMALL[:3, None]
-        moving = _parts(answers[:, None] * tones.turns(_POINTS))
+        responses = np.einsum("kta,tk->ak", states[:number, -tones.period :, columns], last) / _SMALL[:3, None]
+        moving = _parts(responses[:, None] * tones.turns(_POINTS))
         signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
     relative = np.square(largest / _SMALL)[:, None, None, None]
     return {"base": jnp.asarray(base / unit), "added": jnp.asarray(relative * each / unit), "signals": signals}
@@ -102,7 +102,7 @@ class ReferenceTask(task.AbstractTask):
       each reference. Both are about the inertias first.
     - `signals`: the angles and rates of an axis by a unit of the coefficients of its reference, cosines first, as a
       share of the part of the limit that gusts leave; by the name of the limit.
-    - `largest`: the largest value of each reference. `basis`: the tones at the points of a period.
+    - `largest`: the largest value of each reference.
     """
 
     kind: ClassVar[str] = "references"
@@ -110,6 +110,8 @@ class ReferenceTask(task.AbstractTask):
     starts: ClassVar[int] = 8
     first: ClassVar[float] = 0.85
 
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
     envelope: Envelope
     scale: Float[Numeric, "3"]
     unexcited: Float[Numeric, " parameters"]
@@ -118,22 +120,11 @@ class ReferenceTask(task.AbstractTask):
     added: Float[Numeric, "references tones unknowns unknowns"]
     signals: dict[str, Float[Numeric, "axes points coefficients"]]
     largest: Float[Numeric, "4"]
-    basis: Float[Array, "points coefficients"]
     tones: Tones = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_references)
-
-    @property
-    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """Ix, Iy and Iz, and the model's other parameters."""
-        return self.fleet.inertias_first(INERTIAS, self.fleet.model.parameter_names)
-
-    @property
-    def units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """Of `names`."""
-        return self.fleet.inertias_first(("kg m^2",) * len(INERTIAS), self.fleet.model.parameter_units)
 
     @property
     def size(self) -> int:
@@ -150,7 +141,7 @@ class ReferenceTask(task.AbstractTask):
         """See `AbstractTask`."""
         each = coefficients.reshape(4, -1)
         moved = {name: jnp.einsum("apk,ak->pa", some, each[:3]) for name, some in self.signals.items()}
-        return moved | {"reference": self.basis @ each.T}
+        return moved | {"reference": as_float(_parts(self.tones.turns(_POINTS))) @ each.T}
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`. The references have their largest values, or are reduced to a share of them."""
@@ -165,7 +156,7 @@ class ReferenceTask(task.AbstractTask):
             for name, share in uses.items():
                 if still[name] >= 1:
                     raise _too_gusty(name)
-                if share > 1:  # the share beyond that of gusts grows about linearly with the references
+                if share > 1:  # the share that gusts do not use grows about linearly with the references
                     steps.append((_TARGET - still[name]) / (share - still[name]))
             factor *= max(min(steps), _LEAST_STEP)
             uses = self.fleet.uses(factor * inputs, self.envelope)
@@ -231,12 +222,13 @@ def design_references(
     tones = Tones.up_to(bandwidth, samples, dt)
     progress("flying tones")
     references = ReferenceTask(
+        names=inertias_first(INERTIAS, fleet.model.parameter_names),
+        units=inertias_first(("kg m^2",) * len(INERTIAS), fleet.model.parameter_units),
         envelope=envelope,
         scale=np.asarray(loop.airframe.inertia),
         unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
         largest=largest,
-        basis=as_float(_parts(tones.turns(_POINTS))),
         tones=tones,
         samples=samples,
         criterion=criterion,

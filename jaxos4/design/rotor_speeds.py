@@ -69,6 +69,8 @@ class RotorSpeedTask(task.AbstractTask):
     starts: ClassVar[int] = 2
     first: ClassVar[float] = 0.1  # a coefficient of 1 alone uses the whole envelope
 
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
     envelope: Envelope
     scale: Float[Numeric, " parameters"]
     unexcited: Float[Numeric, " parameters"]
@@ -85,16 +87,6 @@ class RotorSpeedTask(task.AbstractTask):
     criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_input)
-
-    @property
-    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """Of the model's parameters."""
-        return self.model.parameter_names
-
-    @property
-    def units(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """Of the model's parameters."""
-        return self.model.parameter_units
 
     @property
     def size(self) -> int:
@@ -333,6 +325,8 @@ def design_input(
     rotor_speeds = RotorSpeedTask(
         **_tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth),
         model=model,
+        names=model.parameter_names,
+        units=model.parameter_units,
         scale=np.asarray(bracket.half_width),
         unexcited=np.asarray(model.half_width),
         envelope=envelope,

@@ -93,7 +93,7 @@ class AbstractTask(eqx.Module):
     - `names`, `units`: of each parameter, the targets first.
     - `scale`: for each target, a size of which accuracies are shares. `unexcited`: a parameter whose bound is not below
       this counts as not excited.
-    - `criterion`: of the accuracy of all targets, see `design_input`.
+    - `criterion`: how the accuracies of all targets are combined, see `design_input`.
     """
 
     kind: ClassVar[str]

@@ -75,10 +75,9 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
     if to not in TARGETS:
         raise InputError(f"`to`: must be one of {', '.join(TARGETS)}, got {to!r}.")
     _check_draws(samples, seed)
-    target = TARGETS[to]
-    warning = (
-        () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {meaning(found.result)}.", *found.doubts)
-    )
+    target, own, warning = TARGETS[to], found.identification, tuple[str, ...]()
+    if not own.successful:
+        warning = (f"NOT TO BE TRUSTED: {own.result}: {meaning(own.result)}.", *own.warnings)
 
     def text(vehicle: RigidVehicle, *lines: str) -> str:
         made = f"Made by jaxos4 {__version__} from {found.source}."

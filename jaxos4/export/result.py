@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import as_constant
-from ..airframe import AXES, INERTIAS, YAW, Airframe
+from ..airframe import AXES, INERTIAS, YAW
 from ..closed_loop import ClosedLoop
 from ..errors import InputError, named, printable
 from ..flight import RATES, STATE_NAMES
@@ -36,35 +36,25 @@ _MAX_DRAWS, _MAX_IMPOSSIBLE = 1_000_000, 1000
 
 
 class Identified(NamedTuple):
-    """A vehicle from a result file.
+    """A vehicle from a result.
 
     - `source`: names the file, the estimator, the model and the result.
-    - `result`: the name of the result code. If it is not `"successful"`, the estimate cannot be trusted.
-    - `airframe`: the constants that were not estimated.
+    - `identification`: the result itself.
     - `values`: all parameters by name, estimated or fixed.
     - `identifies_iz`: whether the flights show Iz, if the airframe's drag coefficient is right.
-    - `doubts`: why the estimate cannot be trusted, or only with care, and what to do; one line each. Empty if the
-      result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.
     - `inertia_z`: the moment of inertia Iz [kg m^2] that the user gave in the place of the estimate.
     - `varying`, `root`: the Gaussian of the constants that differ in drawn vehicles, see `spread_of`.
     """
 
     source: str
-    result: str
-    airframe: Airframe
+    identification: VehicleIdentification
     values: dict[str, float]
     identifies_iz: bool
-    doubts: tuple[str, ...]
     notes: tuple[str, ...]
     inertia_z: float | None = None
     varying: dict[str, dict[str, Any]] = {}
     root: Float[np.ndarray, "n n"] = np.zeros((0, 0))
-
-    @property
-    def successful(self) -> bool:
-        """True if the estimate can be trusted."""
-        return self.result == "successful"
 
     @property
     def vehicle(self) -> RigidVehicle:
@@ -72,13 +62,14 @@ class Identified(NamedTuple):
         return self._made(self.values)
 
     def _made(self, values: dict[str, float]) -> RigidVehicle:
-        estimated = rigid_vehicle(self.airframe, values)
+        airframe = self.identification.airframe
+        estimated = rigid_vehicle(airframe, values)
         ix, iy, iz = estimated.inertia
         if self.inertia_z is None or (self.identifies_iz and not iz > 0):
             return estimated
         rounding = 1e-9
         allowed = min(max(self.inertia_z, (1 + rounding) * abs(ix - iy)), (1 - rounding) * (ix + iy))
-        vehicle = rigid_vehicle(self.airframe, {**values, YAW.inertia: allowed})
+        vehicle = rigid_vehicle(airframe, {**values, YAW.inertia: allowed})
         if not self.identifies_iz:
             return vehicle
         # Flights show the yaw torque over Iz: another Iz means another drag coefficient.
@@ -150,11 +141,9 @@ def read_result(found: Identification | str | os.PathLike[str], *, inertia_z: fl
         source = printable(", ".join(file.logs) if isinstance(found, Identification) else Path(found).name)
         exported = Identified(
             source=f"{source} ({file.estimator}, {file.model} model, {file.result})",
-            result=file.result,
-            airframe=file.airframe,
+            identification=file,
             values=values | dict.fromkeys(negative, 0.0),
             identifies_iz=YAW.inverse in estimated,
-            doubts=file.warnings,
             notes=tuple(notes),
             inertia_z=inertia_z,
         )
@@ -237,10 +226,10 @@ def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:
     `settings`: of a `ClosedLoop`, instead of those that were found. Raises as `read_result` does.
     """
     found = read_result(path)
-    vehicle, gusts = found.vehicle, vehicle_result(path).disturbances
+    vehicle, gusts = found.vehicle, found.identification.disturbances
     airframe = eqx.tree_at(
         lambda airframe: tuple(getattr(airframe, name) for name in _FOUND),
-        found.airframe,
+        found.identification.airframe,
         tuple(as_constant(getattr(vehicle, name)) for name in _FOUND),
     )
     known: dict[str, Any] = {name: found.values[name] for name in _MOTOR if found.values.get(name, 0.0) > 0}

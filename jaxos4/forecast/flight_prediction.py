@@ -1,4 +1,4 @@
-"""A prediction of a flight: states, band, errors beside those of simple predictions, tables and files."""
+"""A prediction of a flight: states, band, errors compared with simple predictions, tables and files."""
 
 import os
 from collections.abc import Iterator
@@ -59,15 +59,15 @@ class FlightPrediction(NamedTuple):
     z from body to earth, body rates [rad/s]. NaN: not measured.
 
     - `found`, `flight`: names of the result and of the flight.
-    - `time`: of each start in the log [s]. `horizons`: time from the start to the prediction [s].
+    - `time`: time of each start in the log [s]. `horizons`: time from the start to the prediction [s].
     - `begin`: the state at the start.
     - `predicted`: with the disturbance at the start that the filters know. `unaware`: without.
-    - `half_width`: of the 95 % band of what is measured: position, velocity, attitude as a small rotation about the
-      body's axes [rad], rates.
+    - `half_width`: half the width of the 95 % band of measurements: position, velocity, attitude as a small rotation
+      about the body's axes [rad], rates.
     - `measured`: the states at each horizon.
     - `constant`, `regression`: the states by simple predictions. `None`: the flight says too little for a regression.
     - `missing`: the quantities that were not measured, and are not compared.
-    - `seed`: of the draws for the band. `notes`: about the result and the data.
+    - `seed`: random seed of the band's draws. `notes`: on the result and the data.
     """
 
     found: str

@@ -5,10 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..flight import STATE_NAMES, Flight
+from ..flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY, Flight
 from ..recording.noise import white_noise
+from ..rotations import attitude_quaternion, conjugate, quaternion_product, rotated
 from .flight_prediction import known_mean
-from .motion import PARTS, departures, inverse, product, turned
+from .motion import PARTS, departures
 
 
 class Measured(NamedTuple):
@@ -31,14 +32,8 @@ class Measured(NamedTuple):
     def of(cls, flight: Flight) -> "Measured":
         """The measurements of a flight."""
         recorded = np.asarray(flight.states)
-        position, velocity, angles, rates = (
-            recorded[:, [STATE_NAMES.index(name) for name in names.split()]]
-            for names in ("x y z", "vx vy vz", "phi theta psi", "p q r")
-        )
-        half = np.stack([np.cos(angles / 2), np.sin(angles / 2)])
-        zero = np.zeros(len(angles))
-        roll, pitch, yaw = ((half[0, :, i], *np.insert([zero, zero], i, half[1, :, i], axis=0)) for i in range(3))
-        attitude = np.stack(product(yaw, product(pitch, roll)), axis=1)
+        position, velocity, angles, rates = (recorded[:, places] for places in (POSITION, VELOCITY, ANGLES, RATES))
+        attitude = np.stack(attitude_quaternion(angles), axis=1)
         columns = np.concatenate([position, velocity, angles, rates], axis=1).T
         noise = np.nan_to_num([white_noise(column, 4) for column in columns])
         states = np.concatenate([position, velocity, attitude, rates], axis=1)
@@ -49,7 +44,7 @@ class Measured(NamedTuple):
         """From each sample to the next: p', q', r' [rad/s^2], and the specific force that velocity implies [m/s^2]."""
         change = np.diff(self.states, axis=0) / self.dt
         change[np.diff(self.stretch) != 0] = np.nan
-        force = turned(inverse(self.states[:-1, 6:10].T), tuple((change[:, 3:6] + [0.0, 0.0, gravity]).T))
+        force = rotated(conjugate(self.states[:-1, 6:10].T), tuple((change[:, 3:6] + [0.0, 0.0, gravity]).T))
         return np.pad(np.hstack([change[:, 10:], np.stack(force, 1)]), ((0, 1), (0, 0)), constant_values=np.nan)
 
     def has(self, part: str) -> bool:
@@ -71,15 +66,16 @@ class Measured(NamedTuple):
         Sensors contradict each other by noise of any colour, or by shifted clocks; the accelerometer's mean error does
         not count.
 
-        **Returns:** the standard deviation after each step, without what the white noise of gyro and accelerometer
-        causes, and at least that of the start and the end; that alone for fewer than `fewest` starts.
+        **Returns:** the standard deviation after each step, less the part that the white noise of gyro and
+        accelerometer causes. It is at least the noise of start and end together, and equal to it for fewer than
+        `fewest` starts.
         """
         rows, dt, down = start[:, None] + np.arange(steps + 1), self.dt, np.array([0.0, 0.0, gravity])
         begin, rates = self.states[start], self.states[rows[:, 1:], 10:]
         turning = _moved(begin, rates, np.zeros_like(rates), dt)[..., 6:10]
         attitude = np.moveaxis(np.concatenate([begin[:, None, 6:10], turning], axis=1), -1, 0)
         force = self.force + known_mean(self.accelerations(gravity)[:, 3:] - self.force)
-        push = np.stack(turned(attitude, tuple(np.moveaxis(force[rows], -1, 0))), axis=-1) - down
+        push = np.stack(rotated(attitude, tuple(np.moveaxis(force[rows], -1, 0))), axis=-1) - down
         velocity = begin[:, None, 3:6] + dt * np.cumsum((push[:, 1:] + push[:, :-1]) / 2, axis=1)
         reckoned = _moved(begin, rates, velocity, dt)
         departed = np.abs(departures(reckoned, self.states[rows[:, 1:]]))[..., :9]
@@ -125,7 +121,7 @@ def regressed(
         found = (_features(now, speeds, moves) / scale) @ weights
         rate, velocity = np.clip(now[:, 10:] + dt * found[:, :3], -1e3, 1e3), now[:, 3:6]
         if moves:
-            push = np.stack(turned(now[:, 6:10].T, tuple(found[:, 3:].T)), axis=1)
+            push = np.stack(rotated(now[:, 6:10].T, tuple(found[:, 3:].T)), axis=1)
             velocity = velocity + dt * (push - [0.0, 0.0, gravity])
         now = _moved(now, rate[:, None], velocity[:, None], dt)[:, 0]
         states.append(now)
@@ -134,7 +130,7 @@ def regressed(
 
 def _features(states: np.ndarray, omega: np.ndarray, moves: bool) -> np.ndarray:
     rates, one = states[:, 10:], np.ones((len(states), 1))
-    velocity = [np.stack(turned(inverse(states[:, 6:10].T), tuple(states[:, 3:6].T)), axis=1)] if moves else []
+    velocity = [np.stack(rotated(conjugate(states[:, 6:10].T), tuple(states[:, 3:6].T)), axis=1)] if moves else []
     return np.concatenate([one, rates, *velocity, omega**2], axis=1)
 
 
@@ -155,6 +151,6 @@ def _moved(
     for turn in np.moveaxis(turns, 1, 0):
         angle = np.linalg.norm(turn, axis=1)
         axis = turn * (np.sinc(angle / (2 * np.pi)) / 2)[:, None]
-        attitude = product(attitude, (np.cos(angle / 2), *axis.T))
+        attitude = quaternion_product(attitude, (np.cos(angle / 2), *axis.T))
         attitudes.append(np.stack(attitude, axis=1))
     return np.concatenate([position, velocity, np.stack(attitudes, axis=1), rates], axis=2)

@@ -13,13 +13,11 @@ from ..analysis.prediction import Filtered, filtered, gyro_bias, open_loop
 from ..flight import RATES, STATE_NAMES, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Forcing, Rates, State
+from ..rotations import Quaternion, Vector, conjugate, deviation, quaternion_product, rotated
 from ..shooting import FASTEST
 from ..shooting.gains import Covariance, LogNoise, Transition, first_covariance, is_rate, next_gains, step_of
 from ..simulation import runge_kutta
 
-_Samples = Float[Numeric, "*samples"]
-Vector = tuple[_Samples, _Samples, _Samples]
-Quaternion = tuple[_Samples, _Samples, _Samples, _Samples]
 PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10], "rates": np.r_[10:13]}
 """The places of the parts of a state in an array of 13. The attitude is the quaternion w, x, y, z, body to earth."""
 
@@ -44,24 +42,24 @@ class Known(NamedTuple):
 
     - `state`: as measured, as in `PARTS`.
     - `filters`: rates and unexplained specific forces [rad/s; m/s^2], and what drives these [rad/s^2; m/s^2].
-    - `unsure`: the standard deviation of each offset, see `Futures`.
+    - `offset_std`: the standard deviation of each offset, see `Futures`.
     """
 
     state: Float[Numeric, "... 13"]
     filters: Filtered
-    unsure: Float[Numeric, "... 6"]
+    offset_std: Float[Numeric, "... 6"]
 
 
 class Futures(NamedTuple):
     """Several futures of each start.
 
-    - `parameters`: of the model. `forcing`: of these parameters, one row for each sample.
-    - `offset`: what p', q', r' [rad/s^2] and the specific force [m/s^2] have in this recording besides the model, from
+    - `parameters`: of the model. `forcing`: with these parameters, one row for each sample.
+    - `offset`: p', q', r' [rad/s^2] and specific force [m/s^2] that the model lacks in this recording, estimated from
       the past of each sample.
     - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
-    - `errors`: of the filters at the start.
+    - `errors`: errors of the filters at the start.
     - `off`: errors of the offsets, and what they make of the disturbances at the start, in standard deviations.
-    - `gusts`: what each channel gains in each step besides the model.
+    - `gusts`: random increments of each channel in each step.
     """
 
     parameters: Float[Array, "futures parameters"]
@@ -71,43 +69,6 @@ class Futures(NamedTuple):
     errors: Filtered
     off: Float[Array, "futures 2 6"]
     gusts: Filtered
-
-
-def product(a, b) -> Quaternion:
-    """The quaternion of the rotation `b`, and then `a`. NumPy and JAX."""
-    (w, x, y, z), (k, j, m, n) = a, b
-    return (
-        w * k - x * j - y * m - z * n,
-        w * j + x * k + y * n - z * m,
-        w * m - x * n + y * k + z * j,
-        w * n + x * m - y * j + z * k,
-    )
-
-
-def inverse(a) -> Quaternion:
-    """The quaternion of the rotation back."""
-    w, x, y, z = a
-    return w, -x, -y, -z
-
-
-def turned(a, vector) -> Vector:
-    """A vector turned by a quaternion: from the body's axes to the earth's, if that is the attitude."""
-    w, *axis = a
-    b = cross(axis, vector)
-    x, y, z = (v + 2 * (w * c + d) for v, c, d in zip(vector, b, cross(axis, b), strict=True))
-    return x, y, z
-
-
-def cross(a, b) -> Vector:
-    """The cross product."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def deviation(a, b) -> Vector:
-    """Twice the vector part of the rotation from attitude `a` to `b`, in the axes of `a`: [rad] if it is small."""
-    w, *vector = product(inverse(a), b)
-    x, y, z = (2 * x * (1 - 2 * (w < 0)) for x in vector)
-    return x, y, z
 
 
 def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
@@ -123,7 +84,7 @@ def _fly_future(
     steps = future.gusts.driven.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    error, absorbed = start.unsure * future.off
+    error, absorbed = start.offset_std * future.off
     measured = Filtered(jnp.zeros(noise.strength.size).at[:3].set(w), jnp.zeros(noise.strength.size))
     known = jax.tree.map(lambda x, y, e: jnp.where(future.filtered, x, y) + e, start.filters, measured, future.errors)
     known = known._replace(disturbance=known.disturbance.at[:3].add(absorbed[:3]))
@@ -138,11 +99,11 @@ def _fly_future(
 
         @jax.jit  # traced once for the four stages of a step
         def derivative(motion: Motion) -> Motion:
-            row = forcing._replace(velocity=turned(inverse(motion.attitude), motion.velocity))
+            row = forcing._replace(velocity=rotated(conjugate(motion.attitude), motion.velocity))
             accelerations = _sum(model.angular_acceleration(motion.rates, row, scalars), turning)
             force = _sum(model.specific_force(row.thrust, row, scalars), pushing)
-            x, y, z = turned(motion.attitude, force)
-            spin = product(motion.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in motion.rates)))
+            x, y, z = rotated(motion.attitude, force)
+            spin = quaternion_product(motion.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in motion.rates)))
             return Motion(motion.velocity, (x, y, z - model.airframe.gravity), spin, Rates(*accelerations))
 
         moved = runge_kutta(derivative, motion, dt)
@@ -195,18 +156,18 @@ def known_at_samples(
 ) -> tuple[Known, Forcing, Float[Array, "futures samples 6"]]:
     """The knowledge at each sample, by the first row of `parameters`; forcing and offsets of each row: see `Futures`.
 
-    The velocity is left out of the forcing: it will be that of the prediction.
+    The forcing has no velocity: a prediction has its own.
 
     - `length`: the samples of the flight that are no padding.
     - `measured`: states, accelerations and the white noise of velocity: see `jaxos4.forecast.measured.Measured`.
-    - `noise`: of the filters. `prior`: the standard deviation of each offset before the flight.
+    - `noise`: levels of the filters. `prior`: the standard deviation of each offset before the flight.
     """
     state, accelerations, velocity_noise = measured
     rates, inputs = flight.states[:, RATES], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
     kept = jnp.exp(-flight.dt / MEMORY)
     sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), velocity_noise])
-    weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt)
+    weight, offset_std = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt)
 
     def of_future(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
@@ -225,7 +186,7 @@ def known_at_samples(
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     seen = jnp.concatenate([rates, force], axis=1)
     filters, _ = filtered(noise, seen, modelled, flight.stretch_numbers, flight.dt)
-    return Known(state, filters, unsure), forcing, offset
+    return Known(state, filters, offset_std), forcing, offset
 
 
 def _offset_weights(

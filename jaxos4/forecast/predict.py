@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import Parameters, as_float
+from ..airframe import MOTIONS
 from ..analysis.prediction import Filtered
 from ..errors import InputError, named, printable, shortened
-from ..flight import FORCE_NAMES, Flight
+from ..flight import ANGLES, FORCE_NAMES, Flight
 from ..identification import Identification
 from ..linalg import covariance_root
 from ..logs import Recording, Source, as_recording
@@ -23,11 +24,12 @@ from ..models.flight_model import FlightModel, without_recording
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording.prepared import Prepared, prepare
 from ..result_file import vehicle_result
+from ..rotations import rotated
 from ..shooting import capacity_of, pad_flight
 from ..shooting.gains import Covariance, LogNoise
 from .flight_prediction import FlightPrediction
 from .measured import Measured, constant_rates, regressed
-from .motion import PARTS, PUSH, Futures, fly_chunk, known_at_samples, settled, turned
+from .motion import PARTS, PUSH, Futures, fly_chunk, known_at_samples, settled
 
 DRAWS = 64  # futures of a start for the band
 HALF_BAND = 1.9977  # standard deviations of this many futures from the middle of a 95 % band to its end (Student)
@@ -38,13 +40,13 @@ CHUNK = 32  # starts that fly in one call of a program
 class Vehicle(NamedTuple):
     """The vehicle that predicts.
 
-    - `name`: of the result's file. Without a file: the estimator and the model.
-    - `model`: of one recording.
-    - `parameters`, `covariance`: of the model. The mean of the recordings, if each had its own value.
-    - `offset`: how far an offset of p', q', r' may be from the parameter in another recording, as a standard deviation
-      [rad/s^2]; 0 if the model has none.
-    - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
-    - `sample_time`: of the fit [s].
+    - `name`: the name of the result's file, or the estimator and the model.
+    - `model`: for one recording.
+    - `parameters`, `covariance`: estimates of the model's parameters; their mean, if each recording had its own value.
+    - `offset`: how much the offsets of p', q', r' vary from recording to recording, as standard deviations [rad/s^2];
+      0 if the model has none.
+    - `noise`: levels of the body rates, then of the specific forces along `model.force_axes`.
+    - `sample_time`: sample time of the fit [s].
     - `result`: the name of the result code.
     - `notes`: why the estimate cannot be trusted, and which parameters were not identified; one line each.
     """
@@ -67,9 +69,9 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     name = f"{file.estimator}, {file.model} model" if given else printable(Path(found).name)
     with named("" if given else found):
         used = file.provenance
-        if strangers := [term for term in used.terms or () if term not in TERMS]:
+        if unknown := [term for term in used.terms or () if term not in TERMS]:
             raise InputError(
-                f"the term {shortened(strangers[0], 40)} is not of this version; run `jaxos4 estimate` again."
+                f"the term {shortened(unknown[0], 40)} is not of this version; run `jaxos4 estimate` again."
             )
         model = FlightModel(file.airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
         known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
@@ -95,7 +97,7 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
             model,
             np.array(values),
             shares @ np.array(file.covariance) @ shares.T,
-            np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
+            np.array([width.get(f"{axis}_offset", 0.0) for axis in MOTIONS]),
             LogNoise(*np.log(np.maximum(table, 1e-9)).T),  # finite
             used.sample_time,
             file.result,
@@ -135,10 +137,10 @@ def predict(
     - `found`: the identification of a vehicle, the file that `jaxos4 estimate --out` wrote, or its
       `jaxos4.forecast.vehicle_of`.
     - `flight`: or the path of a log. It has body rates and attitude at least. Without a velocity, predictions begin
-      with that of dead reckoning, or at rest; what was not measured is not compared.
+      with one from dead reckoning, or at rest; what was not measured is not compared.
     - `horizon`: how far ahead [s]. `spacing`: the time between two starts [s]; 0: at each sample.
-    - `sample_time`: the log is averaged to it [s]. Default: that of the fit.
-    - `seed`: of the draws.
+    - `sample_time`: the log is averaged to it [s]; by default to the sample time of the fit.
+    - `seed`: random seed of the draws.
 
     The regression for comparison is fitted to the flight of an identification, or else to the first half of `flight`.
 
@@ -152,23 +154,12 @@ def predict(
         raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
     vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
     recording = as_recording(flight, airframe=vehicle.model.airframe)
-    prepared = _prepare(vehicle, recording, sample_time)
-    fitted = found.problem if isinstance(found, Identification) else None
-    trained = None if fitted is None else Measured.of(fitted.flight)
-    return _predicted(vehicle, recording.name, prepared, trained, horizon, spacing, seed)
-
-
-def _predicted(
-    vehicle: Vehicle,
-    name: str,
-    prepared: Prepared,
-    trained: Measured | None,
-    horizon: float,
-    spacing: float,
-    seed: int,
-) -> FlightPrediction:
-    """The prediction of a flight of this name. The regression is fitted to `trained`, or to the flight's first half."""
-    measured, flight = Measured.of(prepared.fitted), _padded(prepared.fitted)
+    name, prepared = recording.name, _prepare(vehicle, recording, sample_time)
+    measured, padded = Measured.of(prepared.fitted), prepared.fitted
+    if padded.body_velocity is None:  # the model's forcing has one
+        padded = dataclasses.replace(padded, body_velocity=np.zeros((padded.time.size, 3)))
+    if (capacity := capacity_of(padded.time.size)) != padded.time.size:
+        padded = pad_flight(padded, capacity)
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     for option, value in (("horizon", horizon), ("spacing", spacing)):
         if 0 < value < dt / 2:
@@ -177,9 +168,10 @@ def _predicted(
     start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    begin, states, spread = _predict_states(vehicle, flight, measured, start, missing, noise, steps, seed)
-    ahead, trained = start[:, None] + np.arange(1, steps + 1), measured.first_half if trained is None else trained
-    gravity = float(vehicle.model.airframe.gravity)
+    begin, states, spread = _predict_states(vehicle, padded, measured, start, missing, noise, steps, seed)
+    fitted = found.problem if isinstance(found, Identification) else None
+    trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
+    ahead, gravity = start[:, None] + np.arange(1, steps + 1), float(vehicle.model.airframe.gravity)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
     sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(
@@ -201,9 +193,9 @@ def _predicted(
 
 
 def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) -> Prepared:
-    """The usable parts of a log with the sample time of the fit, or that of the log if it is longer."""
+    """The usable parts of a log, averaged to the sample time of the fit if the log's is shorter."""
     name, airframe = recording.name, vehicle.model.airframe
-    if np.isnan(recording.states[:, [6, 8, 10]]).all(axis=0).any():
+    if np.isnan(recording.states[:, ANGLES]).all(axis=0).any():
         raise InputError(f"{name}: a prediction begins with the attitude; log phi, theta and psi.")
     if sample_time is not None and not sample_time >= 0.99 * recording.dt:
         raise InputError(f"`sample_time` {sample_time:g}: {name} has one sample every {recording.dt:.4g} s; give that.")
@@ -213,14 +205,6 @@ def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) 
         if lacking := (TERMS[term].needs & _INPUTS) - prepared.available:
             raise InputError(f"{name}: has no {' and '.join(sorted(lacking))}, which the term {term} needs; log it.")
     return prepared
-
-
-def _padded(flight: Flight) -> Flight:
-    """The flight with the velocity that the model's forcing has, with room for more samples."""
-    if flight.body_velocity is None:
-        flight = dataclasses.replace(flight, body_velocity=np.zeros((flight.time.size, 3)))
-    capacity = capacity_of(flight.time.size)
-    return flight if capacity == flight.time.size else pad_flight(flight, capacity)
 
 
 def _starts(
@@ -253,7 +237,7 @@ def _predict_states(
 ]:
     """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures.
 
-    A position that was not measured is 0, a velocity that of dead reckoning, without an offset of the force.
+    Without measurements, the position is 0, and the velocity comes from dead reckoning and has no offset of the force.
     """
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, flight.dt
     root = covariance_root(vehicle.covariance)
@@ -262,7 +246,7 @@ def _predict_states(
     state, samples, noise = measured.states.copy(), len(measured.stretch), jax.tree.map(as_float, noise)
     if "velocity" in missing:
         reckoned = np.asarray(flight.body_velocity)[:samples].T
-        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
+        state[:, PARTS["velocity"]] = np.stack(rotated(state[:, PARTS["attitude"]].T, reckoned), 1)
     if "position" in missing:
         state[:, PARTS["position"]] = 0.0
     accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
@@ -277,8 +261,8 @@ def _predict_states(
     gusts = _pairs(added, generator.standard_normal((DRAWS, steps, channels, 2)))
     off = generator.standard_normal((DRAWS, 6))
     drawn = errors, np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
-    surely = jax.tree.map(lambda x: as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])), drawn)
-    futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
+    certain = jax.tree.map(lambda x: as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])), drawn)
+    futures = Futures(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *certain)
 
     chunks = (np.minimum(np.arange(i, i + CHUNK), start.size - 1) for i in range(0, start.size, CHUNK))
     found = [fly_chunk(vehicle.model, futures, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]

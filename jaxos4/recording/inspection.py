@@ -45,11 +45,12 @@ class Inspection(msgspec.Struct, frozen=True):
 
     - `log`, `format`: the file, and the `name` of its `LogFormat`.
     - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
-    - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
+    - `channels`: by name. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale. In JSON:
+      `measured`.
     - `refusals`: why no vehicle can be identified, and what to do, most important first. In JSON: `findings`.
     - `findings`: faults that the log shows, see `jaxos4.recording.checks`. In JSON: `checks`.
     - `notes`: remarks from reading the log.
-    - `parts`: the stretches in order of time.
+    - `stretches`: in order of time. In JSON: `parts`.
     """
 
     log: str
@@ -58,11 +59,11 @@ class Inspection(msgspec.Struct, frozen=True):
     begin: float
     end: float
     sample_time: float
-    measured: dict[str, Channel]
+    channels: dict[str, Channel] = msgspec.field(name="measured")
     refusals: tuple[str, ...] = msgspec.field(name="findings")
     findings: tuple[Finding, ...] = msgspec.field(name="checks")
     notes: tuple[str, ...]
-    parts: tuple[InspectedStretch, ...]
+    stretches: tuple[InspectedStretch, ...] = msgspec.field(name="parts")
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings, ready for JSON."""
@@ -72,10 +73,10 @@ class Inspection(msgspec.Struct, frozen=True):
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
     """Describe a log that was read with this airframe and `full_scale=1.0`. Torques are unknown without an airframe."""
     seconds = fair_share([recording], finest(recording.dt, commands=recording.dt * recording.commanded))
-    evidence, parts = Evidence(recording, airframe, seconds=seconds), []
+    evidence, stretches = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
         excited = {} if stretch.reason else excitation(cut(evidence.plausible.recording, stretch), airframe)
-        parts.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
+        stretches.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
     nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))
@@ -87,15 +88,15 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         begin=float(recording.time[0]),
         end=float(recording.time[-1]),
         sample_time=recording.dt,
-        measured=_measured(recording),
+        channels=_channels(recording),
         refusals=refusals,
         findings=findings(evidence),
         notes=recording.notes if yaw is None else (*recording.notes, str(yaw)),
-        parts=tuple(parts),
+        stretches=tuple(stretches),
     )
 
 
-def _measured(recording: Recording) -> dict[str, Channel]:
+def _channels(recording: Recording) -> dict[str, Channel]:
     time, motors = recording.time, recording.facts.motors
     columns = recording.columns(inputs=False)
     columns |= {f"rotor{i + 1}": speed for i, speed in enumerate(recording.omega.T)}

@@ -121,12 +121,11 @@ def forest(found: Comparison, look: Style) -> Figure:
 
 def write_comparison(path: str | os.PathLike[str], found: Comparison, *, command: str = "") -> None:
     """Writes the page of a comparison, completely or not at all. `command`: that makes it again. Raises `OSError`."""
-    count = len(found.reasons)
     said = f"{' '.join(headline(found.statuses).values())} {agreement(found)}"
     top = [text(said, f"verdict{' warning' if found.different else ''}")]
-    if count:
+    if found.reasons:
         lines = text([f"{line}." for line in found.reasons])
-        top.append(folded(f"{count} reason{'s' if count > 1 else ''}", lines, id="reasons"))
+        top.append(folded(counted(len(found.reasons), "reason"), lines, id="reasons"))
     top.append(text([f"{note}." for note in found.notes], id="notes"))
     top.append(text(found.next_flight[0].upper() + found.next_flight[1:], id="next"))
     write_page(

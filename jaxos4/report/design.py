@@ -1,7 +1,7 @@
 """A design of a flight beside the standard inputs: the table that `jaxos4 design` prints, and its figure."""
 
 import math
-from pathlib import Path
+import os
 
 import numpy as np
 from rich.console import Console
@@ -9,7 +9,7 @@ from rich.console import Console
 from .._files import write_file
 from ..design import Design
 from .panels import Figure, Line, Panel, Scale
-from .style import Dash, Style, styles
+from .style import styles
 from .svg import as_file
 from .text import Listing, plain
 
@@ -33,7 +33,7 @@ _WORDS = {
 
 
 def print_design(console: Console, found: Design, accuracy: float) -> None:
-    """Print the table, the gain, the use of limits, and how long to fly for an `accuracy`, as a share of each scale."""
+    """Prints the table, the gain, the use of limits, and how long to fly for an `accuracy`: a share of each scale."""
     task, rows = found.task, []
     unexcited, targets, compared, _ = _WORDS[task.kind]
     every = {"designed": found.designed, **found.standard}
@@ -66,23 +66,23 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
     console.print(f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}.")
 
 
-def write_design(found: Design, accuracy: float, out: Path) -> None:
-    """Write the figure as SVG: above what to fly, below the bound of each target against the time of flight.
+def write_design_figure(path: str | os.PathLike[str], found: Design, accuracy: float) -> None:
+    """Writes the figure as SVG: above what to fly, below the bound of each target against the time of flight.
 
-    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds).
+    A line shows the wanted accuracy (references), or the half-width of the bracket (rotor speeds). Raises `OSError`.
     """
     task, designed, in_percent = found.task, found.designed, found.task.kind == "references"
     every, panels = {"designed": designed, **found.standard}, []
-    looks, shown = styles(list(every)), round(2 * designed.period / designed.dt)
-    time, wanted = designed.dt * np.arange(designed.inputs.shape[0]), "wanted" if in_percent else "bracket"
+    looks = {name: (look.color, 1.6, look.dash) for name, look in styles(list(every)).items()}
+    time, shown = designed.dt * np.arange(designed.inputs.shape[0]), round(2 * designed.period / designed.dt)
+    flown = [name for name in (("designed",) if in_percent else ("multisine", "designed")) if name in every]
     for i, title in enumerate(_WORDS[task.kind][-1]):
-        flown = [name for name in (("designed",) if in_percent else ("multisine", "designed")) if name in every]
-        lines = [Line(time[:shown], every[name].inputs[:shown, i], *_look(looks[name]), name=name) for name in flown]
+        lines = [Line(time[:shown], every[name].inputs[:shown, i], *looks[name], name=name) for name in flown]
         panels.append(Panel(title, lines, Scale(label="time [s]"), width=_WIDTH, height=_HEIGHT))
     x = Scale("log", label="flight [s]") if in_percent else Scale(label="time [s]")
     for i, (name, unit) in enumerate(zip(task.names[: task.scale.size], task.units, strict=False)):
-        line = 100 * accuracy if in_percent else float(task.scale[i])
-        marks = [Line((-math.inf, math.inf), (line, line), width=1.2, name=wanted)]
+        line, meaning = (100 * accuracy, "wanted") if in_percent else (float(task.scale[i]), "bracket")
+        marks = [Line((-math.inf, math.inf), (line, line), width=1.2, name=meaning)]
         for kind, one in every.items():
             if one.history is None:
                 seconds = np.geomspace(designed.period, 10 * designed.duration, 50)
@@ -91,11 +91,7 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
             else:
                 seconds, bound = time, one.history[:, i]
                 bound = np.where(bound < 3 * task.scale[i], bound, np.nan)
-            marks.append(Line(seconds, bound, *_look(looks[kind]), name=kind))
+            marks.append(Line(seconds, bound, *looks[kind], name=kind))
         title = f"{name}: bound [{'%' if in_percent else unit}]"
         panels.append(Panel(title, marks, x, Scale("log"), _WIDTH, _HEIGHT))
-    write_file(out, as_file(Figure("design", panels, columns=4)))
-
-
-def _look(look: Style) -> tuple[str, float, Dash]:
-    return look.color, 1.6, look.dash
+    write_file(path, as_file(Figure("design", panels, columns=4)))

@@ -16,9 +16,9 @@ from ..identification.verdict import headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from . import identification_figures as figures
 from .identification_signals import BAND, identified_signals
+from .identification_text import next_lines, notes_of, quantity_rows, share, warning_lines, why_no_value
 from .page import Section, picture, signals, table, template, text, write_page
 from .style import Style, styles
-from .terminal import next_lines, notes_of, quantity_rows, share, warning_lines, why_no_value
 from .text import DASH, plain, span
 
 # The page shows these entries of the provenance in a place of their own.
@@ -70,7 +70,6 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
             for name, x in msgspec.to_builtins(used).items()
             if name not in _ELSEWHERE
         ],
-        has_signals=bool(drawn),
     )
 
 

@@ -14,7 +14,7 @@ from ..flight import STATE_NAMES, STATE_UNITS
 from ..identification.results import Identification, VehicleIdentification
 from ..models.state import CASCADE_ORDER
 from .style import BOUND_DASHES, Style, style
-from .timeline import Axis, line, panel, signals, spans, view
+from .timeline import TimeAxis, line, panel, signals, spans, view
 
 BAND = 0.95
 """The share of the errors that the band of the predictions holds."""
@@ -60,13 +60,13 @@ def identified_signals(found: Identification, look: Style) -> str:
     )
 
 
-def _axis(traces: Traces, ahead: Predictions | None) -> Axis:
+def _axis(traces: Traces, ahead: Predictions | None) -> TimeAxis:
     """The axis of all logs, with the moments that are predicted."""
     starts, longest = traces.start_time, 0.0 if ahead is None else float(ahead.horizons.max())
     time = np.concatenate([traces.time, starts, starts + longest])
     log = np.concatenate([traces.log, traces.start_log, traces.start_log])
     order = np.lexsort([time, log])
-    return Axis.of(time[order], log[order])
+    return TimeAxis.of(time[order], log[order])
 
 
 def _panels(
@@ -101,7 +101,7 @@ def _common(traces: Traces) -> list[dict[str, Any]]:
     return [*panels, panel("gusts [rad/s²]", gusts, reach=reach)] if gusts else panels
 
 
-def _horizon(traces: Traces, ahead: Predictions, place: int, axis: Axis, look: Style) -> dict[str, Any]:
+def _horizon(traces: Traces, ahead: Predictions, place: int, axis: TimeAxis, look: Style) -> dict[str, Any]:
     """The predictions so far ahead. The line breaks between predictions that are not of one stretch."""
     horizon, half, breaks = float(ahead.horizons[place]), prediction_band(ahead)[place], ahead.breaks
     start = axis.place(traces.start_time + horizon, traces.start_log)
@@ -110,7 +110,9 @@ def _horizon(traces: Traces, ahead: Predictions, place: int, axis: Axis, look: S
     return view(f"{horizon:.3g} s ahead", start, _panels(measured, predicted, look, half=half))
 
 
-def _trajectories(traces: Traces, ahead: Predictions, paths: Predictions, axis: Axis, look: Style) -> dict[str, Any]:
+def _trajectories(
+    traces: Traces, ahead: Predictions, paths: Predictions, axis: TimeAxis, look: Style
+) -> dict[str, Any]:
     """The predictions from each start, of which one is chosen, beside all that was measured meanwhile."""
     place = np.searchsorted(ahead.start, paths.start)
     begin, log = traces.start_time[place], traces.start_log[place]

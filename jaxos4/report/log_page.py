@@ -1,44 +1,79 @@
-"""The page of a log, before anything is fitted: `jaxos4 inspect --report`. It needs no other file."""
+"""The contents of a log, before anything is fitted: the text and the page of `jaxos4 inspect`."""
 
+import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
 from markupsafe import Markup
+from rich.console import Console
 
 from .._files import check_writable
 from ..airframe import MOTIONS, Airframe
 from ..errors import InputError, printable
-from ..flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY, Flight
+from ..flight import RATES, SIGNALS, UNITS, Flight
 from ..logs import Recording, Source, as_recording, read_recording
-from ..logs.sampling import filled
 from ..logs.table import counted
 from ..recording.checks import Evidence
 from ..recording.inspection import Inspection, inspect_log
 from ..recording.prepared import prepare
 from ..recording.stretches import Stretch, cut
-from . import timeline
+from .log_figures import is_share, logged, motors, spectra
 from .page import Section, picture, signals, table, text, write_page
-from .panels import Band, Figure, Line, Panel, Scale
-from .style import BOUND_DASHES, style
-from .terminal import part_rows, unit_of
-from .text import plain
+from .text import Listing, plain
+from .timeline import spans
 
-_SAMPLES = 5000  # of each signal at most; a page then has less than 600 kB
 _LONGEST = 60  # parts in the table at most, the longest
-_SEGMENT = 1.0  # s; spectra are means of segments of this length
-_SLOWEST = 1.0  # Hz; the lowest frequency of a spectrum
-_BINS = 60  # of the motors' speeds
 _USUAL = 0.9  # of the time the rotors turn at speeds in the band of the spectra
-_SIGNALS = (
-    ("rate [rad/s]", RATES, ("p", "q", "r")),
-    ("force [m/s²]", np.arange(12, 15), ("ax", "ay", "az")),
-    ("attitude [rad]", ANGLES, MOTIONS),
-    ("velocity [m/s]", VELOCITY, ("vx", "vy", "vz")),
-    ("position [m]", POSITION, ("x", "y", "z")),
-)
+_COMMANDS = "of full scale (commands)"
+_TOGETHER = ["p q r", "phi theta psi", "x y z", "vx vy vz"]
+_TOGETHER += [" ".join(signal.columns) for name, signal in SIGNALS.items() if signal.columns and name != "states"]
+# The unit of channels that are shown together.
+_UNITS = {names: UNITS[names.split()[0]] for names in _TOGETHER} | {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
+
+
+def print_inspection(console: Console, found: Inspection, label: str, *, most: int = 14) -> None:
+    """Prints the channels of a log, the findings of its checks, and the `most` longest parts. `label`: its format."""
+    console.print(
+        f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
+        f"one every {1e3 * found.sample_time:.4g} ms",
+        soft_wrap=True,
+    )
+    for refusal in found.refusals:
+        console.print(f"cannot identify a vehicle: {refusal}.", soft_wrap=True)
+    for each in found.findings:
+        verb = "contradicts" if each.contradicted else "concerns"
+        console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
+    for names, unit in _UNITS.items():
+        measured = {name: found.channels[name] for name in names.split() if name in found.channels}
+        if not measured:
+            continue
+        largest = max(abs(end) for channel in measured.values() for end in (channel.least, channel.most))
+        rate = min(channel.rate for channel in measured.values())
+        gap = max(channel.longest_gap for channel in measured.values())
+        gaps = f", at most {1e3 * gap:.3g} ms apart" if gap > 1.5 * found.sample_time else ""
+        commands = "rotor1" in names and 0 < largest <= 1
+        size = f"up to {largest:.3g} {_COMMANDS if commands else unit}"
+        console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
+    for note in found.notes:
+        console.print(f"note: {note}")
+    rows = _part_rows(found, most)
+    headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
+    Listing(headings, rows, numbers).print_on(console)
+    if len(found.stretches) > len(rows):
+        console.print(f"and {len(found.stretches) - len(rows)} shorter parts")
+    console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
+
+
+def _part_rows(found: Inspection, most: int) -> list[tuple[str, ...]]:
+    """The cells of the `most` longest parts of a log, in order of time: from, to, use, and the excitation by axis."""
+    rows = []
+    longest = sorted(found.stretches, key=lambda part: part.begin - part.end)[:most]
+    for part in sorted(longest, key=lambda part: part.begin):
+        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
+        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
+    return rows
 
 
 def write_log_page(
@@ -52,7 +87,7 @@ def write_log_page(
     """Writes the page of a log, completely or not at all.
 
     - `log`: a recording, or the path of a log. `airframe`: of its vehicle; without it, torques are unknown.
-    - `found`: of `inspect_log`, if it was computed before. `command`: that makes the page again.
+    - `found`: the inspection, if it was made before. `command`: the one that makes the page again.
 
     **Raises:** `OSError` if the page cannot be written; `InputError` if the log cannot be read.
     """
@@ -60,37 +95,22 @@ def write_log_page(
     given = isinstance(log, Recording | Flight)
     recording = as_recording(log) if given else read_recording(log, airframe, full_scale=1.0)
     found = inspect_log(recording, airframe) if found is None else found
-    full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     plausible = Evidence(recording, airframe).plausible.recording
-    flown = [cut(plausible, Stretch(part.begin, part.end)) for part in found.parts if part.usable]
-    band = None
-    if flown and not is_share(recording):
-        speeds, rare = np.concatenate([each.omega for each in flown]), (1 - _USUAL) / 2
-        low, high = np.quantile(speeds, [rare, 1 - rare]) / (2 * np.pi)
-        band = float(low), float(high)
-    shown, block = logged(recording, found)
+    flown = [cut(plausible, Stretch(part.begin, part.end)) for part in found.stretches if part.usable]
+    full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     label = recording.facts.format.label if recording.facts.format else "recording"
     sampled = f"{found.samples} samples, one every {plain(1e3 * found.sample_time)} ms"
     top = [
         text(verdict(found), f"verdict{' warning' if found.refusals else ''}"),
         text([f"Cannot identify a vehicle: {line}." for line in found.refusals]),
     ]
-    caption = (
-        "Horizontal: time [s]. Grey: not usable, for the reason in the table of parts. The options above the figure "
-        "name the part that is in sight, for jaxos4 estimate."
-    )
-    if block > 1:
-        blocks = f"{plain(1e3 * recording.dt * block)} ms"
-        caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
-    seen = signals(shown, caption, names_part=True)
-    commands = recording.commanded and full == 1
     sections = [
-        Section("signals", "Logged signals", [seen, text(fitted(recording, airframe), id="fitted")], "Signals"),
+        Section("signals", "Logged signals", _signals(recording, airframe, found), "Signals"),
         Section("checks", "Failed checks", _checks(found), "Checks"),
         Section("parts", "Parts that can be used", [_parts(found)], "Parts"),
-        Section("measured", "Sampling, gaps and ranges", [_measured(found, commands)], "Measured"),
+        Section("measured", "Sampling, gaps and ranges", [_measured(found, is_share(recording))], "Measured"),
         Section("motors", "Motors and their limits", _motors(flown, full), "Motors"),
-        Section("spectra", "Vibration", _spectra(flown, band), "Spectra"),
+        Section("spectra", "Vibration", _spectra(flown, full), "Spectra"),
     ]
     write_page(
         path,
@@ -101,8 +121,19 @@ def write_log_page(
         command=command,
         end=[text(found.notes)],
         provenance=[("log", recording.name)],
-        has_signals=True,
     )
+
+
+def _signals(recording: Recording, airframe: Airframe | None, found: Inspection) -> list[Markup]:
+    drawn, block = logged(recording, found)
+    caption = (
+        "Horizontal: time [s]. Grey: not usable, for the reason in the table of parts. The options above the figure "
+        "name the part that is in sight, for jaxos4 estimate."
+    )
+    if block > 1:
+        blocks = f"{plain(1e3 * recording.dt * block)} ms"
+        caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
+    return [signals(drawn, caption, names_part=True), text(fitted(recording, airframe), id="fitted")]
 
 
 def _checks(found: Inspection) -> list[Markup]:
@@ -116,8 +147,8 @@ def _checks(found: Inspection) -> list[Markup]:
 
 
 def _parts(found: Inspection) -> Markup:
-    rows = part_rows(found, _LONGEST)
-    shorter = len(found.parts) - len(rows)
+    rows = _part_rows(found, _LONGEST)
+    shorter = len(found.stretches) - len(rows)
     note = (
         "Roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s]. An axis that is weak "
         f"or none is not identified by this part.{f' {shorter} shorter parts are not listed.' if shorter else ''}"
@@ -127,13 +158,11 @@ def _parts(found: Inspection) -> Markup:
 
 
 def _measured(found: Inspection, commands: bool) -> Markup:
-    rows = [
-        (
-            *(name, unit_of(name, commands), plain(one.rate, 4), plain(1e3 * one.longest_gap, 3)),
-            *(plain(one.least, 4), plain(one.most, 4)),
-        )
-        for name, one in found.measured.items()
-    ]
+    rows = []
+    for name, one in found.channels.items():
+        unit = _COMMANDS if commands and name.startswith("rotor") else UNITS.get(name, "rad/s")
+        numbers = plain(one.rate, 4), plain(1e3 * one.longest_gap, 3), plain(one.least, 4), plain(one.most, 4)
+        rows.append((name, unit, *numbers))
     headings = ("channel", "unit", "rate [Hz]", "longest gap [ms]", "least", "largest")
     return table("measured-table", "What was measured, and how often", headings, rows)
 
@@ -149,12 +178,17 @@ def _motors(flown: Sequence[Recording], full: float) -> list[Markup]:
     return [picture(motors(flown, full), caption)]
 
 
-def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> list[Markup]:
-    if not flown or (figure := spectra(flown, band)) is None:
+def _spectra(flown: Sequence[Recording], full: float) -> list[Markup]:
+    if not flown:
         return []
-    turns = (
-        f" The rotors turn {band[0]:.0f} to {band[1]:.0f} Hz; their blades pass twice as often or more." if band else ""
-    )
+    band, turns = None, ""
+    if full != 1:
+        speeds, rare = np.concatenate([each.omega for each in flown]), (1 - _USUAL) / 2
+        low, high = np.quantile(speeds, [rare, 1 - rare]).tolist()
+        band = low / (2 * math.pi), high / (2 * math.pi)
+        turns = f" The rotors turn {band[0]:.0f} to {band[1]:.0f} Hz; their blades pass twice as often or more."
+    if (figure := spectra(flown, band)) is None:
+        return []
     caption = (
         f"Amplitude spectral density in the usable parts.{turns} Motion of a vehicle lies below about 20 Hz. A peak "
         "above is vibration; vibration above half the sampling rate folds down into the motion, and no setting removes "
@@ -165,7 +199,7 @@ def _spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> li
 
 def verdict(found: Inspection) -> str:
     """The usable share of a log, and the axes that it excites, in one sentence."""
-    used = [part for part in found.parts if part.usable]
+    used = [part for part in found.stretches if part.usable]
     seconds = sum(part.end - part.begin for part in used)
     if not used:
         return "No part of this log can be used."
@@ -174,58 +208,6 @@ def verdict(found: Inspection) -> str:
     axes = ", ".join(f"{axis} {each}" for axis, each in best.items())
     parts = counted(len(used), "part")
     return f"{seconds:.1f} of {found.end - found.begin:.1f} s can be used, in {parts}; excitation: {axes}."
-
-
-def is_share(recording: Recording) -> bool:
-    """Whether the motors are commands as a share of full scale."""
-    return recording.commanded and float(np.nanmax(recording.omega, initial=0.0)) <= 1.0
-
-
-def logged(recording: Recording, found: Inspection) -> tuple[str, int]:
-    """All signals of a log for the time axis, grey where it is not usable, and the `thinned` samples of a block."""
-    panels, width = [], 0
-    motor = ("command" if is_share(recording) else "motor [rad/s]", recording.omega, tuple("1234"))
-    groups = [(title, _sensed(recording, which), names) for title, which, names in _SIGNALS]
-    groups = [groups[0], motor, *groups[1:]]
-    if recording.voltage is not None:
-        groups.append(("battery [V]", recording.voltage[:, None], ("battery",)))
-    groups = [group for group in groups if np.isfinite(group[1]).any()]
-    every = [
-        timeline.thinned(recording.time, bridged(recording.time, column)[:, None], _SAMPLES)
-        for _, measured, _ in groups
-        for column in measured.T
-    ]
-    time, _, block = every[0]
-    values = np.hstack([fewer for _, fewer, _ in every])
-    for title, _, names in groups:
-        columns = ((name, values[:, width + i], style(i)) for i, name in enumerate(names))
-        panels.append(timeline.panel(title, [timeline.line(*each) for each in columns if np.isfinite(each[1]).any()]))
-        width += len(names)
-    axis = timeline.Axis.of(recording.time[[0, -1]], np.zeros(2, int), longest=np.inf)
-    begin = recording.time[0]
-    shaded = [(part.begin - begin, part.end - begin) for part in found.parts if not part.usable]
-    return timeline.signals(axis, [timeline.view("", time - begin, panels)], shaded=shaded), block
-
-
-def _sensed(recording: Recording, which: Int[np.ndarray, " columns"]) -> Float[np.ndarray, "samples columns"]:
-    """Some of the channels, without a copy of all."""
-    states, force = recording.states, recording.specific_force
-    if which[0] < len(STATE_NAMES):
-        return states[:, which]
-    return np.full((len(states), len(which)), np.nan) if force is None else force
-
-
-def bridged(
-    time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"], *, steps: float = 3.0
-) -> Float[np.ndarray, " samples"]:
-    """A signal with straight lines between its samples, unless they are apart by more than this many usual steps."""
-    at = np.flatnonzero(np.isfinite(values))
-    if at.size < 2 or at.size == values.size:
-        return values
-    apart = np.diff(time[at])
-    place = np.clip(np.searchsorted(time[at], time, side="right") - 1, 0, at.size - 2)
-    near = (apart[place] <= steps * np.median(apart)) & (time >= time[at[0]]) & (time <= time[at[-1]])
-    return np.where(near | np.isfinite(values), np.interp(time, time[at], values[at]), np.nan)
 
 
 def fitted(recording: Recording, airframe: Airframe | None) -> str:
@@ -242,65 +224,6 @@ def fitted(recording: Recording, airframe: Airframe | None) -> str:
     used = f"{ready.seconds[0]:.1f} s would be fitted, in samples of {1e3 * float(ready.fitted.dt):.3g} ms"
     if ready.tested is None:
         return f"{used}, and nothing held out."
-    held = timeline.spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
+    held = spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
     parts = ", ".join(f"{begin:.1f} to {end:.1f}" for begin, end in held[:8]) + ", ..." * (len(held) > 8)
     return f"{used}; {ready.seconds[1]:.1f} s would be held out and predicted: {parts} s."
-
-
-def motors(flown: Sequence[Recording], full: float) -> Figure:
-    """The share of the time that each motor spends at each speed; dashed: full speed."""
-    omega = np.concatenate([each.omega for each in flown])
-    largest = float(omega.max())
-    top = full if np.isfinite(full) and full < 3 * largest else largest
-    edges = np.linspace(0.0, max(top, largest, 1e-9), _BINS + 1)
-    shares = [100 * np.histogram(column, edges)[0] / len(omega) for column in omega.T]
-    x = Scale(ends=(0.0, 1.02 * float(edges[-1])), label="command" if full == 1.0 else "speed [rad/s]")
-    y, panels = Scale(ends=(0.0, 1.05 * max(float(each.max()) for each in shares))), []
-    for i, share in enumerate(shares):
-        at, steps, color = np.repeat(edges, 2)[1:-1], np.repeat(share, 2), style(i).color
-        marks = [Band(at, np.zeros(at.size), steps, color), Line(at, steps, color, 1.4)]
-        if top == full:
-            marks.append(Line((full, full), (-np.inf, np.inf), dash=BOUND_DASHES[2], name="full speed"))
-        panels.append(Panel(f"motor {i + 1}: time [%]", marks, x, y, 270, 190))
-    return Figure("motors", panels, columns=4)
-
-
-def spectra(flown: Sequence[Recording], band: tuple[float, float] | None) -> Figure | None:
-    """Amplitude spectral densities of gyro and accelerometer; band: how often the rotors turn."""
-    kinds = {"gyro [rad/s/√Hz]": RATES, "accelerometer [m/s²/√Hz]": np.arange(12, 15)}
-    sensed = (np.hstack([_sensed(each, which) for which in kinds.values()]) for each in flown)
-    frequency, whole = amplitude_density(sensed, flown[0].dt)
-    x, panels = Scale("log", (_SLOWEST, float(frequency[-1])), label="frequency [Hz]"), []
-    rotors = [] if band is None else [Band(band, 2 * [-np.inf], 2 * [np.inf], opacity=0.25, name="rotors turn")]
-    for i, title in enumerate(kinds):
-        density = whole[:, 3 * i : 3 * i + 3]
-        lines = [
-            Line(frequency, column, style(k).color, 1.4, BOUND_DASHES[dash], name=name)
-            for k, (column, dash, name) in enumerate(zip(density.T, (0, 2, 1), "xyz", strict=True))
-        ]
-        if np.isfinite(density).any():
-            panels.append(Panel(title, [*rotors, *lines], x, Scale("log"), 430, 260))
-    return Figure("spectra", panels, columns=2) if panels else None
-
-
-def amplitude_density(
-    parts: Iterable[Float[np.ndarray, "_ channels"]], dt: float
-) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies channels"]]:
-    """Frequencies [Hz] and the amplitude spectral density of signals, by Welch's means of overlapping segments.
-
-    A channel has the mean over the segments in which it was measured, or NaN. Reference: Welch 1967, IEEE
-    Trans. Audio Electroacoustics 15.
-    """
-    size = max(round(_SEGMENT / dt), 8)
-    window, frequency = np.hanning(size)[:, None], np.fft.rfftfreq(size, dt)
-    total = measured = np.zeros((frequency.size, 1))
-    for part in parts:
-        total, measured = (np.broadcast_to(each, (frequency.size, part.shape[1])).copy() for each in (total, measured))
-        for begin in range(0, len(part) - size + 1, size // 2):
-            piece = filled(part[begin : begin + size])
-            power = np.abs(np.fft.rfft(window * (piece - piece.mean(axis=0)), axis=0)) ** 2
-            measured += np.isfinite(power)
-            total += np.nan_to_num(power)
-    mean = np.where(measured, total / np.maximum(measured, 1), np.nan)
-    density, kept = 2 * dt * mean / np.square(window).sum(), frequency >= _SLOWEST
-    return frequency[kept], np.sqrt(density[kept])

@@ -81,10 +81,15 @@ def as_matplotlib(figure: Figure) -> Drawn:
 
 
 def as_pdf(figure: Figure) -> bytes:
-    """The figure as PDF. The same figure gives the same bytes."""
-    buffer = io.BytesIO()
+    """The figure as PDF."""
     with drawing():
-        as_matplotlib(figure).savefig(buffer, format="pdf", metadata={"CreationDate": None})
+        return rendered(as_matplotlib(figure), "pdf")
+
+
+def rendered(drawn: Drawn, kind: str) -> bytes:
+    """A figure of Matplotlib as a file: `"svg"` or `"pdf"`. The same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    drawn.savefig(buffer, format=kind, metadata={"Date" if kind == "svg" else "CreationDate": None})
     return buffer.getvalue()
 
 

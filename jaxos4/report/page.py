@@ -55,7 +55,7 @@ def table(
 ) -> Markup:
     """A table; nothing without rows. On a narrow screen each row is a card, in which headings stand above cells.
 
-    - `headings`: of all columns, some with a unit: `"rate [Hz]"`.
+    - `headings`: column heads, some with a unit: `"rate [Hz]"`.
     - `rows`: the name of each row and its cells; a text instead of a row is the name of the rows below it. The second
       line of a cell is small.
     - `notes`: paragraphs below the table.
@@ -98,7 +98,6 @@ def write_page(
     command: str = "",
     provenance: Sequence[tuple[str, str]] = (),
     estimators: dict[str, Style] | None = None,
-    has_signals: bool = False,
 ) -> None:
     """Writes a page, completely or not at all: its `title`, what it is `about`, the `top`, sections, how it was made.
 
@@ -115,5 +114,6 @@ def write_page(
     }
     filled = [each for each in sections if any(each.parts)]
     given = {"title": title, "about": about, "top": top, "sections": filled, "end": end, "command": command}
+    has_signals = any('id="timeline"' in part for each in filled for part in each.parts)  # its scripts are long
     given |= {"provenance": provenance, "swatches": swatches, "has_signals": has_signals}
     write_file(path, template("page.html.j2").render(given))

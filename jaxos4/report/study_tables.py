@@ -4,8 +4,7 @@ import csv
 import io
 import itertools
 import json
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import xarray as xr
@@ -13,7 +12,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..study import OUTCOMES, metrics
-from .text import DASH, Listing, plain
+from .text import DASH, Listing, plain, span, with_unit
 
 _PHRASES = {
     "model": "{} model",
@@ -29,32 +28,20 @@ _PHRASES = {
 _MARKS = ("", "†", "‡")
 _MOST_LISTED = 20
 Rows = list[str | tuple[str, ...]]
+Table = tuple[str, Sequence[str], Rows, list[str]]
+"""The caption, the headings, the rows and the notes of a table; see `page.table`."""
 
 
-class Table(NamedTuple):
-    """A table of the page, see `page.table`."""
+def scenarios(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
+    """All scenarios: all noise scales and estimators, and one value on each other axis.
 
-    caption: str
-    headings: Sequence[str]
-    rows: Sequence[str | Sequence[str]]
-    notes: Sequence[str] = ()
-
-
-class ScenarioData(NamedTuple):
-    """The data that one table or figure compares: all noise scales and estimators, one value on each other axis."""
-
-    number: int
-    label: str
-    data: xr.Dataset
-
-
-def scenarios(dataset: xr.Dataset) -> Iterator[ScenarioData]:
-    """All scenarios, numbered from 1. The label names the dimensions that differ, or all if there is one scenario."""
+    Each has a label that names the dimensions that differ, or all if there is one scenario.
+    """
     fixed = [name for name in metrics.SCENARIO if name in _PHRASES]
     varied = [name for name in fixed if dataset.sizes[name] > 1] or fixed
-    for number, at in enumerate(itertools.product(*(range(dataset.sizes[name]) for name in fixed)), start=1):
-        data = dataset.isel(dict(zip(fixed, at, strict=True)))
-        yield ScenarioData(number, ", ".join(_PHRASES[name].format(data[name].item()) for name in varied), data)
+    places = itertools.product(*(range(dataset.sizes[name]) for name in fixed))
+    every = [dataset.isel(dict(zip(fixed, at, strict=True))) for at in places]
+    return [(", ".join(_PHRASES[name].format(data[name].item()) for name in varied), data) for data in every]
 
 
 def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
@@ -100,7 +87,7 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     def table(name: str, measure: str, found: xr.Dataset, headings: list[str], caption: str) -> Table:
         source = f"From estimate, truth, {'bound' if name == 'efficiency' else 'half_width'}, result (metrics.{name})."
         rows = _by_estimator(data, lambda at: _with_intervals(found.isel(at), measure))
-        return Table(caption, ("estimator", *headings), rows, [source])
+        return caption, ("estimator", *headings), rows, [source]
 
     ratio = "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do"
     held = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
@@ -112,7 +99,7 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
         "coverage": table("coverage", "coverage", 100 * covered, parameters, held),
         "levels": table("mean_coverage", "coverage", 100 * metrics.mean_coverage(data), levels, means),
         "results": _result_table(data),
-    }
+    } | ({"estimates": _estimate_table(data)} if data.sizes["flight"] == 1 else {})
 
 
 def shown_level(data: xr.Dataset) -> float:
@@ -149,7 +136,7 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         headings.append(f"{name} [{'%' if not any(marked) else unit if all(marked) else f'%; marked: {unit}'}]")
     caption = "RMS error [% of the truth; where marked, in the parameter's unit]"
     source = "From estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)."
-    return Table(caption, headings, rows, [*notes, source])
+    return caption, headings, rows, [*notes, source]
 
 
 def _result_table(data: xr.Dataset) -> Table:
@@ -165,7 +152,45 @@ def _result_table(data: xr.Dataset) -> Table:
     caption = "Flights by result, mean rollouts, and the hybrid's seed brackets that contain the truth [%]"
     source = "From result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)."
     headings = ("estimator", *headings, "rollouts", "seed hits")
-    return Table(caption, headings, _by_estimator(data, cells), [source])
+    return caption, headings, _by_estimator(data, cells), [source]
+
+
+def _estimate_table(data: xr.Dataset) -> Table:
+    """Estimate, interval and bound of each estimator, in groups of one noise scale and parameter with its truth."""
+    rows: Rows = []
+    error, level = metrics.normalised_error(data), shown_level(data)
+    half = data["half_width"].sel(level=level)
+    shown = (data["estimate"], data["estimate"] - half, data["estimate"] + half, data["bound"], error)
+    for i, scale in enumerate(scale_labels(data)):
+        for k, (name, unit) in enumerate(zip(names(data, "parameter"), names(data, "unit"), strict=True)):
+            at = {"scale": i, "parameter": k, "flight": 0}
+            truth = float(data["truth"].isel(at, missing_dims="ignore"))
+            rows.append(f"{with_unit(name, unit)} at {scale}, truth {plain(truth, 4)}")
+            for j, estimator in enumerate(names(data, "estimator")):
+                value, low, high, bound, ratio = (
+                    float(each.isel(at | {"estimator": j}, missing_dims="ignore")) for each in shown
+                )
+                ends = DASH if np.isnan(low) else span((low, high))
+                rows.append((estimator, plain(value, 4), ends, plain(bound, 4), plain(ratio, 2)))
+    headings = ("estimator", "estimate", "interval", "bound", "error / bound")
+    caption = f"Each estimate with its interval of {100 * level:g} %, and the truth"
+    return caption, headings, rows, ["From estimate, truth, half_width, bound, result."]
+
+
+def ended(data: xr.Dataset) -> list[str]:
+    """How each estimate ended, and how many of its intervals contain the truth."""
+    known = {code: name.replace("_", " ") for name, code in metrics.codes(data).items()}
+    level = shown_level(data)
+    share = metrics.coverage(data).sel(level=level)
+    lines = []
+    for i, scale in enumerate(scale_labels(data)):
+        for j, estimator in enumerate(names(data, "estimator")):
+            at = {"scale": i, "estimator": j}
+            result = known.get(int(data["result"].isel(at | {"flight": 0})), "unknown result")
+            counted, hold = (int(share[name].isel(at).sum()) for name in ("count", "coverage"))
+            held = f", {hold} of {counted} intervals contain the truth" if counted else ""
+            lines.append(f"{estimator} at {scale}: {result}{held}.")
+    return lines
 
 
 def best_estimators(data: xr.Dataset) -> dict[str, str]:
@@ -221,7 +246,7 @@ def error_csv(dataset: xr.Dataset) -> str:
     measured = ["rms_error", "rms_error_percent", "bound", "efficiency", "efficiency_low", "efficiency_high"]
     measured += ["coverage", "coverage_low", "coverage_high", "rollouts"]
     writer.writerow([*fixed, "noise_scale", "estimator", "seen", "parameter", "unit", "level", *measured])
-    for _, _, data in scenarios(dataset):
+    for _, data in scenarios(dataset):
         level = shown_level(data)
         error, bound, spent = metrics.estimator_error(data), metrics.bound_error(data), metrics.mean_rollouts(data)
         share, ratio = metrics.coverage(data).sel(level=level), metrics.efficiency(data)
@@ -270,13 +295,13 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
     """The table of errors of each scenario, then the notes that explain the marks."""
     parts: list[RenderableType] = []
     notes: dict[str, None] = {}
-    for scenario in scenarios(dataset):
-        table, rows = _error_table(scenario.data, digits=2), []
-        headings = [heading.partition(" [")[0] for heading in table.headings[1:]]
+    for label, data in scenarios(dataset):
+        (_, headings, cells, explained), rows = _error_table(data, digits=2), []
+        headings = [heading.partition(" [")[0] for heading in headings[1:]]
         blank = [""] * len(headings)
-        for row in table.rows:
+        for row in cells:
             rows += [["", *blank]] * bool(rows) + [[row, *blank]] if isinstance(row, str) else [row]
         listing = Listing(["", *headings], rows, headings, apart=1)  # 80 columns must do
-        parts += [Text(f"RMS error [%], {scenario.label}"), listing.table()]
-        notes |= dict.fromkeys(table.notes[:-1])  # the last one says how the page's numbers are computed
+        parts += [Text(f"RMS error [%], {label}"), listing.table()]
+        notes |= dict.fromkeys(explained[:-1])  # the last one says how the page's numbers are computed
     return Group(*parts, *(Text(note) for note in notes))

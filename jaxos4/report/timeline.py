@@ -13,7 +13,7 @@ from .style import Style
 _LEVELS = 65_000  # of a packed number, which takes two bytes
 
 
-class Axis(NamedTuple):
+class TimeAxis(NamedTuple):
     """A time axis without gaps, from 0. It is made of pieces, each an uninterrupted part of a log.
 
     - `at`: where a piece begins on the axis; `begin`, `end`: its own time [s]; `log`: the number of its log.
@@ -27,7 +27,7 @@ class Axis(NamedTuple):
     @classmethod
     def of(
         cls, time: Float[np.ndarray, " samples"], log: Int[np.ndarray, " samples"], *, longest: float = 1.0
-    ) -> "Axis":
+    ) -> "TimeAxis":
         """The axis of samples in their order. `longest`: the longest time without a sample that stays [s]."""
         steps = np.diff(time)
         usual = float(np.median(steps)) if steps.size else 1.0
@@ -105,8 +105,8 @@ def view(
 ) -> dict[str, Any]:
     """Panels of the same samples, packed.
 
-    - `time`: of each sample on the axis [s], see `Axis.place`.
-    - `start`: of a prediction from many starts, the number of that of each sample. Those from a chosen one are drawn.
+    - `time`: the place of each sample on the axis [s], see `TimeAxis.place`.
+    - `start`: for predictions from many starts, the number of each sample's start. One start is drawn at a time.
     """
     kept = np.isfinite(time)
     order = np.flatnonzero(kept)[np.argsort(time[kept], kind="stable")]
@@ -122,7 +122,7 @@ def view(
 
 
 def signals(
-    axis: Axis,
+    axis: TimeAxis,
     common: Sequence[dict[str, Any]],
     views: Sequence[dict[str, Any]] = (),
     *,

@@ -160,7 +160,7 @@ def _loaded(network: bytes) -> TrainedNetwork:
         return load_network(io.BytesIO(network))
 
 
-def carry_out(
+def run_study(
     study: Study,
     out: Path,
     device: str,

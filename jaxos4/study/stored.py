@@ -1,4 +1,4 @@
-"""The door of a study's Dataset: what `results.nc` must hold for a report, checked before anything is drawn."""
+"""Reads the Dataset of a study, and checks that `results.nc` holds what a report needs."""
 
 import json
 import os
@@ -42,7 +42,7 @@ _REMEDY = "give a folder that `jaxos4 study` wrote"
 
 
 def read_results(directory: Path) -> xr.Dataset:
-    """Reads the Dataset in a study's folder. Raises `InputError` if there is none, or it is not that of a study."""
+    """Reads the Dataset in a study's folder. Raises `InputError` if there is none, or it is not a study's."""
     path = directory / RESULTS_FILE
     if not directory.is_dir():
         raise InputError(f"{directory}: no such folder; {_REMEDY}.")
@@ -72,7 +72,7 @@ def _probe(path: Path) -> None:
 
 
 def _fault(dataset: xr.Dataset) -> str:
-    """Why a Dataset is not that of a study; empty if it is one."""
+    """Why a Dataset is no study's; empty if it is one."""
     if missing := ", ".join(sorted(SCHEMA.keys() - dataset.variables.keys())):
         return f"no {missing}"
     kinds = {"U": "UO", "f": "fiu", "i": "iu"}  # whole numbers can be numbers, and texts objects

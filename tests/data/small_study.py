@@ -8,7 +8,7 @@ import sys
 import xarray as xr
 from helpers import COMMAND, PROGRESS, environment, how_we_compile
 
-from jaxos4.study import carry_out, load_study
+from jaxos4 import study
 
 SPECIFICATION = """
 title = "A small study"
@@ -56,7 +56,7 @@ def specification(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Pa
 def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
     """Runs a study in this process."""
     out = folder / "whole"
-    carry_out(load_study(specification(folder, text)), out, "these tests")
+    study.run_study(study.load_study(specification(folder, text)), out, "these tests")
     return out
 
 

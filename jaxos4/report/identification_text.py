@@ -1,4 +1,4 @@
-"""Identifications, the contents of logs, and what a flight of an OS4 can identify, as text for a terminal."""
+"""Identifications, and what a flight of an OS4 can identify, as text for a terminal."""
 
 import io
 import math
@@ -6,9 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 
-from ..airframe import MOTIONS
 from ..estimators import ESTIMATORS
-from ..flight import SIGNALS, UNITS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.physical import PhysicalQuantity, physical_quantities, possible
@@ -23,7 +21,6 @@ from ..identification.verdict import (
     reason_lines,
     statuses_of,
 )
-from ..recording.inspection import Inspection
 from ..results import NINETY_FIVE
 from .text import DASH, Listing, plain, say
 
@@ -34,13 +31,7 @@ _SIGNIFICANCE = 0.01
 # Of the sentences of the headline, on terminals that have colours.
 _COLOURS = {IDENTIFIED: "green", RESERVED: "yellow", MISSING: "yellow", CONTRADICTED: "bold red"}
 
-_COMMANDS = "of full scale (commands)"
-_TOGETHER = ["p q r", "phi theta psi", "x y z", "vx vy vz"]
-_TOGETHER += [" ".join(signal.columns) for name, signal in SIGNALS.items() if signal.columns and name != "states"]
-# The unit of channels that are shown together.
-_UNITS = {names: UNITS[names.split()[0]] for names in _TOGETHER} | {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
-
-Section = Iterator[str | Listing]
+Lines = Iterator[str | Listing]
 
 
 def print_identification(console: Console, found: Identification, *, verbose: bool = False) -> None:
@@ -50,13 +41,15 @@ def print_identification(console: Console, found: Identification, *, verbose: bo
     parameters.
     """
     notes = [f"note: {note}" for note in notes_of(found)]
-    parts = [*warning_lines(found), *notes]
+    parts: list[str | Listing] = [*warning_lines(found), *notes]
     if not found.has_answer:
         parts = [*notes, *_failure(found)]
     elif isinstance(found, OS4Identification):
         parts += [*_parameters(found), *_fit(found), *_inertias(found), *_validation(found)]
     elif isinstance(found, VehicleIdentification):
-        parts = [*_quantities(found), *parts]
+        if rows := quantity_rows(physical_quantities(found)):
+            headings = ("quantity", "estimate", "95 % interval", "unit", "note")
+            parts.insert(0, Listing(headings, rows, ("estimate",)))
         parts += [*_parameters(found), *_held(found), *_inertias(found), *_of_vehicle(found)] if verbose else []
     if found.has_answer:
         parts += [_summary(found), *next_lines(found)]
@@ -87,11 +80,6 @@ def quantity_rows(quantities: Sequence[PhysicalQuantity]) -> list[tuple[str, ...
     return rows
 
 
-def _quantities(found: Identification) -> Section:
-    if rows := quantity_rows(physical_quantities(found)):
-        yield Listing(("quantity", "estimate", "95 % interval", "unit", "note"), rows, ("estimate",))
-
-
 def warning_lines(found: Identification) -> list[str]:
     """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
     widened = found.widened if isinstance(found, VehicleIdentification) else {}
@@ -104,11 +92,11 @@ def warning_lines(found: Identification) -> list[str]:
 
 
 def notes_of(found: Identification) -> list[str]:
-    """What was changed and noticed, and the clock of the motors if it is not the gyro's."""
+    """The notes on the data, and the clock of the motors if it is not the gyro's."""
     return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
 
 
-def _failure(found: Identification) -> Section:
+def _failure(found: Identification) -> Lines:
     if found.result != "nonfinite_trajectory" or found.is_vehicle:
         return
     kind = ESTIMATORS.get(found.estimator)
@@ -120,7 +108,7 @@ def _failure(found: Identification) -> Section:
     )
 
 
-def _parameters(found: Identification) -> Section:
+def _parameters(found: Identification) -> Lines:
     of_os4 = not found.is_vehicle
     digits = 5 if of_os4 else 4
     rows = []
@@ -147,14 +135,14 @@ def _parameters(found: Identification) -> Section:
         yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
 
 
-def _held(found: VehicleIdentification) -> Section:
+def _held(found: VehicleIdentification) -> Lines:
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
         reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
     yield from (f"fixed, {reason}: {', '.join(held)}." for reason, held in reasons.items())
 
 
-def _fit(found: OS4Identification) -> Section:
+def _fit(found: OS4Identification) -> Lines:
     percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
     yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
     coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
@@ -171,10 +159,10 @@ def _fit(found: OS4Identification) -> Section:
     tests = {"free of the inputs (cross-correlation)": {name: row.input_p for name, row in found.fit.items()}}
     if found.provenance.windows == 1:  # the free initial states of windows mislead the test
         tests = {"white (Ljung-Box)": {name: row.white_p for name, row in found.fit.items()}} | tests
-    for property_, p_values in tests.items() if found.fit else ():
+    for claim, p_values in tests.items() if found.fit else ():
         failed = [name for name, p_value in p_values.items() if p_value * len(p_values) < _SIGNIFICANCE]
-        answer = f"not those of {', '.join(failed)}" if failed else "all"
-        yield f"residuals {property_}, tests at {100 * _SIGNIFICANCE:.0f} %: {answer}."
+        passed = f"not those of {', '.join(failed)}" if failed else "all"
+        yield f"residuals {claim}, tests at {100 * _SIGNIFICANCE:.0f} %: {passed}."
 
 
 def why_no_value(row: Constant) -> str:
@@ -182,7 +170,7 @@ def why_no_value(row: Constant) -> str:
     return "below noise" if abs(row.estimate) <= NINETY_FIVE * row.std else "impossible"
 
 
-def _inertias(found: Identification) -> Section:
+def _inertias(found: Identification) -> Lines:
     body = found.rigid_body
     inertias = [
         f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
@@ -202,7 +190,7 @@ def _inertias(found: Identification) -> Section:
         yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}{verdict}."
 
 
-def _validation(found: OS4Identification) -> Section:
+def _validation(found: OS4Identification) -> Lines:
     if found.validation is None:
         return
     flight, fit = found.validation.flight, found.validation.fit
@@ -213,7 +201,7 @@ def _validation(found: OS4Identification) -> Section:
     yield f"validation on {flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
 
 
-def _of_vehicle(found: VehicleIdentification) -> Section:
+def _of_vehicle(found: VehicleIdentification) -> Lines:
     rows = []
     for each in found.sample_times:
         chosen = " (chosen)" if math.isclose(each.sample_time, found.provenance.sample_time) else ""
@@ -255,7 +243,7 @@ def _summary(found: Identification) -> str:
 
 
 def next_lines(found: Identification) -> list[str]:
-    """What to fly next, if anything was judged."""
+    """Advice on the next flight, if anything was judged."""
     return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
 
 
@@ -264,55 +252,6 @@ def share(value: float | None) -> str:
     if value is None:
         return DASH
     return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"
-
-
-def unit_of(channel: str, commands: bool) -> str:
-    """The unit of a channel. `commands`: whether rotors have commands."""
-    unit = next(unit for names, unit in _UNITS.items() if channel in names.split())
-    return _COMMANDS if commands and channel.startswith("rotor") else unit
-
-
-def print_inspection(console: Console, found: Inspection, label: str, *, most: int = 14) -> None:
-    """Prints the channels of a log, the findings of its checks, and the `most` longest parts. `label`: its format."""
-    console.print(
-        f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
-        f"one every {1e3 * found.sample_time:.4g} ms",
-        soft_wrap=True,
-    )
-    for refusal in found.refusals:
-        console.print(f"cannot identify a vehicle: {refusal}.", soft_wrap=True)
-    for each in found.findings:
-        verb = "contradicts" if each.contradicted else "concerns"
-        console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
-    for names, unit in _UNITS.items():
-        measured = {name: found.measured[name] for name in names.split() if name in found.measured}
-        if not measured:
-            continue
-        largest = max(abs(end) for channel in measured.values() for end in (channel.least, channel.most))
-        rate = min(channel.rate for channel in measured.values())
-        gap = max(channel.longest_gap for channel in measured.values())
-        gaps = f", at most {1e3 * gap:.3g} ms apart" if gap > 1.5 * found.sample_time else ""
-        commands = "rotor1" in names and 0 < largest <= 1
-        size = f"up to {largest:.3g} {_COMMANDS if commands else unit}"
-        console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
-    for note in found.notes:
-        console.print(f"note: {note}")
-    rows = part_rows(found, most)
-    headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
-    Listing(headings, rows, numbers).print_on(console)
-    if len(found.parts) > len(rows):
-        console.print(f"and {len(found.parts) - len(rows)} shorter parts")
-    console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
-
-
-def part_rows(found: Inspection, most: int) -> list[tuple[str, ...]]:
-    """The cells of the `most` longest parts of a log, in order of time: from, to, use, and the excitation by axis."""
-    rows = []
-    longest = sorted(found.parts, key=lambda part: part.begin - part.end)[:most]
-    for part in sorted(longest, key=lambda part: part.begin):
-        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
-        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
-    return rows
 
 
 def print_information(console: Console, found: FlightInformation) -> None:
