@@ -23,10 +23,10 @@ from . import (
     recording as recording,
     report as report,
     results as results,
+    rotations as rotations,
     shooting as shooting,
     simulation as simulation,
     study as study,
-    trigonometry as trigonometry,
 )
 from ._version import __version__ as __version__
 from .airframe import (

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from .._templates import templates
+from .._files import templates
 from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
 from ..logs import Recording
