@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..flight import STATE_NAMES, Flight
-from ..recording.noise import white_noise
+from ..recording.sensor_errors import white_noise
 from .flight_prediction import known_mean
 from .motion import PARTS, departures, inverse, product, turned
 

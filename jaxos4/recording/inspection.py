@@ -74,7 +74,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     seconds = fair_share([recording], finest(recording.dt, commands=recording.dt * recording.commanded))
     evidence, parts = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
-        excited = {} if stretch.reason else excitation(cut(evidence.plausible.recording, stretch), airframe)
+        excited = {} if stretch.reason else excitation(cut(evidence.recording, stretch), airframe)
         parts.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
     nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)

@@ -73,14 +73,18 @@ class Evidence:
 
     @functools.cached_property
     def plausible(self) -> Plausible:
-        """The recording without faulty values, along the body's axes. Clipping is found along the sensors' axes."""
-        found = plausible(self.logged)
-        return found._replace(recording=in_body_axes(found.recording, self.airframe))
+        """The recording without faulty values, along the sensors' axes, and these values."""
+        return plausible(self.logged)
+
+    @functools.cached_property
+    def recording(self) -> Recording:
+        """The recording without faulty values, along the body's axes."""
+        return in_body_axes(self.plausible.recording, self.airframe)
 
     @functools.cached_property
     def every(self) -> tuple[Stretch, ...]:
         """Every stretch of the flight: usable ones, and others with the reason."""
-        return stretches(self.plausible.recording, self.airframe)
+        return stretches(self.recording, self.airframe)
 
     @property
     def usable(self) -> list[Stretch]:
@@ -89,12 +93,12 @@ class Evidence:
 
     def richest(self, parts: Sequence[Stretch]) -> list[Stretch]:
         """The most informative pieces of some parts, of at most `seconds` together."""
-        return richest(self.plausible.recording, parts, torques_of(self.airframe), self.seconds)
+        return richest(self.recording, parts, torques_of(self.airframe), self.seconds)
 
     @functools.cached_property
     def stretches(self) -> tuple[Recording, ...]:
         """The usable stretches of the flight; only the most informative pieces if it is longer than `seconds`."""
-        recording = self.plausible.recording
+        recording = self.recording
         if recording.stretch is not None:  # concatenated flights are usable
             edges = np.flatnonzero(np.diff(recording.stretch)) + 1
             ends = zip([0, *edges], [*edges, recording.time.size], strict=True)
@@ -108,7 +112,7 @@ class Evidence:
 
         A vehicle whose accelerometer is turned seems to lie on the ground.
         """
-        whole = self.plausible.recording
+        whole = self.recording
         thrust = self.thrust(whole)
         if self.stretches or self.airframe is None or thrust is None:
             return self.stretches
@@ -133,7 +137,7 @@ class Evidence:
     @functools.cached_property
     def rest(self) -> Float[np.ndarray, "3"] | None:
         """The specific force at rest before the first stretch in flight [m/s^2]. `None`: never at rest, or moved."""
-        recording = self.plausible.recording
+        recording = self.recording
         begin = min((each.begin for each in self.usable), default=0.0) if self.stretches else 0.0
         before = np.count_nonzero(recording.time < begin - MARGIN)
         length = max(round(REST / recording.dt), 4)
