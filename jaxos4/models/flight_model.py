@@ -100,11 +100,11 @@ class FlightModel(AbstractModel):
 
     @property
     def quantities(self) -> dict[str, list[str]]:
-        """The quantities that the terms describe, with their parameters but without biases; see `Term.quantity`."""
+        """The quantities that the terms describe, with their parameters but without biases; see `Term.verdict`."""
         found: dict[str, list[str]] = {}
         for term, _, parameter in self._table:
-            if term.quantity and parameter.force_axis is None:
-                found.setdefault(term.quantity, []).append(parameter.name)
+            if term.verdict and parameter.force_axis is None:
+                found.setdefault(term.verdict, []).append(parameter.name)
         return found
 
     @property
@@ -303,11 +303,9 @@ class FlightModel(AbstractModel):
         values = {c: as_float(c(self.airframe) if callable(c) else c) for c in dict.fromkeys(constants)}
         return jnp.stack([values[c] for c in constants]) if constants else jnp.zeros(0)
 
-    def _contributions(
-        self, quantity: str, parameters, forcing: Forcing | None = None
-    ) -> list[tuple[Callable, Values]]:
+    def _contributions(self, field: str, parameters, forcing: Forcing | None = None) -> list[tuple[Callable, Values]]:
         """The contributions of the terms to a field of `Term`, each with the values of its parameters."""
-        acting = [(term, getattr(term, quantity)) for term in self._terms]
+        acting = [(term, getattr(term, field)) for term in self._terms]
         return [(change, self._values(term, parameters, forcing)) for term, change in acting if change]
 
     def _values(self, term: Term, parameters, forcing: Forcing | None) -> Values:
