@@ -24,8 +24,8 @@ from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
+from ..networks.estimator import GivenNetwork, network_for, network_provenance
 from ..networks.file import load_network
-from ..networks.for_flight import GivenNetwork, network_for, network_provenance
 from ..recording.checks import KINEMATIC, self_checks
 from ..results import has_answer, result_names
 from ..shooting import ShootingProblem, padded

@@ -17,7 +17,7 @@ from ..logs import Recording
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
-from ..networks.for_flight import seen_channels
+from ..networks.estimator import seen_channels
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem, Unknowns
 

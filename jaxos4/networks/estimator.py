@@ -1,5 +1,7 @@
-"""The paper's neural network (ANN): settings, training, and estimator. The paper does not describe it."""
+"""The paper's neural network (ANN): settings, use, and networks for one flight. The paper does not describe it."""
 
+import dataclasses
+import os
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -12,6 +14,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Parameters, Scalar, as_float, integer, setting
 from ..bracket import UNIFORM_PRIOR, Bracket
+from ..errors import named
 from ..estimate import AbstractEstimator, Calibration, Estimate
 from ..flight import STATE_NAMES
 from ..linalg import invert
@@ -293,3 +296,54 @@ def _given_held(
     shifted = parameters + jnp.where(held.any(), deviations * (gain @ off), 0.0)
     known = jnp.where(free[:, None] & free, correlation - gain @ across.T, 0.0)
     return jnp.where(held, unknowns.center, shifted), known
+
+
+GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
+"""A network, or its file."""
+SEED_STEPS = 2000  # of training a network that only gives a search its start
+VEHICLE = NetworkEstimator(steps=250, batch=64, noise=(1.0, 1.0), held_out=2000)
+MAX_WINDOWS = 24  # that the network of a vehicle sees, however long the flight is
+FLYABLE = 0.5  # share of a vehicle's bracket in which nearly all simulated flights can be flown
+
+
+def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
+    """Train a network for one flight, named `name`: briefly if shooting follows (`shoots`)."""
+    steps = SEED_STEPS if shoots else NetworkEstimator.steps
+    settings = NetworkEstimator(channels=seen_channels(problem), steps=steps)
+    with named(name):
+        return settings.fit(problem, bracket, key=jax.random.key(seed))
+
+
+def most_agile_windows(problem: ShootingProblem) -> ShootingProblem:
+    """The part of a vehicle's flight that a network sees: the windows in a row with the largest rates."""
+    windows = min(MAX_WINDOWS, problem.windows)
+    samples = problem.flight.time.shape[0] // problem.windows
+    motion = np.nansum(np.square(problem.recorded()), axis=1).reshape(problem.windows, samples).sum(axis=1)
+    first = samples * int(np.convolve(motion, np.ones(windows), "valid").argmax())
+    part = slice(first, first + samples * windows)
+    flight = jax.tree.map(lambda leaf: leaf[part] if leaf.ndim else leaf, problem.flight)
+    return dataclasses.replace(problem, flight=flight, windows=windows)
+
+
+def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> TrainedNetwork:
+    """Train a network for a part of a vehicle's flight in windows, at the noise levels of the problem."""
+    unknowns = problem.unknowns
+    bracket = Bracket.around(unknowns.center, FLYABLE * unknowns.half_width)
+    with named(name):
+        return VEHICLE.fit(problem, bracket, key=jax.random.key(seed))
+
+
+def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:
+    """The origin of a network and its training, for JSON."""
+    bracket = network.bracket
+    return {
+        "file": None if given is None or isinstance(given, TrainedNetwork) else os.fspath(given),
+        "settings": {f.name: getattr(network.settings, f.name) for f in dataclasses.fields(network.settings)},
+        "bracket": {"lower": bracket.lower.tolist(), "upper": bracket.upper.tolist()},
+    }
+
+
+def seen_channels(problem: ShootingProblem) -> str:
+    """The channels of a network by default: the rates, and the attitude if a rate was not measured."""
+    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
+    return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"
