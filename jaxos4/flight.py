@@ -16,10 +16,12 @@ from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
 STATE_UNITS = ("m", "m/s", "m", "m/s", "m", "m/s", "rad", "rad/s", "rad", "rad/s", "rad", "rad/s")
+ANGLE_NAMES, RATE_NAMES = ("phi", "theta", "psi"), ("p", "q", "r")
 ANGLES, RATES, POSITION, VELOCITY = (
     np.array([STATE_NAMES.index(name) for name in names])
-    for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
+    for names in (ANGLE_NAMES, RATE_NAMES, ("x", "y", "z"), ("vx", "vy", "vz"))
 )
+"""The places of some states in `STATE_NAMES`."""
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
 COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 """The columns of measured rotor speeds [rad/s], and of commands [0..1]."""

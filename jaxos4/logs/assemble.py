@@ -7,7 +7,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..errors import printable
-from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES, STATE_NAMES
+from ..flight import COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SIGNALS, SPEED_NAMES, STATE_NAMES
 from .sampling import UNIFORM, grid_size, held_regularly, last_measured, logged_rate, resample, unwrap
 from .table import MAX_ROWS, Recording, Sampling, Table, counted, listed, signals_of
 from .values import COLUMNS, PITCH, without_impossible
@@ -28,7 +28,7 @@ def recording_of(
     # A column of empty cells was not logged, also if it is a rotor's.
     motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
     dt = _check_time(table)
-    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
+    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, RATE_NAMES)}
     facts = table.facts._replace(**{name: getattr(table.facts, name) or slowest for name, slowest in rarest.items()})
     for name in filter(table.holds, motors):
         if np.isnan(table.columns[name][0]):

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import check_plain, read_toml
-from ..flight import SIGNALS, SPEED_NAMES
+from ..flight import ANGLE_NAMES, SIGNALS, SPEED_NAMES
 from ..rotations import euler_angles
-from .messages import ANGLES
 from .table import LogPath, Table, listed, quoted, refuse
 from .values import COLUMNS, PWM, PWM_ZERO, ColumnLimits
 
@@ -141,8 +140,8 @@ def mapped_rows(table: Table, columns: ColumnMap) -> Table:
     found = {column: columns.converted(column, raw[place]) for column, place in chosen.items()}
     if found.keys() >= set(QUATERNION):
         angles = euler_angles(np.column_stack([found[name] for name in QUATERNION]))
-        found |= {name: x for name, x in zip(ANGLES, angles.T, strict=True) if name not in found}
-        chosen |= dict.fromkeys(ANGLES, chosen["qw"])
+        found |= {name: x for name, x in zip(ANGLE_NAMES, angles.T, strict=True) if name not in found}
+        chosen |= dict.fromkeys(ANGLE_NAMES, chosen["qw"])
     found = {name: values for name, values in found.items() if name not in QUATERNION}
     unknown = tuple(name for name in names if name not in chosen.values())
     return table._replace(columns=found, names=chosen, unknown=unknown, remedy=_REMEDY)

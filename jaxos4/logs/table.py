@@ -227,6 +227,11 @@ def signals_of(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return signals
 
 
+def items(name: str, count: int) -> list[str]:
+    """The names of the numbers in an array: `name[0]`, `name[1]`, ..."""
+    return [f"{name}[{i}]" for i in range(count)]
+
+
 def order_note(first: str) -> str:
     """The note on the order of the rotors; `first`: the name of rotor 1 in the log."""
     same = "rotor_positions and rotor_spins must be in the same order"

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..airframe import STANDARD_GRAVITY
-from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES, UNITS
-from .sampling import filled
+from ..flight import COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SIGNALS, SPEED_NAMES, UNITS
+from .sampling import filled, runs
 from .table import Recording, Table
 
 
@@ -35,9 +35,9 @@ class ColumnLimits(NamedTuple):
     zero: bool = True
 
 
-_DEGREE, _RPM = math.pi / 180, 2 * math.pi / 60
+DEGREE, RPM = math.pi / 180, 2 * math.pi / 60  # rad, rad/s
 PWM, PWM_ZERO = "PWM", 1000.0  # us; a command in this unit is (value - 1000) / 1000
-_TURNING = {"deg/s": _DEGREE, "rpm": _RPM}
+_TURNING = {"deg/s": DEGREE, "rpm": RPM}
 _TIME = "t is in seconds: if these are milli-, micro- or nanoseconds, divide"
 _COMMAND = "commands are fractions 0..1: divide by full scale (100, 65535)"
 _SPEED = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
@@ -53,7 +53,7 @@ _OF_UNIT = {  # of the signals of a flight
         ColumnLimits("m", -1e6, 1e6, _POSITION, others={"cm": 0.01, "mm": 1e-3}),
         ColumnLimits("m/s", -1e3, 1e3, _VELOCITY, others={"cm/s": 0.01, "mm/s": 1e-3}),
         ColumnLimits("rad/s", -60.0, 60.0, "it looks like deg/s: divide by 57.3", others=_TURNING),
-        ColumnLimits("rad", -1e4, 1e4, "it looks like degrees: divide by 57.3", others={"deg": _DEGREE}),
+        ColumnLimits("rad", -1e4, 1e4, "it looks like degrees: divide by 57.3", others={"deg": DEGREE}),
         ColumnLimits("m/s^2", -1e3, 1e3, _FORCE, others={"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}),
         ColumnLimits("V", -200.0, 200.0, _VOLTAGE, others={"mV": 1e-3}, zero=False),
     )
@@ -154,7 +154,7 @@ def plausible(recording: Recording) -> Plausible:
             impossible[name] = int(wrong.sum()), float(worst)
             column[wrong] = np.nan
         known = np.count_nonzero(np.isfinite(column))
-        for sign in (1.0, -1.0) if name in ("p", "q", "r", *FORCE_NAMES) else ():
+        for sign in (1.0, -1.0) if name in (*RATE_NAMES, *FORCE_NAMES) else ():
             stuck = _stuck(sign * column)
             if stuck.any():
                 end, number = float(column[stuck][0]), int(stuck.sum())
@@ -210,8 +210,7 @@ def _stuck(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"
         return out
     held = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]])))
     usual = float(np.quantile(held, 0.9))  # samples for which a value is held
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], top.astype(int), [0]])))
-    at_top = np.ceil((edges[1::2] - edges[::2]) / usual).sum()
+    at_top = sum(math.ceil((end - begin) / usual) for begin, end in runs(top))
     levels, counts = np.unique(x, return_counts=True)
     if 2 * np.sort(counts)[-LEVELS:].sum() > x.size:
         return out
