@@ -199,16 +199,6 @@ class TrainedNetwork(AbstractEstimator):
 
     def _compare(self, problem: ShootingProblem) -> Estimate | str:
         """The estimate, or how the problem differs from that of training. One program computes both."""
-        if (kind := self._other_kind(problem)) is not None:
-            return kind
-        estimate, differences = self._identify(problem.restrict(self.channels))
-        for what, differs in differences.items():
-            if not isinstance(differs, Tracer) and differs:
-                return f"it was trained for another {what}"
-        return estimate
-
-    def _other_kind(self, problem: ShootingProblem) -> str | None:
-        """The difference in words as `mismatch` gives it, but not of numbers."""
         own = self.problem
         if CHANNELS[self.channels] > problem.size:
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"
@@ -220,7 +210,11 @@ class TrainedNetwork(AbstractEstimator):
             looked_at = [i for i in CASCADE_ORDER[: own.size] if not not_needed[:, i].all()]
             if missing := [STATE_NAMES[i] for i in looked_at if absent[:, i].all()]:
                 return f"it looks at {', '.join(missing)}, which this flight did not measure"
-        return None
+        estimate, differences = self._identify(problem.restrict(self.channels))
+        for what, differs in differences.items():
+            if not isinstance(differs, Tracer) and differs:
+                return f"it was trained for another {what}"
+        return estimate
 
     def _differences(self, problem: ShootingProblem) -> dict[str, Bool[Array, ""]]:
         """For each quantity, whether its numbers differ from those of training."""

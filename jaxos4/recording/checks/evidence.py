@@ -152,20 +152,9 @@ class Evidence:
         alike = np.abs(means - np.median(means, axis=0)).max(axis=1) < STILL * GRAVITY
         return means[alike].mean(axis=0) if alike.mean() > 0.75 else None  # otherwise it was in a hand
 
-    @functools.cached_property
-    def turns(self) -> Turns | None:
-        """Attitude against gyro."""
-        return attitude_turns(self.stretches)
-
-    @functools.cached_property
-    def velocity(self) -> Measured | None:
-        """See `velocity_slopes`."""
-        return velocity_slopes(self.stretches)
-
-    @functools.cached_property
-    def tilt(self) -> Measured | None:
-        """See `tilt_slopes`."""
-        return tilt_slopes(self.stretches)
+    turns = functools.cached_property[Turns | None](lambda self: attitude_turns(self.stretches))
+    velocity = functools.cached_property[Measured | None](lambda self: velocity_slopes(self.stretches))
+    tilt = functools.cached_property[Measured | None](lambda self: tilt_slopes(self.stretches))
 
     @functools.cached_property
     def response(self) -> Response | None:
