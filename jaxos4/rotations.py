@@ -79,7 +79,7 @@ def _once(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..
 
 @_once.def_vmap
 def _once_for_batch(lanes: int, is_batched: list[bool], x: Float[Array, "..."]) -> tuple[Any, Any]:
-    """The same, because a conditional that JAX batches is none."""
+    """Computes a batch in the same conditional: one that JAX batches would be none."""
     del lanes, is_batched
     return _once(x), (True, True)
 

@@ -33,7 +33,7 @@ class Air(eqx.Module):
     roll acceleration, and flapping_pitch v_x to the pitch acceleration.
 
     - `wind`: standard deviation along x, y, z [m/s]. `wind_time`: the correlation time [s].
-    - `drag`: of the rotors along x and y [1/s].
+    - `drag`: the drag of the rotors along x and y [1/s].
     - `inflow`: the thrust that rotors lose as they climb through the air [1/s].
     - `flapping`: moment over inertia and airspeed, in roll and pitch [1/(m s)], of either sign.
 

@@ -64,7 +64,7 @@ class _Log(NamedTuple):
     """A blackbox log: its columns `raw` and its `settings`; our `columns` and their `names` in the log; `notes`.
 
     - `header`: the row of the CSV's header; `None` for a log that was not decoded.
-    - `converted`: of columns that `blackbox_decode` has converted, the whole name ("gyroADC[0] (deg/s)") and the unit.
+    - `converted`: the whole name ("gyroADC[0] (deg/s)") and the unit of columns that `blackbox_decode` has converted.
     """
 
     path: LogPath

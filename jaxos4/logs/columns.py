@@ -24,7 +24,7 @@ _COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
 _VECTORS = [tuple(signal.columns) for signal in SIGNALS.values() if len(signal.columns) == 3]
 _ALONG_YZ = [name for vector in _VECTORS for name in vector[1:]]
 _TURNED = {"q", "r", "theta", "psi", "y", "z", "vy", "vz", "qy", "qz", *_ALONG_YZ}
-"""What has the opposite sign after half a turn about x."""
+"""The columns that have the opposite sign after half a turn about x."""
 _REMEDY = "correct its unit or sign in the column map"
 
 
@@ -54,7 +54,7 @@ class ColumnMap(NamedTuple):
         """By column, its place in a log.
 
         - `held`: takes a source; returns its name in the log, or `None` if the log does not hold it.
-        - `names`: of all that the log holds, for the `InputError` about a column that is needed.
+        - `names`: all columns or topics of the log, for the `InputError` about a column that is needed.
         """
         found = {}
         for column, source in self.sources.items():

@@ -69,7 +69,7 @@ class Messages:
 
     - `fields`: by kind of message and instance, the fields of its messages as arrays of one length. `t`: times [s].
     - `remedy`: what to do if the log is corrupt.
-    - `notes`: what was assumed, one line each.
+    - `notes`: the assumptions of the reader, one line each.
     - `names`: by our column, its name in the log.
     - `parameters`: the settings of the autopilot.
     - `prefixed`: whether the name of a field begins with the name of its kind and a dot.

@@ -20,7 +20,7 @@ from .table import Recording, Table
 class ColumnLimits(NamedTuple):
     """The unit of a column, and the numbers that it can hold.
 
-    - `unit`: of the column. `others`: units in which a log may have it, and their factors to `unit`.
+    - `unit`: the unit of the column. `others`: units in which a log may have it, and their factors to `unit`.
     - `least`, `largest`: what lies beyond is impossible: out of reach of any quadrotor, but not of a wrong unit.
     - `advice`: on larger values, and, without `below`, on smaller ones too.
     - `zero`: whether 0 is a measurement, and negative numbers are. If not, they count as not measured.

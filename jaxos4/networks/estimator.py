@@ -55,7 +55,7 @@ class NetworkEstimator(eqx.Module):
       bracket; attitude and position hold more information, but are far from linear.
     - `noise`: the lowest and highest noise scale of training, in multiples of the problem's sigma. Scales are drawn
       log-uniformly, and the scale is an input of the network.
-    - `architecture`: what corrects a linear map: `"mlp"`, a multilayer perceptron, or `"cmac"`, a table of weights.
+    - `architecture`: the correction of a linear map: `"mlp"`, a multilayer perceptron, or `"cmac"`, a table of weights.
     - `width`, `depth`: of the perceptron.
     - `tilings`, `cells`: of CMAC, for each pair of score features: the number of tilings, and of cells along each side.
       Finer cells represent more, and learn more slowly.

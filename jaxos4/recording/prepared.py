@@ -48,15 +48,15 @@ class Prepared(NamedTuple):
     - `fitted`: one flight of all stretches; measurements that are held out are missing.
     - `tested`: the same samples with only the held-out measurements; `None`: nothing is held out.
     - `recordings`: for each stretch, the number of its recording, from 0.
-    - `time`: of each sample in its log [s].
-    - `length`: of a window, in samples.
-    - `available`: what every recording offers to the terms of a model, see `Term.needs`.
+    - `time`: the time of each sample in its log [s].
+    - `length`: the number of samples of a window.
+    - `available`: the data that every recording offers to the terms of a model, see `Term.needs`.
     - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `force_level`.
       `None`: unknown.
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
-    - `notes`: what the reader changed, and which stretches are not used.
-    - `findings`: what the logs show that concerns moments of inertia, or contradicts another quantity.
+    - `notes`: changes by the reader, and stretches that are not used.
+    - `findings`: faults of the logs that concern moments of inertia, or contradict another quantity.
     - `log_step`: the longest sample of the logs [s].
     - `motor_step`: the longest time between new values of the motors in the logs [s].
     - `vibrates`: the rates with a line in the gyro's spectrum, and its frequency [Hz], see `vibrating_rates`.

@@ -28,10 +28,10 @@ class Finding(msgspec.Struct, frozen=True):
     """A fault that a log shows.
 
     - `name`: an identifier for programs.
-    - `cause`: what is wrong with the log. If several causes are possible, it names all of them.
+    - `cause`: the fault of the log. If several causes are possible, it names all of them.
     - `size`: the figure behind it, with its unit.
     - `remedy`: what to do.
-    - `quantities`: what the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
+    - `quantities`: the quantities that the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
     - `contradicted`: whether the log contradicts these quantities. Otherwise the finding is only noted.
     """
 

@@ -49,7 +49,7 @@ class Response(msgspec.Struct, frozen=True):
     """The answer of roll and pitch acceleration and vertical force to the rotors.
 
     - `turning`: the matrix from roll and pitch torque to roll and pitch acceleration [1/(kg m^2)].
-    - `delays`: of gyro and accelerometer after the rotors, and of the gyro after the accelerometer [s].
+    - `delays`: the delays of gyro and accelerometer after the rotors, and of the gyro after the accelerometer [s].
     - `explained`: the shares that the rotors explain: of the squared errors with which roll and pitch rate are
       predicted, and of the power of the vertical force. NaN: not measured.
     - `lag`: lag of the rotors [s]; 0 if their speeds were measured.
