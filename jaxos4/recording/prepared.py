@@ -13,12 +13,11 @@ from ..airframe import INERTIAS, Airframe
 from ..errors import InputError, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..logs import Recording
-from ..logs.table import counted
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
-from .richest import MOST, fair_share
+from .richest import fair_share, note_of
 from .sensor_errors import force_level, force_noise, vibrating_rates, without_noise
 from .stretches import Stretch, cut, end_of_tumble, nothing_usable
 from .windows import averaged, concatenate, hold_out, whole_windows
@@ -239,16 +238,7 @@ def _usable(
 def _richest(evidence: Evidence, parts: Sequence[Stretch]) -> tuple[list[Recording], list[str]]:
     """The parts, or if they are too long those that tell the most; and a note on that."""
     recording, chosen = evidence.recording, evidence.richest(parts)
-    pieces = [cut(recording, each) for each in chosen]
-    seconds, usable = (sum(each.length for each in every) for every in (chosen, parts))
-    if seconds > (1 - 1e-6) * usable:
-        return pieces, []
-    note = (
-        f"{recording.name}: {seconds:.1f} of {usable:.1f} usable s are fitted, because more than {MOST:,} samples take "
-        f"minutes: the {counted(len(chosen), 'part')} whose torques vary the most (a longer `sample_time` fits more; "
-        "`begin` and `end` choose another part)"
-    )
-    return pieces, [note]
+    return [cut(recording, each) for each in chosen], note_of(recording.name, chosen, parts)
 
 
 def _sample_times(

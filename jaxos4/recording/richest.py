@@ -7,10 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..logs import Recording
+from ..logs.table import counted
 from .stretches import MIN_STRETCH, Stretch, cut
 
 PIECE = 30.0  # s; shorter pieces would be chosen for their gusts, which biases a fit, and begin with unsettled filters
 MOST = 65_536  # samples of a fit, which takes more than a minute; flights of any length up to it share a program
+_SAME = 1e-6  # durations that differ by less than this share are equal
 _BIN = 0.02  # s; torques that change faster hardly turn a vehicle
 _LEVELS = 2.0  # for each factor of 2; pieces whose torques differ only by chance count as equal
 
@@ -52,6 +54,18 @@ def fair_share(recordings: Sequence[Recording], step: float) -> float:
             return left / (len(lengths) - number)
         left -= length
     return math.inf
+
+
+def note_of(name: str, chosen: Sequence[Stretch], parts: Sequence[Stretch]) -> list[str]:
+    """A note, if these are not all of the usable parts of a log."""
+    seconds, usable = (sum(each.length for each in every) for every in (chosen, parts))
+    if seconds > (1 - _SAME) * usable:
+        return []
+    return [
+        f"{name}: {seconds:.1f} of {usable:.1f} usable s are fitted, because more than {MOST:,} samples take minutes: "
+        f"the {counted(len(chosen), 'part')} whose torques vary the most (a longer `sample_time` fits more; `begin` "
+        "and `end` choose another part)"
+    ]
 
 
 def _pieces(part: Stretch, longest: float) -> list[Stretch]:
