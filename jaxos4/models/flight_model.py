@@ -195,11 +195,11 @@ class FlightModel(AbstractModel):
         grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=parts > 0)
         if inputs.length is not None:
             whole = self.batch - self.batch % max(parts, 1)  # a batch holds all parts of its samples
-            return self._driven_in_batches(inputs, inputs.length, grid, parameters, whole, of_parts)
+            return self._rotor_forcing_in_batches(inputs, inputs.length, grid, parameters, whole, of_parts)
         every = Batch(grid, jnp.arange(len(inputs.omega)), jnp.zeros_like(inputs.omega[0]))
-        return of_parts(self._driven(inputs, grid, every, parameters)[0])
+        return of_parts(self._rotor_forcing(inputs, grid, every, parameters)[0])
 
-    def _driven(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
+    def _rotor_forcing(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
         """The forcing by the rotors over some samples, and the rotor speeds at the end of the last sample."""
         airframe = self.airframe
 
@@ -224,10 +224,10 @@ class FlightModel(AbstractModel):
         )
         return found, speeds.end[-1]
 
-    def _driven_in_batches(
+    def _rotor_forcing_in_batches(
         self, inputs: Inputs, length: Count, grid: Grid, parameters, rows: int, of_parts: Callable[[Forcing], Forcing]
     ) -> Forcing:
-        """`of_parts` of `_driven` for the samples that count, `rows` at a time, so that padding takes no time."""
+        """Transforms `_rotor_forcing` by `of_parts`, `rows` samples at a time, so that padding takes no time."""
         samples, zeros = inputs.omega.shape[0], jnp.zeros(-(-inputs.omega.shape[0] // rows) * rows, float)
         nothing = of_parts(Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros))
         many = nothing.roll.shape[0] * rows // zeros.shape[0]
@@ -235,7 +235,7 @@ class FlightModel(AbstractModel):
         def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
             filled, before = carry
             batch = Batch(grid, jnp.minimum(i * rows + jnp.arange(rows), samples - 1), before)
-            found, before = self._driven(inputs, grid, batch, parameters)
+            found, before = self._rotor_forcing(inputs, grid, batch, parameters)
             place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * many, axis=0)
             return jax.tree.map(place, filled, of_parts(found)), before
 

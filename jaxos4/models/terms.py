@@ -15,7 +15,7 @@ from .._custom_types import RotorSpeeds, Scalar
 from .._registry import Registry
 from ..airframe import GRAVITY, MOTIONS, Airframe
 from .abstract import Contradiction, Parameter
-from .rotors import Batch, Commands, Grid, Motor, Speeds, delayed, driven
+from .rotors import Batch, Commands, Grid, Motor, Speeds, commanded_speeds, delayed
 from .state import Forcing, Rates, Samples, Vector
 
 # The data that a term can need from the logs or from the airframe.
@@ -172,7 +172,7 @@ def _scaled(share: Callable[[Values, Grid, Places], Samples]) -> Callable[[Comma
 def _drive(omega: RotorSpeeds, values: Values, batch: Batch, airframe: Airframe) -> Speeds:
     full = jnp.asarray(airframe.max_rotor_speed)
     lag, curve, braking, sag = (values[p] for p in ("rotor_lag", "thrust_curve", "motor_braking", SAG))
-    return driven(omega, Motor(lag, curve, braking, full, sag, jnp.asarray(airframe.hover_speed)), batch)
+    return commanded_speeds(omega, Motor(lag, curve, braking, full, sag, jnp.asarray(airframe.hover_speed)), batch)
 
 
 def _velocity(forcing: Forcing):
@@ -261,7 +261,7 @@ _OWN: dict[str, Term] = {
         "rotors follow their commands as first-order systems: rotor_lag [s]; for logs without the data for `motor`",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
-        speed=lambda omega, values, batch, airframe: driven(omega, Motor(values["rotor_lag"]), batch),
+        speed=lambda omega, values, batch, airframe: commanded_speeds(omega, Motor(values["rotor_lag"]), batch),
         verdict="motors",
     ),
     "delay": Term(

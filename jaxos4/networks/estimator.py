@@ -178,7 +178,7 @@ class TrainedNetwork(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight in the network's own bracket; that of the problem must only be valid.
 
-        If the problem holds parameters, the answer is that for their values.
+        If the problem fixes parameters, the answer is that for their values.
 
         **Returns:** an estimate, `at_bound` if the answer lies outside of the bracket of training by more than its
         interval, `unidentifiable` if an interval is hardly narrower than the bracket, and `network_mismatch` for more
@@ -249,7 +249,7 @@ class TrainedNetwork(AbstractEstimator):
         rms, correlation, factors, simultaneous = self.errors.at(within)
         std = jnp.exp(log_spread[:count]) * self.scaling.bound(within)[:count] * rms * inflation
         deviations = std * coordinates.width[:count]
-        parameters, correlation = _given_held(problem.unknowns, parameters, deviations, correlation)
+        parameters, correlation = _given_fixed(problem.unknowns, parameters, deviations, correlation)
         shot = problem.shots(parameters, initial_state)
         free = problem.unknowns.free
         outside = (jnp.abs(u[:count]) > 1 + factors[-1] * std) & free
@@ -278,18 +278,18 @@ class TrainedNetwork(AbstractEstimator):
         return estimate, differences
 
 
-def _given_held(
+def _given_fixed(
     unknowns: Unknowns, parameters: Parameters, deviations: Parameters, correlation: Float[Array, "count count"]
 ) -> tuple[Parameters, Float[Array, "count count"]]:
-    """The mean and the correlations of a Gaussian answer if the held parameters are known."""
-    free, held = unknowns.free, ~unknowns.free
-    among_held = jnp.where(held[:, None] & held, correlation, jnp.eye(free.size))
-    across = jnp.where(free[:, None] & held, correlation, 0.0)
-    gain = across @ invert(among_held)
-    off = jnp.where(held, (unknowns.center - parameters) / deviations, 0.0)
-    shifted = parameters + jnp.where(held.any(), deviations * (gain @ off), 0.0)
+    """The mean and the correlations of a Gaussian answer if the fixed parameters are known."""
+    free, fixed = unknowns.free, ~unknowns.free
+    among_fixed = jnp.where(fixed[:, None] & fixed, correlation, jnp.eye(free.size))
+    across = jnp.where(free[:, None] & fixed, correlation, 0.0)
+    gain = across @ invert(among_fixed)
+    off = jnp.where(fixed, (unknowns.center - parameters) / deviations, 0.0)
+    shifted = parameters + jnp.where(fixed.any(), deviations * (gain @ off), 0.0)
     known = jnp.where(free[:, None] & free, correlation - gain @ across.T, 0.0)
-    return jnp.where(held, unknowns.center, shifted), known
+    return jnp.where(fixed, unknowns.center, shifted), known
 
 
 GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
