@@ -184,7 +184,7 @@ def _cleaned(
     if slow:
         raise InputError(f"{name}: {slow}.")
     if limited := at_limit(evidence.recording, airframe):
-        notes.append("; ".join(limited))
+        notes.append(limited)
     if begin is None and (recovered := end_of_tumble(evidence.recording, airframe)) is not None:
         notes.append(f"{name}: tumbles at launch until {recovered:.1f} s (`begin` {recovered:.1f} leaves this out)")
     opposite = opposite_axes(usable, airframe)
@@ -195,15 +195,15 @@ def _cleaned(
     return usable, [*notes, *recording.named_notes, *note], judged
 
 
-def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None:
-    """Cause and remedy, if rotors are at full speed for a noticeable time. These stretches are not used."""
+def at_limit(recording: Recording, airframe: Airframe) -> str:
+    """The rotors that are often at full speed, and the remedy; empty if none is. These stretches are not used."""
     shares = (recording.omega >= FULL * float(airframe.max_rotor_speed)).mean(axis=0)
     often = [
         f"rotor {i + 1} is at its limit for {100 * share:.0f} % of the time"
         for i, share in enumerate(shares)
         if share > OFTEN
     ]
-    return (f"{recording.name}: {', '.join(often)}", "fly more gently, or with a fuller battery") if often else None
+    return f"{recording.name}: {', '.join(often)}; fly more gently, or with a fuller battery" if often else ""
 
 
 def _usable(
