@@ -21,7 +21,7 @@ from ..linalg import invert
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem, Unknowns, in_blocks
-from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
+from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling
 from .features import FEATURES, Coordinates, Features
 from .training import calibrate, train, untrained
 
@@ -110,11 +110,9 @@ class NetworkEstimator(eqx.Module):
         """
         self._check(problem, bracket)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, as_float(self.noise[1]))
-        scaling, regressor = untrained(features, self.noise, self.architecture, self.shape, key)
-        names = "noise", "steps", "batch", "learning_rate", "patience"
-        how = {name: getattr(self, name) for name in names}
-        regressor, history = train(regressor, scaling, features, key, **how)
-        errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
+        scaling, regressor = untrained(features, self, key)
+        regressor, history = train(regressor, scaling, features, self, key)
+        errors = calibrate(regressor, scaling, features, self, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
     def _check(self, problem: ShootingProblem, bracket: Bracket) -> None:

@@ -66,6 +66,8 @@ class Evidence:
     """The facts of one recording that its checks share. `airframe`: `None` if it is not known.
 
     **Arguments:** as in `self_checks`. `seconds`: the longest duration that is examined [s], see `richest`.
+
+    `turns`, `velocity` and `tilt` are the comparisons of channels in `jaxos4.recording.checks.estimates`.
     """
 
     def __init__(self, recording: Recording, airframe: Airframe | None, *, seconds: float = math.inf):
