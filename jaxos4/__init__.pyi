@@ -23,10 +23,10 @@ from . import (
     recording as recording,
     report as report,
     results as results,
+    rotations as rotations,
     shooting as shooting,
     simulation as simulation,
     study as study,
-    trigonometry as trigonometry,
 )
 from ._version import __version__ as __version__
 from .airframe import (
@@ -93,9 +93,9 @@ from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flig
 from .forecast import FlightPrediction as FlightPrediction, predict as predict
 from .identification import (
     FlightInformation as FlightInformation,
-    FlightSettings as FlightSettings,
     Identification as Identification,
     OS4Identification as OS4Identification,
+    OS4Settings as OS4Settings,
     VehicleIdentification as VehicleIdentification,
     VehicleSettings as VehicleSettings,
     assess as assess,

@@ -1,7 +1,8 @@
-"""Files are written completely or not at all; JSON and TOML are read or refused in one line."""
+"""Reads and writes files: written completely or not at all, read or refused in one line; and templates of files."""
 
 import contextlib
 import errno
+import html
 import json
 import math
 import os
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, in_words, shortened
+from .errors import InputError, in_words, printable, shortened
 
 # Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
 BROKEN = (
@@ -197,3 +198,30 @@ def check_plain(path: object, value: Any, remedy: str, largest: float = _LARGEST
             continue
         elif isinstance(each, int | float) and not abs(each) <= largest:
             raise InputError(f"{path}: `{shortened(place, 80)}` is beyond {largest:.3g}; {remedy}.")
+
+
+def templates(package: str, escape: Callable[[str], str] | None = None) -> Any:
+    """The templates in a package's folder, in which no text of a user becomes markup or code.
+
+    `escape`: makes text harmless: `printable`, `in_xml`; by default as HTML.
+    """
+    import jinja2  # slow, and few need it
+    from markupsafe import Markup
+
+    def finalize(value: Any) -> Any:
+        return value if escape is None or isinstance(value, Markup) else Markup(escape(str(value)))  # noqa: S704
+
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader(package, "."),
+        undefined=jinja2.StrictUndefined,
+        autoescape=True,  # macros give markup, which is not escaped twice
+        finalize=finalize,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=escape is not None,
+    )
+
+
+def in_xml(text: str) -> str:
+    """The text in a comment, an attribute or an element of XML. A comment must not contain two hyphens in a row."""
+    return re.sub("-(?=-)", "- ", html.escape(printable(text), quote=False).replace('"', "&quot;"))

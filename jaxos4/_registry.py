@@ -4,6 +4,7 @@ Installed packages are searched when a name is looked up that the table does not
 a start costs nothing. An entry point is imported when it is used.
 """
 
+import pkgutil
 from collections import UserDict
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -17,12 +18,17 @@ T = TypeVar("T")
 class Registry(UserDict[str, T], Generic[T]):
     """Objects by name: those of the table, then those of installed packages, which replace none of the table.
 
-    `group`: of entry points, whose names are those in the table. Raises `InputError` if one cannot be imported.
+    - `group`: of entry points, whose names are those in the table. Raises `InputError` if one cannot be imported.
+    - `own`: the table. An object given as `"module:Object"` of this package is imported when it is looked up.
     """
 
-    def __init__(self, group: str, own: Mapping[str, T]):
-        super().__init__(own)
+    def __init__(self, group: str, own: Mapping[str, T | str]):
+        super().__init__(own)  # type: ignore[arg-type]
         self.group = group
+
+    def __getitem__(self, name: str) -> T:
+        found: Any = super().__getitem__(name)
+        return pkgutil.resolve_name(f"jaxos4.{found}") if isinstance(found, str) else found
 
     @cached_property
     def _others(self) -> dict[str, Any]:

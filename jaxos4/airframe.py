@@ -23,11 +23,11 @@ GRAVITY, STANDARD_GRAVITY = 9.81, 9.80665
 
 
 class Axis(NamedTuple):
-    """What belongs to one axis of the body.
+    """One axis of the body, with its names in motion, inertia and alpha.
 
-    - `motion`: about it. `rate`, `inertia`: the names of the body rate and of the moment of inertia.
+    - `motion`: the rotation about it. `rate`, `inertia`: the names of the body rate and of the moment of inertia.
     - `coupling`, `inverse`: the alphas of its rate equation that are the gyroscopic coupling and 1 / `inertia`.
-    - `place`: that of `inverse` among alpha_1..8, counted from 0.
+    - `place`: the index of `inverse` among alpha_1..8, counted from 0.
     """
 
     motion: str

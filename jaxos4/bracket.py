@@ -45,10 +45,11 @@ class Bracket(eqx.Module):
         with np.errstate(all="ignore"):  # infinite ends, as JAX has them
             return cls(middle - reach, middle + reach)
 
-    @classmethod
-    def default(cls, model: AbstractModel) -> "Bracket":
+    @staticmethod
+    @eqx.filter_jit  # one compiled program instead of one for each operation
+    def default(model: AbstractModel) -> "Bracket":
         """The bracket around `model.alpha`, with the model's half-widths."""
-        return _default(model)
+        return Bracket.around(model.alpha, model.half_width)
 
     @property
     def center(self) -> Parameters:
@@ -68,8 +69,3 @@ class Bracket(eqx.Module):
 def _numpy_if_known(a: Array, b: Array) -> tuple[Numeric, Numeric]:
     """Both arrays, as NumPy if their values are known: arithmetic then needs no compiled program."""
     return (a, b) if isinstance(a, Tracer) or isinstance(b, Tracer) else (np.asarray(a), np.asarray(b))
-
-
-@eqx.filter_jit  # one compiled program instead of one for each operation
-def _default(model: AbstractModel) -> Bracket:
-    return Bracket.around(model.alpha, model.half_width)

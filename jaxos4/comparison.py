@@ -29,7 +29,7 @@ class ComparedQuantity(NamedTuple):
       intervals say, `std` is widened by the square root of `chi2` over its degrees of freedom.
     - `chi2`, `p`: the weighted sum of squares about the mean, and the probability of this or more if all results have
       the same true value. NaN if fewer than two count.
-    - `status`: that of the mean: the worst of the results that count, or of all if none counts.
+    - `status`: the status of the mean: the worst of the results that count, or of all if none counts.
     - `reference`: the value in the airframe's file, of a moment of inertia; NaN if the results have several.
     """
 
@@ -53,11 +53,11 @@ class ComparedQuantity(NamedTuple):
 class Comparison(NamedTuple):
     """Results compared; made by `jaxos4.compare_results`.
 
-    - `names`: of the results. `flights`: the logs of each. `quantities`: each that a result has.
-    - `notes`: what makes the results hard to compare.
+    - `names`: the results. `flights`: the logs of each result. `quantities`: all that a result has.
+    - `notes`: why the results are hard to compare.
     - `level`: the probability that any quantity is reported as different although all agree.
-    - `statuses`: of each quantity that has a verdict, by name: no better than those of the results that count.
-    - `reasons`: by the names of quantities, why they are not simply identified: each with the numbers of its results.
+    - `statuses`: by quantity with a verdict: the status, no better than in any result that counts.
+    - `reasons`: why quantities are not simply identified, each with their names and the numbers of the results.
     - `next_flight`: what to fly next, in one line.
     """
 

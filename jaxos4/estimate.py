@@ -42,15 +42,15 @@ class Estimate(eqx.Module):
 
     - `parameters`: all unknowns that the problem's windows share; a fixed one has a variance of 0. Without an estimate
       (see `result`): the bracket's center, or 0 if the bracket is invalid. The bracket of a network is its own.
-    - `covariance`: of `parameters`, from the Fisher information of the problem; a network's from its errors on
-      simulated flights. Infinite without an estimate.
+    - `covariance`: the covariance of `parameters`, by the Fisher information of the problem, or by a network's errors
+      on simulated flights. Infinite without an estimate.
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
-    - `cost`: of the problem at the estimate, for its channels (a network: for its own): 1/2 |W (y - x)|^2, or the
+    - `cost`: the problem's cost at the estimate, for its channels (a network: for its own): 1/2 |W (y - x)|^2, or the
       negative log-likelihood of innovations. Infinite without an estimate.
     - `rollouts`: simulated flights: one for a shot, and one for each of its derivatives; IBSS counts the derivatives
       only. `sweeps`: number of iterations, summed over the stages.
     - `result`: how the search ended.
-    - `calibration`: of the intervals, if they were calibrated on simulated flights; `None` means Gaussian.
+    - `calibration`: the calibration of the intervals on simulated flights; `None`: Gaussian intervals.
     - `seed`: the bracket that the search began from, if another estimator gave one.
     - `history`: the parameters after each sample, from a recursive estimator.
     - `parts`: the likelihood of each part of the flight, from a problem whose parts are compared.

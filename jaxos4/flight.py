@@ -16,10 +16,12 @@ from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
 STATE_UNITS = ("m", "m/s", "m", "m/s", "m", "m/s", "rad", "rad/s", "rad", "rad/s", "rad", "rad/s")
+ANGLE_NAMES, RATE_NAMES = ("phi", "theta", "psi"), ("p", "q", "r")
 ANGLES, RATES, POSITION, VELOCITY = (
     np.array([STATE_NAMES.index(name) for name in names])
-    for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
+    for names in (ANGLE_NAMES, RATE_NAMES, ("x", "y", "z"), ("vx", "vy", "vz"))
 )
+"""The places of some states in `STATE_NAMES`."""
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
 COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 """The columns of measured rotor speeds [rad/s], and of commands [0..1]."""
@@ -29,9 +31,9 @@ CHANNEL_NAMES = (*STATE_NAMES, *FORCE_NAMES)
 
 
 class Signal(NamedTuple):
-    """A field of `Flight` with one row a sample. What cuts, joins, averages, reads or writes flights looks here.
+    """A field of `Flight` with one row a sample. All code that cuts, joins, averages, reads or writes flights uses it.
 
-    - `shape`: of a row; `None`: any.
+    - `shape`: the shape of a row; `None`: any.
     - `columns`: its columns in a log, by name, with their units; none if it follows from other signals.
     - `is_input`: models need its value in all samples. Otherwise NaN marks what was not measured.
     """
@@ -68,7 +70,7 @@ class Inputs(NamedTuple):
 
     - `velocity`: along the body's axes [m/s]. `None`: unknown.
     - `stretches`: `None`: the flight is one stretch.
-    - `voltage`: of the battery [V]. `None`: not logged.
+    - `voltage`: the battery's voltage [V]. `None`: not logged.
     - `length`: the number of samples that count; the others are padding. `None`: all count.
     - `within`, `averaging_time`: see `Flight`.
     """
@@ -112,13 +114,13 @@ class Flight(eqx.Module):
     - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing. Unless
       they are `held`, measured speeds are those at `time[k]`.
     - `states`: in the order of `STATE_NAMES` (Eq. (14)) and the units of `STATE_UNITS`. NaN: not measured.
-    - `specific_force`: what an accelerometer measures along the body's axes [m/s^2]. `None` or NaN: not measured.
+    - `specific_force`: the signal of an accelerometer along the body's axes [m/s^2]. `None` or NaN: not measured.
     - `result`: how a simulation ended. Rows after a failure are NaN.
     - `body_velocity`: along the body's axes [m/s], an input of some models; no NaN. `None`: unknown.
     - `stretch`: the number of the uninterrupted stretch of each sample, counted from 0. Joined flights have several
       (`jaxos4.join`), and their time counts samples. `None`: the flight is one stretch.
     - `commanded`: whether `omega` holds commands, which the rotors follow with a lag, and not measured speeds.
-    - `voltage`: of the battery [V], an input of some models; no NaN. `None`: not logged.
+    - `voltage`: the battery's voltage [V], an input of some models; no NaN. `None`: not logged.
     - `held`: see `omega`.
     - `within`: the root mean square of each rotor's speed in equal parts of the sample, from `time[k]` - dt/2 to
       `time[k]` + dt/2 [rad/s]. `None`: unknown.

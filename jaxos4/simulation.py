@@ -111,14 +111,10 @@ def simulate(
         if jnp.shape(value) != (size,):
             raise ValueError(f"`{name}` must have shape ({size},), got {jnp.shape(value)}; use `vmap` for a batch.")
     dt = setting("dt", positive=True)(dt)
-    return _simulate(model, as_float(parameters), as_float(omega), dt, as_float(start), method)
+    return _in_one_program(_flown, model, as_float(parameters), as_float(omega), dt, as_float(start), method)
 
 
-@eqx.filter_jit
-def _simulate(
-    model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
-) -> Flight:
-    return in_blocks(_flown, model, parameters, omega, dt, start, method)
+_in_one_program = eqx.filter_jit(in_blocks)
 
 
 def _flown(

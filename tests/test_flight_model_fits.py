@@ -11,7 +11,7 @@ from helpers import first_state, forcing_of, local_model
 
 import jaxos4
 from jaxos4.flight import Inputs, Stretches
-from jaxos4.models.rotors import Batch, Grid, Motor, driven
+from jaxos4.models.rotors import Batch, Grid, Motor, commanded_speeds
 from jaxos4.models.state import CASCADE_ORDER
 
 
@@ -110,10 +110,8 @@ def test_a_motor_is_its_equation():
         omega = jnp.asarray(np.repeat(commands, finer, axis=0))
         rows = jnp.arange(omega.shape[0])
         grid = Grid(jnp.asarray(dt / finer), 0 * rows, 0 * rows, 0 * rows + rows.size - 1, 0.0 * rows)
-        return np.abs(
-            np.asarray(eqx.filter_jit(driven)(omega, motor, Batch(grid, rows, jnp.zeros(4))).begin[::finer, 0]) / 500
-            - exact
-        ).max()
+        speeds = eqx.filter_jit(commanded_speeds)(omega, motor, Batch(grid, rows, jnp.zeros(4)))
+        return np.abs(np.asarray(speeds.begin[::finer, 0]) / 500 - exact).max()
 
     u = commands[0, 0] / 500
     w, exact = 2 * u / (0.7 + np.sqrt(0.49 + 1.2 * u)), []

@@ -178,7 +178,7 @@ def test_the_command_calls_the_library_and_writes_its_numbers(run, tmp_path, fli
     assert code == 0, err
     (((recording,), subject, options, found),) = called
     assert same(subject, jaxos4.PublishedOS4())
-    assert options == {"settings": jaxos4.FlightSettings(channels="rates")}
+    assert options == {"settings": jaxos4.OS4Settings(channels="rates")}
     for name in ("omega", "states"):
         np.testing.assert_array_equal(getattr(recording.flight, name), getattr(flight, name))
     assert found.successful
@@ -267,7 +267,7 @@ def test_a_search_that_fails_keeps_what_the_log_shows():
 
 MODEL, OS4 = jaxos4.PublishedOS4(), jaxos4.OS4
 TURNED = eqx.tree_at(lambda a: a.sensor_rotation, OS4, np.array([0.0, 0.0, 45.0]))
-OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
+OF_FLIGHT, OF_VEHICLE = jaxos4.OS4Settings, jaxos4.VehicleSettings
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
         (MODEL, {"bracket": {"alpha1": (1.0, 0.0)}}, "`bracket`: `alpha1` must be"),
         (MODEL, {"settings": OF_FLIGHT(initial_state="guessed")}, "`initial_state`: must be free or known"),
         (MODEL, {"settings": OF_FLIGHT(channels="some")}, "`channels`: must be one of rates"),
-        (MODEL, {"settings": OF_VEHICLE()}, "`settings`: must be FlightSettings for a model"),
+        (MODEL, {"settings": OF_VEHICLE()}, "`settings`: must be OS4Settings for a model"),
         (jaxos4.FlightModel(), {}, "`subject`: must be a model in alpha_1..8 or an airframe, which"),
         (OS4, {"settings": OF_FLIGHT()}, "`settings`: must be VehicleSettings for an airframe"),
         (OS4, {"network": "none.net"}, "`network`: a vehicle's network is trained for its own flights"),

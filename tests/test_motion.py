@@ -10,9 +10,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxos4.recording import Recording
-from jaxos4.recording.level import force_level
 from jaxos4.recording.motion import measures_velocity, velocity_of
-from jaxos4.recording.noise import without_noise
+from jaxos4.recording.sensor_errors import force_level, without_noise
 
 # The velocity, against a trajectory that SciPy integrates.
 

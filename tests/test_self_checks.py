@@ -419,7 +419,7 @@ def test_rest_before_take_off_judges_scale_and_mounting_of_the_accelerometer(cas
 
 def test_a_difference_of_two_clocks_is_one_lag(flights, monkeypatch):
     """Gyro and accelerometer alone do not show which of the two clocks is wrong."""
-    delay = agreement._Delay((1, -1, 0, 0), -0.0131, 0.002, 0.004)
+    delay = ((1, -1, 0, 0), -0.0131, np.hypot(0.002, 0.004))
     monkeypatch.setattr(agreement, "_delays", lambda _: ([delay], True))
     found = agreement.sensor_clocks(Evidence(flights[0], CRAZYFLIE))
     assert (found.cause, found.size) == ("the accelerometer lags the gyro", "13.1 +- 8.9 ms")

@@ -10,8 +10,8 @@ from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 import jaxos4
+from jaxos4.rotations import sincos
 from jaxos4.simulation import METHODS
-from jaxos4.trigonometry import sincos
 
 every_method = pytest.mark.parametrize("method", METHODS)
 THETA, Q = jaxos4.STATE_NAMES.index("theta"), jaxos4.STATE_NAMES.index("q")

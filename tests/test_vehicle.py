@@ -18,7 +18,7 @@ from jaxos4.identification.intervals import at_lowest, corrected
 from jaxos4.identification.results import Provenance
 from jaxos4.identification.sample_time import sample_time_of
 from jaxos4.identification.search import search
-from jaxos4.networks import for_flight
+from jaxos4.networks import estimator as networks
 from jaxos4.results import NINETY_FIVE
 from jaxos4.shooting import InnovationsProblem
 
@@ -134,7 +134,7 @@ def test_inertias_lie_in_their_intervals_and_bisection_finds_what_newtons_method
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
     small = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
-    monkeypatch.setattr(for_flight, "VEHICLE", small)
+    monkeypatch.setattr(networks, "VEHICLE", small)
     flight, airframe = (lane(part, 0) for part in flown())
     shorter = jax.tree.map(lambda leaf: leaf[:1001] if leaf.ndim else leaf, flight)
     settings = jaxos4.VehicleSettings(terms=("offset", "lag"), sample_time=0.016, holdout=0.0)

@@ -57,7 +57,7 @@ def test_alphas_of_no_rigid_body_contradict_the_rigid_body_alone(number):
 @functools.cache
 def good(channels):
     flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(standard_flight(), key=jax.random.key(0))
-    return jaxos4.identify(flight, jaxos4.PublishedOS4(), settings=jaxos4.FlightSettings(channels=channels))
+    return jaxos4.identify(flight, jaxos4.PublishedOS4(), settings=jaxos4.OS4Settings(channels=channels))
 
 
 @pytest.mark.parametrize("channels", ["all", pytest.param("rates", marks=pytest.mark.slow)])
@@ -90,7 +90,7 @@ FAULTY = {
 def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels):
     """A flight of 2.5 s is long enough to compare attitude and gyro."""
     _, flight = drawn(0)
-    settings = jaxos4.FlightSettings(channels=channels)
+    settings = jaxos4.OS4Settings(channels=channels)
     found = jaxos4.identify(
         dataclasses.replace(flight, **FAULTY[fault](flight)), jaxos4.PublishedOS4(), settings=settings
     )
@@ -107,7 +107,7 @@ def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels)
 def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():
     states = changed(standard_flight(), scale=0.5)["states"]
     states[:, ANGLES] = np.nan
-    settings = jaxos4.FlightSettings(channels="rates")
+    settings = jaxos4.OS4Settings(channels="rates")
     found = jaxos4.identify(
         dataclasses.replace(standard_flight(), states=states), jaxos4.PublishedOS4(), settings=settings
     )

@@ -5,7 +5,7 @@ import pytest
 
 from jaxos4.flight import RATES
 from jaxos4.recording import Recording
-from jaxos4.recording.noise import vibrating_rates
+from jaxos4.recording.sensor_errors import vibrating_rates
 
 
 def gyro(seed, *, line=0.0, hertz=143.0, filtered=False, dt=0.002):

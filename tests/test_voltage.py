@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxos4.logs import Recording
-from jaxos4.recording.voltage import unseen_sag
+from jaxos4.recording.sensor_errors import unseen_sag
 
 TIME = np.arange(0, 20, 0.004)
 TRUE = 16 - 0.5 * np.random.default_rng(0).random(TIME.size)

@@ -1,7 +1,6 @@
 """A flight in closed loop: the true vehicle, its controller, and the log of its sensors."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -67,47 +66,39 @@ def fly_standard(
     return fly_closed_loop(loop, as_float(references), dt=dt, key=flight, substeps=substeps)
 
 
-class _Acting(NamedTuple):
-    """Forcing by rotors and vertical gust, Omega_r', gusts of p', q', r', and wind along the body's axes in a step."""
+def _physics(loop: ClosedLoop) -> tuple[Callable[..., BodyMotion], Callable[..., Vector]]:
+    """The derivative of the motion in the body's axes, and the specific force along them [m/s^2], as functions.
 
-    rotors: Forcing
-    spin_up: Scalar
-    gust: tuple[Scalar, ...]
-    wind: Vector | None
-
-
-def _physics(loop: ClosedLoop) -> tuple[Callable[[BodyMotion, _Acting], BodyMotion], Callable[..., Vector]]:
-    """The derivative of the motion in the body's axes, and the specific force along them [m/s^2].
-
-    Constants are scalars, because a batch of scalars vectorises.
+    They take the motion or its velocity, the forcing by rotors and vertical gust, the wind along the body's axes, and
+    the derivative the gusts of p', q', r'. Constants are scalars, because a batch of scalars vectorises.
     """
     airframe, air = loop.airframe, loop.air
     ix, iy, iz = jnp.asarray(airframe.inertia)
     rotor, gravity = jnp.asarray(airframe.rotor_inertia), jnp.asarray(airframe.gravity)
     alpha, reaction, damping = alpha_scalars(ix, iy, iz, rotor), rotor / iz, tuple(loop.damping)
 
-    def specific_force(velocity: Vector | None, acting: _Acting) -> Vector:
-        thrust = acting.rotors.thrust
-        if air is None or velocity is None or acting.wind is None:
+    def specific_force(velocity: Vector | None, forcing: Forcing, wind: Vector | None) -> Vector:
+        thrust = forcing.thrust
+        if air is None or velocity is None or wind is None:
             return jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust
-        each = zip((*air.drag, air.inflow), velocity, acting.wind, strict=True)
-        x, y, z = (drag * (wind - v) for drag, v, wind in each)
+        each = zip((*air.drag, air.inflow), velocity, wind, strict=True)
+        x, y, z = (drag * (blown - v) for drag, v, blown in each)
         return x, y, thrust + z
 
-    def derivative(motion: BodyMotion, acting: _Acting) -> BodyMotion:
+    def derivative(motion: BodyMotion, forcing: Forcing, wind: Vector | None, gusts: Vector) -> BodyMotion:
         p, q, r = motion.rates
-        turning = CorrectedOS4().angular_acceleration(motion.rates, acting.rotors, alpha)
-        each = zip(turning, acting.gust, damping, motion.rates, strict=True)
+        turning = CorrectedOS4().angular_acceleration(motion.rates, forcing, alpha)
+        each = zip(turning, gusts, damping, motion.rates, strict=True)
         turning = Rates(*(total + gust - share * rate for total, gust, share, rate in each))
-        turning = turning._replace(r=turning.r - reaction * acting.spin_up)
+        turning = turning._replace(r=turning.r - reaction * forcing.spin_up)
         orientation = Orientation.of(motion.attitude)
         attitude = attitude_rates(motion.rates, orientation)
-        if air is None or motion.velocity is None or acting.wind is None:
+        if air is None or motion.velocity is None or wind is None:
             return BodyMotion(turning, attitude, None)
-        (u, v, w), (wind_x, wind_y, _), (roll, pitch) = motion.velocity, acting.wind, air.flapping
+        (u, v, w), (wind_x, wind_y, _), (roll, pitch) = motion.velocity, wind, air.flapping
         turning = jax.tree.map(jnp.add, turning, Rates(roll * (v - wind_y), pitch * (u - wind_x), jnp.zeros_like(u)))
         sin_phi, cos_phi, sin_theta, cos_theta, _, _ = orientation
-        x, y, z = specific_force(motion.velocity, acting)
+        x, y, z = specific_force(motion.velocity, forcing, wind)
         moving = (
             x + gravity * sin_theta - q * w + r * v,
             y - gravity * cos_theta * sin_phi - r * u + p * w,
@@ -118,31 +109,12 @@ def _physics(loop: ClosedLoop) -> tuple[Callable[[BodyMotion, _Acting], BodyMoti
     return derivative, specific_force
 
 
-class _Drawn(NamedTuple):
-    """The random numbers of a flight, in rows for each run of the controller.
+def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> tuple:
+    """The random numbers of this many runs of the controller, each with `steps` of length `h`.
 
-    `gusts` include the constant torque. `noise` is that of gyro, attitude and accelerometer, `own` that of the
-    controller's gyro.
+    **Returns:** in rows for each run: gusts, which include the constant torque, and winds at the ends of the steps; the
+    noise of gyro, attitude and accelerometer; and the noise of the controller's own gyro.
     """
-
-    gusts: Float[Array, "*runs ends 4"]
-    winds: Float[Array, "*runs ends 3"] | None
-    noise: Float[Array, "*runs 9"]
-    own: Float[Array, "*runs 3"] | None
-
-
-class _Carry(NamedTuple):
-    """The state between two runs of the controller. Row k + 1 of `commands` holds the command of run k."""
-
-    motion: BodyMotion
-    speeds: Float[Array, "4"]
-    integral: PerAxis
-    commands: Float[Array, "rows 4"]
-    signals: Signals | None
-
-
-def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Drawn:
-    """The random numbers of this many runs of the controller, each with `steps` of length `h`."""
     (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
     shape, rows = (runs * steps + 1, 4), steps * np.arange(runs)[:, None] + np.arange(steps + 1)
     gusts = jnp.append(loop.gust, loop.thrust_gust) * coloured(jax.random.normal(gust_key, shape), h / loop.gust_time)
@@ -152,7 +124,7 @@ def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Draw
         winds = loop.air.wind * coloured(jax.random.normal(wind_key, shape), h / loop.air.wind_time)[rows][..., :3]
     if loop.sensors is not None:
         own = jnp.nan_to_num(loop.sensors.controller_gyro_noise) * jax.random.normal(own_key, (runs, 3))
-    return _Drawn(gusts, winds, noise * jax.random.normal(noise_key, (runs, 9)), own)
+    return (gusts, winds), noise * jax.random.normal(noise_key, (runs, 9)), own
 
 
 @eqx.filter_jit
@@ -169,22 +141,22 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     late = jnp.floor(loop.rotor_delay / period).astype(int)
     part = loop.rotor_delay / period - late
 
-    def acting(weak, squares, residual, spin_up, gust, wind) -> _Acting:
+    def acting(weak, squares, residual, spin_up, gust, wind) -> tuple[Forcing, Vector | None, Vector]:
         roll, pitch, yaw, thrust = weak * (mixer @ squares)
-        *turning, pushing = gust
-        rotors = Forcing(roll, pitch, yaw, thrust / airframe.mass + pushing, residual)
-        return _Acting(rotors, spin_up, tuple(turning), None if wind is None else tuple(wind))
+        *gusts, pushing = gust
+        forcing = Forcing(roll, pitch, yaw, thrust / airframe.mass + pushing, residual, spin_up)
+        return forcing, None if wind is None else tuple(wind), tuple(gusts)
 
-    def run(carry: _Carry, row):
-        (motion, speeds, integral, commands, signals), (k, reference, drawn) = carry, row
-        blown, error = (drawn.gusts, drawn.winds), drawn.noise
+    def run(carry, row):
+        (motion, before_run, integral, commands, signals), (k, reference, (blown, error, own_error)) = carry, row
         weak, nothing = 1 - loop.sag * k / (runs - 1), jnp.zeros(())
-        now = acting(weak, jnp.square(speeds), nothing, nothing, *jax.tree.map(lambda ends: ends[0], blown))
-        specific = jnp.stack(specific_force(motion.velocity, now)) + error[6:]
+        first = jax.tree.map(lambda ends: ends[0], blown)
+        forcing, wind, _ = acting(weak, jnp.square(before_run), nothing, nothing, *first)
+        specific = jnp.stack(specific_force(motion.velocity, forcing, wind)) + error[6:]
         rates, attitude = jnp.stack(motion.rates), jnp.stack(motion.attitude) + error[3:6]
         seen = gyro = rates + error[:3]
         if sense is not None and signals is not None:
-            signals, gyro, seen = sense(signals, k, speeds, gyro, rates + drawn.own, specific)
+            signals, gyro, seen = sense(signals, k, before_run, gyro, rates + own_error, specific)
             specific = signals.filtered[6:]
         command, integral = _control(loop, allocation, reference, seen, attitude, integral, period)
         commands = commands.at[k + 1].set(command)
@@ -199,22 +171,25 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
             after = motor.step(speeds, (1 - loop.load_sag * (load - 1)) * wanted, h)
             squares = (speeds * speeds + speeds * after + after * after) / 3
             residual, spin_up = (speeds + after) @ spins / 2, (after - speeds) @ spins / h
-            forcing = acting(weak, squares, residual, spin_up, *gust_and_wind)
-            return (runge_kutta(lambda motion: derivative(motion, forcing), motion, h), after), (speeds + after) / 2
+            forced = acting(weak, squares, residual, spin_up, *gust_and_wind)
+            return (runge_kutta(lambda motion: derivative(motion, *forced), motion, h), after), (speeds + after) / 2
 
         middle = jax.tree.map(lambda ends: (ends[:-1] + ends[1:]) / 2, blown)
-        (later, speeds), means = jax.lax.scan(step, (motion, speeds), (jnp.arange(steps), *middle))
+        (later, speeds), means = jax.lax.scan(step, (motion, before_run), (jnp.arange(steps), *middle))
         mean = means.mean(axis=0)
         signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)
-        omega = command if loop.logged == "commands" else carry.speeds
-        return _Carry(later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
+        omega = command if loop.logged == "commands" else before_run
+        return (later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
 
     inputs = jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), _draw(loop, key, runs, steps, h)
     return log(loop, dt, jax.lax.scan(run, _hovering(loop, allocation, runs), inputs)[1], log_key)
 
 
-def _hovering(loop: ClosedLoop, allocation: Array, runs: int) -> _Carry:
-    """The state before the first run: level and at rest, with rotors that carry the weight."""
+def _hovering(loop: ClosedLoop, allocation: Array, runs: int) -> tuple:
+    """The state before the first run: level and at rest, with rotors that carry the weight.
+
+    **Returns:** motion, rotor speeds, integrators, commands, of which row k + 1 holds that of run k, and signals.
+    """
     airframe, zero = loop.airframe, jnp.zeros(())
     weight = as_float(airframe.mass * airframe.gravity)
     hover, _ = _speeds(allocation, jnp.zeros(3), weight, airframe.max_rotor_speed)
@@ -223,7 +198,7 @@ def _hovering(loop: ClosedLoop, allocation: Array, runs: int) -> _Carry:
     still = jnp.zeros(9).at[8].set(airframe.gravity)
     signals = None if loop.sensors is None else Signals(still, still, jnp.zeros(4), jnp.zeros((runs, 3)))
     commands = jnp.broadcast_to(loop.motor.command(hover), (runs + 1, 4))
-    return _Carry(motion, hover, jnp.zeros(3), commands, signals)
+    return motion, hover, jnp.zeros(3), commands, signals
 
 
 def _control(

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int
 from .._custom_types import Key, Scalar
 from ..flight import ANGLES, RATES, VELOCITY, Flight
 from ..models.state import Attitude, Orientation, Rates, Vector, to_earth
+from ..rotations import sincos
 from ..simulation import until_failure
-from ..trigonometry import sincos
 from .settings import ClosedLoop, PerAxis, Sensors
 
 

@@ -22,7 +22,7 @@ PerAxis = Float[Array, "3"]
 Pair = Float[Array, "2"]
 
 LOGGED = ("commands", "speeds")
-_BODY, _XYZ, _XY, _TILT = MOTIONS, ("x", "y", "z"), ("x", "y"), MOTIONS[:2]
+_XYZ, _XY, _TILT = ("x", "y", "z"), ("x", "y"), MOTIONS[:2]
 
 
 class Air(eqx.Module):
@@ -33,7 +33,7 @@ class Air(eqx.Module):
     roll acceleration, and flapping_pitch v_x to the pitch acceleration.
 
     - `wind`: standard deviation along x, y, z [m/s]. `wind_time`: the correlation time [s].
-    - `drag`: of the rotors along x and y [1/s].
+    - `drag`: the drag of the rotors along x and y [1/s].
     - `inflow`: the thrust that rotors lose as they climb through the air [1/s].
     - `flapping`: moment over inertia and airspeed, in roll and pitch [1/(m s)], of either sign.
 
@@ -134,23 +134,23 @@ class ClosedLoop(eqx.Module):
     rotor_delay: Scalar = eqx.field(converter=setting("rotor_delay"), default=0.01)
     thrust_curve: Scalar = eqx.field(converter=setting("thrust_curve", high=STEEPEST), default=1.0)
     motor_braking: Scalar = eqx.field(converter=setting("motor_braking", high=1.0), default=1.0)
-    offset: PerAxis = eqx.field(converter=setting("offset", _BODY, low=-np.inf), default=0.0)
-    damping: PerAxis = eqx.field(converter=setting("damping", _BODY, low=-np.inf), default=0.0)
+    offset: PerAxis = eqx.field(converter=setting("offset", MOTIONS, low=-np.inf), default=0.0)
+    damping: PerAxis = eqx.field(converter=setting("damping", MOTIONS, low=-np.inf), default=0.0)
     sag: Scalar = eqx.field(converter=setting("sag", high=1.0), default=0.0)
     load_sag: Scalar = eqx.field(converter=setting("load_sag", high=1.0), default=0.0)
     air: Air | None = None
-    gust: PerAxis = eqx.field(converter=setting("gust", _BODY), default=0.0)
+    gust: PerAxis = eqx.field(converter=setting("gust", MOTIONS), default=0.0)
     thrust_gust: Scalar = eqx.field(converter=setting("thrust_gust"), default=0.0)
     gust_time: Scalar = eqx.field(converter=setting("gust_time"), default=0.25)
     gyro_noise: Scalar = eqx.field(converter=setting("gyro_noise"), default=0.02)
     attitude_noise: Scalar = eqx.field(converter=setting("attitude_noise"), default=0.002)
     force_noise: Scalar = eqx.field(converter=setting("force_noise"), default=FORCE_SIGMA)
     sensors: Sensors | None = None
-    attitude_gain: PerAxis = eqx.field(converter=setting("attitude_gain", _BODY), default=(4.0, 4.0, 2.0))
-    rate_gain: PerAxis = eqx.field(converter=setting("rate_gain", _BODY), default=(12.0, 12.0, 6.0))
-    integral_gain: PerAxis = eqx.field(converter=setting("integral_gain", _BODY), default=(10.0, 10.0, 5.0))
+    attitude_gain: PerAxis = eqx.field(converter=setting("attitude_gain", MOTIONS), default=(4.0, 4.0, 2.0))
+    rate_gain: PerAxis = eqx.field(converter=setting("rate_gain", MOTIONS), default=(12.0, 12.0, 6.0))
+    integral_gain: PerAxis = eqx.field(converter=setting("integral_gain", MOTIONS), default=(10.0, 10.0, 5.0))
     controller_inertia: PerAxis | None = eqx.field(
-        converter=lambda x: None if x is None else setting("controller_inertia", _BODY)(x), default=None
+        converter=lambda x: None if x is None else setting("controller_inertia", MOTIONS)(x), default=None
     )
     log_every: int = eqx.field(static=True, converter=integer("log_every", 1, static=True), default=1)
     logged: str = eqx.field(static=True, default="commands")

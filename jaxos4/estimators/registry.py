@@ -1,7 +1,6 @@
 """The estimators by name."""
 
-import pkgutil
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .._registry import Registry
 
@@ -10,15 +9,7 @@ if TYPE_CHECKING:  # the command line offers the names before it imports JAX
     from ..networks import TrainedNetwork
 
 
-class Estimators(Registry[Any]):
-    """Classes by name. A class given as `"module:Class"` is imported when it is looked up."""
-
-    def __getitem__(self, name: str) -> "type[AbstractEstimator]":
-        kind = super().__getitem__(name)
-        return pkgutil.resolve_name(f"jaxos4.{kind}") if isinstance(kind, str) else kind
-
-
-ESTIMATORS = Estimators(
+ESTIMATORS: "Registry[type[AbstractEstimator]]" = Registry(
     "jaxos4.estimators",
     {
         "ibss": "estimators.ibss:IBSS",

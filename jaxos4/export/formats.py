@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._templates import in_xml, templates
+from .._files import in_xml, templates
 from .._version import __version__
 from ..errors import InputError, printable
 from ..identification.results import Identification

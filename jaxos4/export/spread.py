@@ -109,7 +109,7 @@ def _sizes(
     file: VehicleIdentification, mean: Mapping[str, float], parameters: Sequence[str]
 ) -> dict[str, tuple[str, float, float]]:
     """The verdict on each moment of inertia and parameter, of what its moves are shares, and how wide a guess is."""
-    terms = {x.name: (term.quantity, x.half_width) for term in TERMS.values() for x in term.parameters}
+    terms = {x.name: (term.verdict, x.half_width) for term in TERMS.values() for x in term.parameters}
     sizes = {name: (name, mean[name], _GUESS * mean[name]) for name in INERTIAS}
     for name in parameters:
         quantity, half_width = terms.get(without_recording(name), ("", 0.0))

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY, Flight
-from ..recording.noise import white_noise
+from ..recording.sensor_errors import white_noise
 from ..rotations import attitude_quaternion, conjugate, quaternion_product, rotated
 from .flight_prediction import known_mean
 from .motion import PARTS, departures

@@ -14,7 +14,7 @@ from ..flight import STATE_NAMES, Flight
 from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
 from .os4 import fit_os4
-from .problem import FlightSettings, Intervals, bracket_of, os4_problem
+from .problem import Intervals, OS4Settings, bracket_of, os4_problem
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):
@@ -80,7 +80,7 @@ def assess(
     """
     (recording,) = as_recordings(flight)
     where = bracket_of(bracket, model)
-    settings = FlightSettings(channels=channels, initial_state=initial_state, window=window)
+    settings = OS4Settings(channels=channels, initial_state=initial_state, window=window)
     problem = os4_problem(recording, model, where, settings)
     answer = fit_os4(IBSS(), problem, progress=progress)
     known = identifiability(answer.evaluation or evaluate(answer.problem, answer.estimate.parameters), where)

@@ -22,13 +22,13 @@ from ..networks import TrainedNetwork
 from .checks import judge_vehicle
 from .data import class_name, silent
 from .os4 import fit_os4, judge_os4, prepare_os4
-from .problem import FlightSettings, Intervals
+from .problem import Intervals, OS4Settings
 from .results import Identification
 from .sample_time import DEFAULT, fit_vehicle, vehicle_estimator
 from .vehicle import VehicleSettings, prepare_vehicle
 
-Settings = FlightSettings | VehicleSettings
-S = TypeVar("S", FlightSettings, VehicleSettings)
+Settings = OS4Settings | VehicleSettings
+S = TypeVar("S", OS4Settings, VehicleSettings)
 
 
 def identify(
@@ -54,7 +54,7 @@ def identify(
 
     - `flights`: the path of a log, a `Flight`, a `Recording` (a flight with a name), or several for a vehicle.
     - `subject`: a model in alpha_1..8, such as `PublishedOS4()`, or the `Airframe` of a real vehicle.
-    - `settings`: `FlightSettings` for a model, `VehicleSettings` for an airframe.
+    - `settings`: `OS4Settings` for a model, `VehicleSettings` for an airframe.
     - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
       `"filter-error"` for a vehicle, which flies in closed loop. The other estimators of a vehicle, such as `"ibss"`,
       search the same likelihood.
@@ -87,7 +87,7 @@ def identify(
         found = judge_vehicle(answer, sample_times, name, progress=progress)
     else:
         options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
-        wanted = _settings(FlightSettings, settings)
+        wanted = _settings(OS4Settings, settings)
         data, name, method = prepare_os4(recordings, subject, wanted, progress=progress, **options)
         found = judge_os4(data, fit_os4(method, data.likelihood, progress=progress), method, name)
     return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)
@@ -107,12 +107,12 @@ def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> 
     **Raises:** `InputError` for an option that does not fit the subject.
     """
     given = {name: value for name, value in options.items() if value is not None}
-    kind = VehicleSettings if isinstance(subject, Airframe) else FlightSettings
+    kind = VehicleSettings if isinstance(subject, Airframe) else OS4Settings
     own = {field.name for field in dataclasses.fields(kind)}
     for name in given:
         if name in own or (name, given[name]) == ("initial_state", "free"):
             continue
-        if kind is FlightSettings:
+        if kind is OS4Settings:
             why = f"is for a real vehicle, not for the {class_name(subject, MODELS)} model"
         elif name == "initial_state":
             raise InputError(f"`initial_state` {given[name]}: a vehicle's filters find their own state; leave it out.")

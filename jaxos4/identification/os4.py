@@ -24,8 +24,8 @@ from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
+from ..networks.estimator import GivenNetwork, network_for, network_provenance
 from ..networks.file import load_network
-from ..networks.for_flight import GivenNetwork, network_for, network_provenance
 from ..recording.checks import KINEMATIC, self_checks
 from ..results import has_answer, result_names
 from ..shooting import ShootingProblem, padded
@@ -43,7 +43,7 @@ from .data import (
     versions,
 )
 from .issues import issues_of_log, issues_of_os4
-from .problem import FlightSettings, Intervals, bracket_of, os4_problem
+from .problem import Intervals, OS4Settings, bracket_of, os4_problem
 from .quantities import os4_quantities
 from .results import COLOURED, ChannelFit, Constant, OS4Identification, ParameterEstimate, RigidBody, Validation
 from .verdict import CONTRADICTED, judge, result_of
@@ -55,7 +55,7 @@ SETTLED = 0.2  # relative change of a noise level that ends the passes; such wei
 def prepare_os4(
     recordings: Sequence[Recording],
     model: AbstractModel,
-    settings: FlightSettings,
+    settings: OS4Settings,
     *,
     estimator: str | AbstractEstimator | None,
     bracket: Intervals,
@@ -121,7 +121,7 @@ def prepare_os4(
 
 
 def _given_network(
-    estimator: str | AbstractEstimator, settings: FlightSettings, network: GivenNetwork
+    estimator: str | AbstractEstimator, settings: OS4Settings, network: GivenNetwork
 ) -> TrainedNetwork | None:
     """The network that an estimator has or was given. Raises `InputError` for options that do not fit the estimator."""
     name, kind = name_and_class(estimator)

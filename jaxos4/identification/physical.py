@@ -90,5 +90,5 @@ def centers_of_mass(found: Identification) -> list[CenterOfMass]:
 
 def _judged() -> dict[str, str]:
     """The name of the verdict on each parameter of a vehicle's terms."""
-    terms = [term for term in TERMS.values() if term.quantity]
-    return {x.name: term.quantity for term in terms for x in term.parameters if x.force_axis is None}
+    terms = [term for term in TERMS.values() if term.verdict]
+    return {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}

@@ -17,7 +17,7 @@ from ..logs import Recording
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
-from ..networks.for_flight import seen_channels
+from ..networks.estimator import seen_channels
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem, Unknowns
 
@@ -29,7 +29,7 @@ _ADDED = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
 
 
 @dataclasses.dataclass(frozen=True)
-class FlightSettings:
+class OS4Settings:
     """Settings of the identification of an OS4.
 
     - `channels`: `"rates"`, `"attitude"` or `"all"`: the compared channels; by default everything that was measured.
@@ -70,9 +70,7 @@ def _interval(name: str, value: Any) -> list[float]:
     return numbers
 
 
-def os4_problem(
-    recording: Recording, model: AbstractModel, bracket: Bracket, settings: FlightSettings
-) -> ShootingProblem:
+def os4_problem(recording: Recording, model: AbstractModel, bracket: Bracket, settings: OS4Settings) -> ShootingProblem:
     """The shooting problem of one flight and a model, with the noise of standard sensors.
 
     **Raises:** `InputError`, one line, for arguments out of range and flights that measured too little.
@@ -153,7 +151,7 @@ def train_network(
     - `settings`: of the training, except the channels.
     - `channels`: the network's inputs; by default the rates, and the attitude if a rate was not measured.
     """
-    where, own = bracket_of(bracket, model), FlightSettings(channels=channels, initial_state=initial_state)
+    where, own = bracket_of(bracket, model), OS4Settings(channels=channels, initial_state=initial_state)
     problem = os4_problem(recording, model, where, own)
     settings = dataclasses.replace(settings, channels=channels or seen_channels(problem))
     with named(recording.name):

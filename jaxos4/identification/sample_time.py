@@ -22,7 +22,7 @@ from ..airframe import AXES, PITCH, ROLL, YAW
 from ..errors import InputError, TrainingError
 from ..estimate import REACH, AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
-from ..networks.for_flight import GivenNetwork, liveliest, vehicle_network_for
+from ..networks.estimator import GivenNetwork, most_agile_windows, vehicle_network_for
 from ..results import result_names
 from ..shooting import InnovationsProblem
 from .answers import VehicleAnswer, dominated, vehicle_constants
@@ -99,7 +99,7 @@ def _with_estimator(
     if not ESTIMATORS[estimator].needs_network:
         return data, make_estimator(estimator)
     progress("training a network for these flights")
-    begin, seen = time.perf_counter(), liveliest(data.problem)
+    begin, seen = time.perf_counter(), most_agile_windows(data.problem)
     name, method = str((data.provenance.flights or ["flight"])[0]), IBSS()
     try:
         method = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)

@@ -173,9 +173,9 @@ def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: P
 def _at_nominal_values(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
     """The parameters near their nominal values fixed there, unless that clearly raises the cost."""
     nominal = {
-        row.name: row.plain
+        row.name: row.nominal
         for row, value, std in _rows(before)
-        if row.plain is not None and std > 0 and abs(value - row.plain) < NEAR_NOMINAL * std
+        if row.nominal is not None and std > 0 and abs(value - row.nominal) < NEAR_NOMINAL * std
     }
     if not nominal:
         return before

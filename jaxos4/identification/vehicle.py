@@ -17,7 +17,7 @@ from ..logs import Recording
 from ..models.flight_model import FlightModel
 from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
 from ..recording.prepared import HOLDOUT, Prepared, prepare
-from ..recording.voltage import unseen_sag
+from ..recording.sensor_errors import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, input_innovations, lagged
 from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions

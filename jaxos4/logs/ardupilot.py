@@ -5,14 +5,15 @@ Reference: `AP_Logger` and `LogStructure.h` of ArduPilot.
 """
 
 import array
-import math
 
 import numpy as np
 
+from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES
 from ..rotations import HALF_TURN
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, motor_order, records
+from .messages import Fields, Messages, Rotors, motor_order, records
 from .sampling import Series, logged_rate
 from .table import LogFormat, LogPath, Table, counted, fast_enough, read_bytes, refuse
+from .values import DEGREE, RPM
 
 _HEAD, _FMT, _FMT_LENGTH = b"\xa3\x95", 0x80, 89
 _TYPES = {  # by letter: the type, and the unit of its last digit, 0 for texts and arrays
@@ -23,12 +24,11 @@ _TYPES = {  # by letter: the type, and the unit of its last digit, 0 for texts a
     **{letter: (code, 0.01) for letter, code in zip("cCeE", "i2 u2 i4 u4".split(), strict=True)},
     **{"n": ("S4", 0.0), "N": ("S16", 0.0), "Z": ("S64", 0.0), "L": ("i4", 1e-7), "a": ("S64", 0.0)},
 }
-_DEGREES, _RPM = math.pi / 180 * HALF_TURN, 2 * math.pi / 60
 _GYRO, _ACCELEROMETER, _ROLL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ"), ("Roll", "Pitch", "Yaw")
 _SOURCES = {
-    RATES: [("GYR", _GYRO, HALF_TURN), ("IMU", _GYRO, HALF_TURN), ("RATE", ("R", "P", "Y"), _DEGREES)],
-    ANGLES: [("ANG", _ROLL, _DEGREES), ("ATT", _ROLL, _DEGREES)],
-    FORCES: [("ACC", _ACCELEROMETER, HALF_TURN), ("IMU", _ACCELEROMETER, HALF_TURN)],
+    RATE_NAMES: [("GYR", _GYRO, HALF_TURN), ("IMU", _GYRO, HALF_TURN), ("RATE", ("R", "P", "Y"), DEGREE * HALF_TURN)],
+    ANGLE_NAMES: [("ANG", _ROLL, DEGREE * HALF_TURN), ("ATT", _ROLL, DEGREE * HALF_TURN)],
+    FORCE_NAMES: [("ACC", _ACCELEROMETER, HALF_TURN), ("IMU", _ACCELEROMETER, HALF_TURN)],
     ("x", "y", "z"): [(name, ("PN", "PE", "PD"), HALF_TURN) for name in ("XKF1", "NKF1")],
     ("vx", "vy", "vz"): [(name, ("VN", "VE", "VD"), HALF_TURN) for name in ("XKF1", "NKF1")],
     ("voltage",): [("BAT", ("Volt",), 1.0)],
@@ -77,7 +77,7 @@ def _rotors(log: Messages, outputs: list[int]) -> Rotors | None:
         t = next(iter(escs.values())).t
         rate = logged_rate(t)
         if commands is None or fast_enough(rate) or rate >= logged_rate(commands.t):
-            values = [log.speeds_at(t, each, name) * _RPM for name, each in escs.items()]
+            values = [log.speeds_at(t, each, name) * RPM for name, each in escs.items()]
             return Rotors(Series(t, np.abs(np.column_stack(values))), [*escs], is_measured=True)
         log.notes.append(f"measured speeds (ESC) were logged at {rate:.2g} Hz only: commands are used")
     if commands is None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..errors import printable
-from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES, STATE_NAMES
+from ..flight import COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SIGNALS, SPEED_NAMES, STATE_NAMES
 from .sampling import UNIFORM, grid_size, held_regularly, last_measured, logged_rate, resample, unwrap
 from .table import MAX_ROWS, Recording, Sampling, Table, counted, listed, signals_of
 from .values import COLUMNS, PITCH, without_impossible
@@ -28,7 +28,7 @@ def recording_of(
     # A column of empty cells was not logged, also if it is a rotor's.
     motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
     dt = _check_time(table)
-    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
+    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, RATE_NAMES)}
     facts = table.facts._replace(**{name: getattr(table.facts, name) or slowest for name, slowest in rarest.items()})
     for name in filter(table.holds, motors):
         if np.isnan(table.columns[name][0]):
@@ -150,7 +150,8 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
 
 def _measured(table: Table, notes: list[str]) -> dict[str, np.ndarray]:
     """The columns of measurements, in which NaN marks gaps, with unwrapped angles."""
-    columns = {name: table.columns[name] for name in _names(table, inputs=False)}
+    every = [name for signal in SIGNALS.values() if not signal.is_input for name in signal.columns]
+    columns = {name: table.columns[name] for name in filter(table.holds, every)}
     for name in filter(columns.__contains__, ("phi", "psi")):
         columns[name], jumps = unwrap(columns[name])
         if jumps:
@@ -166,14 +167,9 @@ def _measured(table: Table, notes: list[str]) -> dict[str, np.ndarray]:
 def _inputs(table: Table) -> dict[str, np.ndarray]:
     """The columns of inputs at every row, interpolated linearly between measured cells."""
     t, found = table.columns["t"], {}
-    for name in _names(table, inputs=True):
+    every = [name for signal in SIGNALS.values() if signal.is_input for name in signal.columns]
+    for name in filter(table.holds, every):
         measured = np.isfinite(table.columns[name])
         if measured.any():
             found[name] = np.interp(t, t[measured], table.columns[name][measured])
     return found
-
-
-def _names(table: Table, *, inputs: bool) -> list[str]:
-    """The columns of a table that hold inputs, or the others, in the order of `SIGNALS`."""
-    signals = [signal for signal in SIGNALS.values() if signal.is_input == inputs]
-    return [name for signal in signals for name in signal.columns if table.holds(name)]

@@ -15,22 +15,21 @@ from typing import NamedTuple
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
-from ..flight import COMMAND_NAMES, SPEED_NAMES
+from ..flight import ANGLE_NAMES, COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SPEED_NAMES
 from ..rotations import HALF_TURN, euler_angles
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
-from .messages import ANGLES, FORCES, RATES
 from .sampling import in_order
-from .table import LogFormat, LogPath, Table, counted, opened, order_note, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, counted, items, opened, order_note, read_bytes, refuse
+from .values import DEGREE, RPM
 
 _MAGIC = b"H Product:Blackbox"
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
 _LONGEST_HEADER = 5000, 1 << 16  # lines of settings, and characters of one
-_DEGREE = math.pi / 180
 _NONE = np.zeros(0)
 _UNITS = {  # of `blackbox_decode`, behind the name of a field
     "time": {"us": 1e-6, "ms": 1e-3, "s": 1.0},
-    "gyroADC": {"deg/s": _DEGREE, "rad/s": 1.0},
+    "gyroADC": {"deg/s": DEGREE, "rad/s": 1.0},
     "accSmooth": {"g": STANDARD_GRAVITY, "m/s/s": 1.0, "m/s2": 1.0},
 }
 _GYROS = ("gyroUnfilt", "gyroADCafterRpm", "gyroADC")
@@ -44,10 +43,10 @@ _DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _RAW = (
     "time",
-    *(f"{name}[{i}]" for name in (*_GYROS, "accSmooth") for i in range(3)),
-    *(f"{name}[{i}]" for name, count in _ATTITUDES.items() for i in range(count)),
+    *(each for name in (*_GYROS, "accSmooth") for each in items(name, 3)),
+    *(each for name, count in _ATTITUDES.items() for each in items(name, count)),
     _VOLTAGE,
-    *(f"{name}[{i}]" for name in (*_SPEEDS, "motor") for i in range(8)),
+    *(each for name in (*_SPEEDS, "motor") for each in items(name, 8)),
 )
 _CONVERTED = {
     f"{name} ({unit})": (name, factor)
@@ -65,7 +64,7 @@ class _Log(NamedTuple):
     """A blackbox log: its columns `raw` and its `settings`; our `columns` and their `names` in the log; `notes`.
 
     - `header`: the row of the CSV's header; `None` for a log that was not decoded.
-    - `converted`: of columns that `blackbox_decode` has converted, the whole name ("gyroADC[0] (deg/s)") and the unit.
+    - `converted`: the whole name ("gyroADC[0] (deg/s)") and the unit of columns that `blackbox_decode` has converted.
     """
 
     path: LogPath
@@ -85,7 +84,7 @@ class _Log(NamedTuple):
 
     def vector(self, name: str, count: int) -> np.ndarray | None:
         """The fields `name[0]`, ..., shape (rows, count), if all were logged and they change."""
-        names = [f"{name}[{i}]" for i in range(count)]
+        names = items(name, count)
         if not self.raw.keys() >= set(names) or not any(np.ptp(_finite(self.raw[each])) for each in names):
             return None
         return np.column_stack([self.raw[each] for each in names])
@@ -228,10 +227,10 @@ def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
 
 
 def _add_rates(log: _Log) -> None:
-    field = next((name for name in _GYROS if log.raw.keys() >= {f"{name}[{i}]" for i in range(3)}), None)
+    field = next((name for name in _GYROS if log.raw.keys() >= {*items(name, 3)}), None)
     if field is None:
         refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
-    names = {name: f"{field}[{i}]" for i, name in enumerate(RATES)}
+    names = dict(zip(RATE_NAMES, items(field, 3), strict=True))
     fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
     log.notes.extend([] if log.settings or names["p"] in log.converted else [f"{field} is taken as deg/s: {fine}"])
     unit = _gyro_unit(log) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
@@ -242,25 +241,25 @@ def _gyro_unit(log: _Log) -> float:
     """One count of the gyro [rad/s]: the setting holds deg/s, or, of Baseflight and in exports, rad/us."""
     for name in _GYRO_SCALES:
         if (scale := log.setting(name, 1e-3, 10)) is not None:
-            return scale * _DEGREE
+            return scale * DEGREE
         if (scale := log.setting(name, 1e-11, 1e-6)) is not None:
             return scale * 1e6
-    return _DEGREE
+    return DEGREE
 
 
 def _add_rotors(log: _Log, *, usual: int = 14) -> None:
     raw = log.raw
-    more = (f"{name}[{i}]" for name in (*_SPEEDS, "motor") for i in range(4, 8))
+    more = (each for name in (*_SPEEDS, "motor") for each in items(name, 8)[4:])
     if any(np.ptp(_finite(raw[name])) > 0 for name in more if name in raw):
         refuse(log.path, "has more than four motors; give the log of a quadrotor", row=log.header)
-    every = {field: [f"{field}[{i}]" for i in range(4)] for field in (*_SPEEDS, "motor")}
+    every = {field: items(field, 4) for field in (*_SPEEDS, "motor")}
     commands = every.pop("motor")
     turning = (f for f, names in every.items() if all((_finite(raw.get(name, _NONE)) > 0).any() for name in names))
     if (field := next(turning, None)) is not None:
         poles = log.setting("motor_poles", 2, 100)
         if field == "eRPM" and poles is None:
             log.notes.append(f"eRPM is turned into speeds with {usual} motor poles, the default: check the vehicle")
-        unit = 100 / ((poles or usual) / 2) * 2 * math.pi / 60 if field == "eRPM" else 1.0
+        unit = 100 / ((poles or usual) / 2) * RPM if field == "eRPM" else 1.0
         log.add(dict(zip(SPEED_NAMES, every[field], strict=True)), unit)
         return
     for name in commands:
@@ -279,7 +278,7 @@ def _add_rotors(log: _Log, *, usual: int = 14) -> None:
 
 
 def _add_force(log: _Log) -> None:
-    names = [f"accSmooth[{i}]" for i in range(3)]
+    names = items("accSmooth", 3)
     if not log.raw.keys() >= set(names):
         return
     if log.setting("acc_1G", 0, 0) is not None or not any(np.ptp(_finite(log.raw[name])) for name in names):
@@ -290,7 +289,7 @@ def _add_force(log: _Log) -> None:
         median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
         one = min((256, 512, 1024, 2048, 4096, 8192), key=lambda g: abs(math.log(g / max(median, 1e-9))))
         log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
-    log.add(dict(zip(FORCES, names, strict=True)), STANDARD_GRAVITY / (one or 1))
+    log.add(dict(zip(FORCE_NAMES, names, strict=True)), STANDARD_GRAVITY / (one or 1))
 
 
 def _add_attitude(log: _Log) -> None:
@@ -302,11 +301,11 @@ def _add_attitude(log: _Log) -> None:
         vector = values / 0x7FFF
         angles = euler_angles(np.column_stack([np.sqrt(np.maximum(1 - (vector**2).sum(axis=1), 0.0)), vector]))
     elif field == "attitude":
-        angles = values * _DEGREE / 10 * [1, 1, -1]
+        angles = values * DEGREE / 10 * [1, 1, -1]
     else:
         return
-    log.names.update(dict.fromkeys(ANGLES, field))
-    log.columns.update(zip(ANGLES, angles.T, strict=True))
+    log.names.update(dict.fromkeys(ANGLE_NAMES, field))
+    log.columns.update(zip(ANGLE_NAMES, angles.T, strict=True))
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

@@ -150,7 +150,7 @@ class Numbers:
         self.at = at
 
     def signed(self, count: int, values: list[int]) -> None:
-        """The same, with the sign in the lowest bit."""
+        """Numbers as `unsigned` reads them, with the sign in the lowest bit."""
         begin = len(values)
         self.unsigned(count, values)
         for i in range(begin, len(values)):

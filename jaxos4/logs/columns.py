@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import check_plain, read_toml
-from ..flight import SIGNALS, SPEED_NAMES
+from ..flight import ANGLE_NAMES, SIGNALS, SPEED_NAMES
 from ..rotations import euler_angles
-from .messages import ANGLES
 from .table import LogPath, Table, listed, quoted, refuse
 from .values import COLUMNS, PWM, PWM_ZERO, ColumnLimits
 
@@ -25,7 +24,7 @@ _COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
 _VECTORS = [tuple(signal.columns) for signal in SIGNALS.values() if len(signal.columns) == 3]
 _ALONG_YZ = [name for vector in _VECTORS for name in vector[1:]]
 _TURNED = {"q", "r", "theta", "psi", "y", "z", "vy", "vz", "qy", "qz", *_ALONG_YZ}
-"""What has the opposite sign after half a turn about x."""
+"""The columns that have the opposite sign after half a turn about x."""
 _REMEDY = "correct its unit or sign in the column map"
 
 
@@ -55,7 +54,7 @@ class ColumnMap(NamedTuple):
         """By column, its place in a log.
 
         - `held`: takes a source; returns its name in the log, or `None` if the log does not hold it.
-        - `names`: of all that the log holds, for the `InputError` about a column that is needed.
+        - `names`: all columns or topics of the log, for the `InputError` about a column that is needed.
         """
         found = {}
         for column, source in self.sources.items():
@@ -141,8 +140,8 @@ def mapped_rows(table: Table, columns: ColumnMap) -> Table:
     found = {column: columns.converted(column, raw[place]) for column, place in chosen.items()}
     if found.keys() >= set(QUATERNION):
         angles = euler_angles(np.column_stack([found[name] for name in QUATERNION]))
-        found |= {name: x for name, x in zip(ANGLES, angles.T, strict=True) if name not in found}
-        chosen |= dict.fromkeys(ANGLES, chosen["qw"])
+        found |= {name: x for name, x in zip(ANGLE_NAMES, angles.T, strict=True) if name not in found}
+        chosen |= dict.fromkeys(ANGLE_NAMES, chosen["qw"])
     found = {name: values for name, values in found.items() if name not in QUATERNION}
     unknown = tuple(name for name in names if name not in chosen.values())
     return table._replace(columns=found, names=chosen, unknown=unknown, remedy=_REMEDY)

@@ -45,7 +45,7 @@ def check_sizes(path: LogPath) -> None:
 
 
 def _check_metadata(path: Path) -> None:
-    """The same for a text in YAML, which may not refer to itself either: lists of lists of it could have any length."""
+    """Refuse a text in YAML that is too long or refers to itself: lists of its own lists could have any length."""
     with opened(path, "rb") as file:
         content = file.read(MAX_METADATA + 1)
     if len(content) > MAX_METADATA:
@@ -55,7 +55,7 @@ def _check_metadata(path: Path) -> None:
 
 
 def _check_whole(path: Path, packed: IO[bytes]) -> None:
-    """The same for a file that may be compressed as a whole. It is decompressed once, a part at a time."""
+    """Refuse a file that grows too much. If it is compressed as a whole, it is decompressed once, a part at a time."""
     most = min(MAX_FILE, max(SMALL, MAX_TIMES * path.stat().st_size))
     end = most + 1
     try:
@@ -73,7 +73,7 @@ def _check_whole(path: Path, packed: IO[bytes]) -> None:
 
 
 def check_parts(path: LogPath, parts: Iterable[tuple[str, bytes]]) -> None:
-    """The same for parts, each the name of its compression and its content."""
+    """Refuse a bag with a part that grows too much. `parts`: the name of the compression and the content of each."""
     if any(_exceeds(kind, content) for kind, content in parts):
         _refuse_part(path)
 
@@ -100,7 +100,7 @@ def _mcap_parts(path: LogPath, file: IO[bytes], *, end: int) -> Iterator[tuple[s
 
 
 def _ros1_parts(path: LogPath, file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
-    """The same of a bag of ROS 1, behind its first line."""
+    """The compression and the content of each chunk of a bag of ROS 1 that is open behind its first line."""
     while len(head := file.read(4)) == 4:
         header = file.read(struct.unpack("<I", head)[0])
         (length,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))

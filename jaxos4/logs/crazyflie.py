@@ -4,7 +4,6 @@ Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 """
 
 import array
-import math
 import re
 import zlib
 from collections.abc import Sequence
@@ -12,10 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
-from ..flight import COMMAND_NAMES, SPEED_NAMES
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, Rotors, records
+from ..flight import ANGLE_NAMES, COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SPEED_NAMES
+from .messages import Fields, Messages, Rotors, records
 from .sampling import Series
 from .table import LogFormat, LogPath, Table, counted, quoted, read_bytes, refuse
+from .values import DEGREE, RPM
 
 _MAGIC = b"\xbc"
 _PAIR = re.compile(rb"(..)(..)", re.DOTALL)
@@ -23,17 +23,17 @@ _TYPE = re.compile(rb"(..)([^\0]{0,255})\0(..)", re.DOTALL)
 _NAME = re.compile(rb"([^\0]{0,255})\0")
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
 _SETS = re.compile(rb"(.)(tick\(I\),(?:[\x20-\x27\x2a\x2b\x2d-\x7e]{1,80}\([bBhHiIqQefd]\),){1,255})", re.DOTALL)
-_DEGREE, _RPM, _FULL = math.pi / 180, 2 * math.pi / 60, 65535.0
+_FULL = 65535.0
 _SOURCES = {
-    RATES: ([f"gyro.{axis}" for axis in "xyz"], _DEGREE),
-    ANGLES: ([f"stateEstimate.{name}" for name in ("roll", "pitch", "yaw")], _DEGREE * np.array([1, -1, 1])),
+    RATE_NAMES: ([f"gyro.{axis}" for axis in "xyz"], DEGREE),
+    ANGLE_NAMES: ([f"stateEstimate.{name}" for name in ("roll", "pitch", "yaw")], DEGREE * np.array([1, -1, 1])),
     # These are read one by one.
-    **{(name,): ([f"acc.{name[1]}"], STANDARD_GRAVITY) for name in FORCES},
+    **{(name,): ([f"acc.{name[1]}"], STANDARD_GRAVITY) for name in FORCE_NAMES},
     **{(name,): ([f"stateEstimate.{name}"], 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")},
     ("voltage",): (["pm.vbat"], 1.0),
 }
 _ROTORS = (
-    ("rpm.m{}", True, _RPM),
+    ("rpm.m{}", True, RPM),
     ("motor.m{}", False, 1 / _FULL),
     ("pwm.m{}_pwm", False, 1 / _FULL),
 )

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..flight import COMMAND_NAMES, SPEED_NAMES
+from ..flight import ANGLE_NAMES, COMMAND_NAMES, RATE_NAMES, SPEED_NAMES
 from .sampling import (
     REACH,
-    RowPositions,
+    Rows,
     Series,
     at_most,
     at_rows,
@@ -23,7 +23,6 @@ from .sampling import (
 from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, order_note, refuse
 from .values import dropped, without_impossible
 
-RATES, ANGLES, FORCES = ("p", "q", "r"), ("phi", "theta", "psi"), ("ax", "ay", "az")
 _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
 
 Names = tuple[str, ...]
@@ -70,7 +69,7 @@ class Messages:
 
     - `fields`: by kind of message and instance, the fields of its messages as arrays of one length. `t`: times [s].
     - `remedy`: what to do if the log is corrupt.
-    - `notes`: what was assumed, one line each.
+    - `notes`: the assumptions of the reader, one line each.
     - `names`: by our column, its name in the log.
     - `parameters`: the settings of the autopilot.
     - `prefixed`: whether the name of a field begins with the name of its kind and a dot.
@@ -128,7 +127,7 @@ class Messages:
                     self.name(columns, kind, fields)
         return found
 
-    def speeds_at(self, t: RowPositions, series: Series, source: str) -> RowPositions:
+    def speeds_at(self, t: Rows, series: Series, source: str) -> Rows:
         """The speeds of one rotor, interpolated at other times without the zeros of its telemetry."""
         values = series.values[:, 0]
         zeros = dropped(series.t, values)
@@ -166,7 +165,7 @@ class Messages:
         **Raises:** `InputError` if rates or rotors are missing or do not overlap, for too many rows or impossible
         samples.
         """
-        rates = found.get(RATES)
+        rates = found.get(RATE_NAMES)
         if rates is None:
             refuse(self.path, f"holds no body rates; {remedies[0]}")
         if rotors is None:
@@ -176,7 +175,8 @@ class Messages:
             Sampling(name.partition(".")[0] if self.prefixed else name, logged_rate(series.t))
             for name, series in ((rotors.names[0], rotors.series), (self.names["p"], rates))
         )
-        rows, table = self._at_rows_of(rates, rotors, {names: each for names, each in found.items() if names != RATES})
+        others = {names: each for names, each in found.items() if names != RATE_NAMES}
+        rows, table = self._at_rows_of(rates, rotors, others)
         first, last = float(rows[0]), float(rows[-1])
         inside = [(max(begin, first) - first, min(end, last) - first) for begin, end in landed]
         about = LogFacts(motors, gyro, landed=tuple(each for each in inside if each[0] <= each[1]), **facts)
@@ -187,9 +187,7 @@ class Messages:
             self.notes.append(order_note(rotors.names[0]))
         return table._replace(held=True, facts=about), tuple(self.notes)
 
-    def _at_rows_of(
-        self, rates: Series, rotors: Rotors, others: Mapping[Names, Series | None]
-    ) -> tuple[RowPositions, Table]:
+    def _at_rows_of(self, rates: Series, rotors: Rotors, others: Mapping[Names, Series | None]) -> tuple[Rows, Table]:
         """The times of the gyro while the motors were logged [s], and all columns brought to them."""
         table = Table(self.path, {}, first_row=None, names=self.names, remedy=self.remedy)
         speeds, rotor_names = rotors.series, SPEED_NAMES if rotors.is_measured else COMMAND_NAMES
@@ -201,7 +199,7 @@ class Messages:
             table = without_impossible(table._replace(columns=columns))
             return Series(series.t, np.column_stack([table.columns[name] for name in names]))
 
-        rates, speeds = at_most(possible(RATES, rates), _FASTEST_ROWS), possible(rotor_names, speeds)
+        rates, speeds = at_most(possible(RATE_NAMES, rates), _FASTEST_ROWS), possible(rotor_names, speeds)
         turning = np.isfinite(speeds.values).all(axis=1)
         speeds = Series(speeds.t[turning], speeds.values[turning])
         inside = (rates.t >= speeds.t[0]) & (rates.t <= speeds.t[-1] + REACH * median_step(speeds.t))
@@ -210,12 +208,12 @@ class Messages:
         rows = rates.t[inside]
         if rows.size > MAX_ROWS:
             refuse(self.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
-        columns = {"t": rows - rows[0]} | dict(zip(RATES, rates.values[inside].T, strict=True))
+        columns = {"t": rows - rows[0]} | dict(zip(RATE_NAMES, rates.values[inside].T, strict=True))
         columns |= zip(rotor_names, root_mean_square(speeds, linear=rotors.is_measured)(rows).T, strict=True)
         for names, series in others.items():
             if series is None:
                 continue
-            if names == ANGLES:
+            if names == ANGLE_NAMES:
                 phi, theta, psi = series.values.T
                 series = Series(series.t, np.column_stack([unwrap(phi)[0], theta, unwrap(psi)[0]]))
             columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)

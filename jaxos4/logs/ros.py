@@ -16,11 +16,11 @@ import numpy as np
 
 from .._files import reading
 from ..errors import shortened
-from ..flight import COMMAND_NAMES, SPEED_NAMES
+from ..flight import ANGLE_NAMES, COMMAND_NAMES, RATE_NAMES, SPEED_NAMES
 from ..rotations import euler_angles
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
 from .compression import check_parts, check_sizes
-from .messages import ANGLES, RATES, Fields, Messages, Rotors
+from .messages import Fields, Messages, Rotors
 from .sampling import Series
 from .table import MAX_ROWS, LogFormat, LogPath, Table, listed, opened, quoted, refuse
 
@@ -131,7 +131,7 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
     if columns is None:
         for columns in map(column_map, PRESETS):
             found = columns.chosen(path, held, topics).keys()
-            if found >= {"p", "q", "r"} and found & {"omega1", "command1"}:
+            if found >= {*RATE_NAMES} and found & {"omega1", "command1"}:
                 break
         else:
             what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {listed(topics) or 'none'}"
@@ -270,13 +270,14 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[T
             return None
         return Rotors.of(found, [chosen[name] for name in names], is_measured=names == SPEED_NAMES)
 
-    quaternion, angles = together(QUATERNION), together(ANGLES)
+    quaternion, angles = together(QUATERNION), together(ANGLE_NAMES)
     if angles is None and quaternion is not None:
         angles = Series(quaternion.t, euler_angles(quaternion.values))
-        log.names.update(dict.fromkeys(ANGLES, chosen["qw"]))
-    single = found.keys() - {*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLES, *RATES, "t"}
+        log.names.update(dict.fromkeys(ANGLE_NAMES, chosen["qw"]))
+    single = found.keys() - {*SPEED_NAMES, *COMMAND_NAMES, *QUATERNION, *ANGLE_NAMES, *RATE_NAMES, "t"}
     return log.table(
-        {RATES: together(RATES), ANGLES: angles} | {(name,): together((name,)) for name in sorted(single)},
+        {RATE_NAMES: together(RATE_NAMES), ANGLE_NAMES: angles}
+        | {(name,): together((name,)) for name in sorted(single)},
         rotors(SPEED_NAMES) or rotors(COMMAND_NAMES),
         remedies=(f"name p, q and r in {columns.name}", f"name omega1..4 or command1..4 in {columns.name}"),
     )

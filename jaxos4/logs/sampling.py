@@ -16,9 +16,10 @@ _FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
 
 Times = Float[np.ndarray, " samples"]
 Columns = Float[np.ndarray, "samples columns"]
-Rotors = Float[np.ndarray, "samples 4"]
-RowPositions = Float[np.ndarray, " rows"]
-Resampled = tuple[RowPositions, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
+Speeds = Float[np.ndarray, "samples 4"]
+Rows = Float[np.ndarray, " rows"]
+"""The times of rows [s]."""
+Resampled = tuple[Rows, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
 PARTS = 4
 """The quarters of an averaged sample in which its rotor speeds are kept. Two of them are half of a sample."""
 
@@ -53,7 +54,7 @@ def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Colum
     return until
 
 
-def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[RowPositions], Columns]:
+def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[Rows], Columns]:
     """Root mean square of each rotor's speed or command from each row to the next, so that its impulse is conserved.
 
     Thrust and torque are proportional to the square. Speeds are held until the next sample; if `linear`, their squares
@@ -62,7 +63,7 @@ def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[RowPo
     squares = Series(series.t, np.square(series.values))
     impulse = integral(squares, linear=linear)
 
-    def at(rows: RowPositions) -> Columns:
+    def at(rows: Rows) -> Columns:
         last = np.searchsorted(series.t, rows[-1], side="right") - 1
         out = np.empty((rows.size, squares.values.shape[1]))
         out[:-1] = np.diff(impulse(rows), axis=0) / np.diff(rows)[:, None]
@@ -74,9 +75,7 @@ def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[RowPo
     return at
 
 
-def speeds_within(
-    t: Times, omega: Rotors, *, held: bool
-) -> Callable[[RowPositions, float], Float[np.ndarray, "rows parts 4"]]:
+def speeds_within(t: Times, omega: Speeds, *, held: bool) -> Callable[[Rows, float], Float[np.ndarray, "rows parts 4"]]:
     """Root mean square of each rotor's speed in the parts of the samples around rows, a function of rows and step [s].
 
     Arguments as of `averages`. Before the first time, rotors have the speeds of the first row.
@@ -84,14 +83,14 @@ def speeds_within(
     times, values = np.append(2 * t[0] - t[-1], t), np.concatenate([omega[:1], omega])
     speeds = root_mean_square(Series(times, values), linear=not held)
 
-    def at(rows: RowPositions, dt: float) -> Float[np.ndarray, "rows parts 4"]:
+    def at(rows: Rows, dt: float) -> Float[np.ndarray, "rows parts 4"]:
         edges = rows[0] - dt / 2 + dt / PARTS * np.arange(PARTS * rows.size + 1)
         return speeds(edges)[:-1].reshape(rows.size, PARTS, -1)
 
     return at
 
 
-def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
+def averages(t: Times, omega: Speeds, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
     """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
 
     Each measurement becomes the mean over a sample around its time, or NaN if less than about half of it was measured.
@@ -120,7 +119,7 @@ def averages(t: Times, omega: Rotors, channels: Columns, *, held: bool) -> Calla
     return average
 
 
-def at_rows(rows: RowPositions, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
+def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
     """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
 
     Values are interpolated linearly, but not across a gap: between neighbours more than 1.5 steps of the sensor apart.
@@ -163,7 +162,7 @@ def grid_size(t: Times, dt: float) -> float:
     return math.floor((t[-1] - t[0]) / dt + UNIFORM) + 1.0
 
 
-def resample(t: Times, omega: Rotors, channels: Columns, dt: float, *, held: bool) -> tuple[Resampled, str]:
+def resample(t: Times, omega: Speeds, channels: Columns, dt: float, *, held: bool) -> tuple[Resampled, str]:
     """Bring rows at uneven times [s] to the grid t_0, t_0 + dt, ..., with a note if that changes any.
 
     `omega` is `held` until the next row, or interpolated (`root_mean_square`); `channels` are interpolated (`at_rows`).
@@ -238,6 +237,12 @@ def last_measured(measured: Bool[np.ndarray, "samples *columns"]) -> Int[np.ndar
 def filled(values: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
     """Each gap gets the value before it, or the first one."""
     return np.take_along_axis(values, last_measured(~np.isnan(values)), axis=0)
+
+
+def runs(where: Bool[np.ndarray, " samples"]) -> list[tuple[int, int]]:
+    """Begin and end (exclusive) of each run of `True`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
 
 
 def median_step(t: Times) -> float:

@@ -36,11 +36,11 @@ class LogFacts(NamedTuple):
     """Facts that a log states beside the flight. `None`: the log does not state it.
 
     - `motors`, `gyro`: how often rotor speeds or commands, and body rates, were written, before any resampling.
-    - `faster`: what to do so that the vehicle writes them more often.
+    - `faster`: how to make the vehicle write them more often.
     - `landed`: from when to when the vehicle itself says that it is on the ground [s], in the flight's time.
     - `rotor_positions`: x forward and y left of each rotor [m], in the order of the rotors in the flight.
     - `rotor_spins`: +1 for counter-clockwise seen from above, -1 for clockwise.
-    - `format`: of the file that was read.
+    - `format`: the format of the file.
     """
 
     motors: Sampling | None = None
@@ -132,12 +132,12 @@ _ARRAYS = ("time", *SIGNALS)
 
 
 class Recording(NamedTuple):
-    """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
+    """A recorded flight as NumPy arrays in double precision, its name, and the facts that its log states.
 
     Fields are as in `Flight`, in SI units. Recordings are cleaned, cut and concatenated, and become a `Flight` last.
 
     - `name`: in messages and in the provenance. Usually the path of the file.
-    - `notes`: what the reader changed in the data, one line each. `facts`: what the log says beside the flight.
+    - `notes`: the reader's changes to the data, one line each. `facts`: statements of the log beside the flight.
     """
 
     time: Float[np.ndarray, " samples"]
@@ -225,6 +225,11 @@ def signals_of(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
             rows = np.column_stack([columns.get(name, nothing) for name in signal.columns])
             signals[field] = rows.reshape(nothing.size, *(signal.shape or ()))
     return signals
+
+
+def items(name: str, count: int) -> list[str]:
+    """The names of the numbers in an array: `name[0]`, `name[1]`, ..."""
+    return [f"{name}[{i}]" for i in range(count)]
 
 
 def order_note(first: str) -> str:

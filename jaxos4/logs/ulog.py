@@ -13,24 +13,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import reading
+from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES
 from ..rotations import HALF_TURN, euler_angles
 from .columns import column_map
-from .messages import ANGLES, FORCES, RATES, Fields, Messages, MessageSource, Names, Rotors, motor_order
-from .sampling import Series, logged_rate
-from .table import LogFormat, LogPath, Table, fast_enough, read_bytes, refuse
+from .messages import Fields, Messages, MessageSource, Names, Rotors, motor_order
+from .sampling import Series, logged_rate, runs
+from .table import LogFormat, LogPath, Table, fast_enough, items, read_bytes, refuse
+from .values import RPM
 
 _MAGIC = b"ULog"
 _MOVING = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
 
 
-def _items(field: str, count: int) -> list[str]:
-    """The names of the numbers in an array."""
-    return [f"{field}[{i}]" for i in range(count)]
-
-
 _BRIDGE = "px4-ros2", "/fmu/out/"
 """The preset that names the topics of PX4's bridge to ROS 2, which are those of its logs, and how their names begin."""
-_COLUMNS: tuple[Names, ...] = (RATES, FORCES, ("voltage",))
+_COLUMNS: tuple[Names, ...] = (RATE_NAMES, FORCE_NAMES, ("voltage",))
 _TOPICS = (
     *("esc_status", "actuator_motors", "actuator_outputs", "vehicle_attitude", "vehicle_local_position"),
     *("vehicle_status", "vehicle_land_detected"),
@@ -65,10 +62,10 @@ def read_ulog(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a PX4 log, and notes on what was assumed. Raises `InputError`."""
     log = _decoded(path)
     _check_vehicle(log)
-    turned = log.series("vehicle_attitude", _items("q", 4))
-    log.names.update(dict.fromkeys(ANGLES, "vehicle_attitude.q"))
+    turned = log.series("vehicle_attitude", items("q", 4))
+    log.names.update(dict.fromkeys(ANGLE_NAMES, "vehicle_attitude.q"))
     found: dict[Names, Series | None] = {columns: log.fastest(columns, _sources(columns)) for columns in _COLUMNS}
-    found[ANGLES] = None if turned is None else Series(turned.t, euler_angles(turned.values) * HALF_TURN)
+    found[ANGLE_NAMES] = None if turned is None else Series(turned.t, euler_angles(turned.values) * HALF_TURN)
     found[tuple(_MOVING)] = _position(log)
     return log.table(
         found,
@@ -155,9 +152,8 @@ def _landed(log: Messages) -> list[tuple[float, float]]:
     series = log.series(topic, sorted(states), fewest=1)
     if series is None or not series.values.size:
         return []
-    changes = np.flatnonzero(np.diff((series.values > 0).any(axis=1), prepend=False, append=False))
-    times = np.append(series.t, np.inf)[changes].tolist()  # a state holds until the next one
-    return list(zip(times[::2], times[1::2], strict=True))
+    times = np.append(series.t, np.inf).tolist()  # a state holds until the next one
+    return [(times[begin], times[end]) for begin, end in runs(np.asarray((series.values > 0).any(axis=1)))]
 
 
 def _rotors(log: Messages) -> Rotors | None:
@@ -180,12 +176,12 @@ def _speeds(log: Messages) -> Rotors | None:
         return None
     functions = [int(log.latest("esc_status", f"esc[{i}].actuator_function") or 0) for i in range(4)]
     order = motor_order(functions, _MOTORS) or range(4)
-    speeds = Series(series.t, np.abs(series.values)[:, order] * (2 * math.pi / 60))
+    speeds = Series(series.t, np.abs(series.values)[:, order] * RPM)
     return Rotors.of(speeds, [f"esc_status.{_ESC_SPEEDS[i]}" for i in order], is_measured=True)
 
 
 def _motors(log: Messages) -> Rotors | None:
-    names = _items("control", 4)
+    names = items("control", 4)
     series = log.series("actuator_motors", names)
     if series is None or not np.isfinite(series.values).any():
         return None

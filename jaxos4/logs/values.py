@@ -4,23 +4,23 @@ The latter count as not measured. Many of them in a column are a wrong unit, and
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..airframe import STANDARD_GRAVITY
-from ..flight import COMMAND_NAMES, FORCE_NAMES, SIGNALS, SPEED_NAMES, UNITS
-from .sampling import filled
+from ..flight import COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SIGNALS, SPEED_NAMES, UNITS
+from .sampling import filled, runs
 from .table import Recording, Table
 
 
 class ColumnLimits(NamedTuple):
     """The unit of a column, and the numbers that it can hold.
 
-    - `unit`: of the column. `others`: units in which a log may have it, and their factors to `unit`.
+    - `unit`: the unit of the column. `others`: units in which a log may have it, and their factors to `unit`.
     - `least`, `largest`: what lies beyond is impossible: out of reach of any quadrotor, but not of a wrong unit.
     - `advice`: on larger values, and, without `below`, on smaller ones too.
     - `zero`: whether 0 is a measurement, and negative numbers are. If not, they count as not measured.
@@ -35,9 +35,9 @@ class ColumnLimits(NamedTuple):
     zero: bool = True
 
 
-_DEGREE, _RPM = math.pi / 180, 2 * math.pi / 60
+DEGREE, RPM = math.pi / 180, 2 * math.pi / 60  # rad, rad/s
 PWM, PWM_ZERO = "PWM", 1000.0  # us; a command in this unit is (value - 1000) / 1000
-_TURNING = {"deg/s": _DEGREE, "rpm": _RPM}
+_TURNING = {"deg/s": DEGREE, "rpm": RPM}
 _TIME = "t is in seconds: if these are milli-, micro- or nanoseconds, divide"
 _COMMAND = "commands are fractions 0..1: divide by full scale (100, 65535)"
 _SPEED = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
@@ -53,7 +53,7 @@ _OF_UNIT = {  # of the signals of a flight
         ColumnLimits("m", -1e6, 1e6, _POSITION, others={"cm": 0.01, "mm": 1e-3}),
         ColumnLimits("m/s", -1e3, 1e3, _VELOCITY, others={"cm/s": 0.01, "mm/s": 1e-3}),
         ColumnLimits("rad/s", -60.0, 60.0, "it looks like deg/s: divide by 57.3", others=_TURNING),
-        ColumnLimits("rad", -1e4, 1e4, "it looks like degrees: divide by 57.3", others={"deg": _DEGREE}),
+        ColumnLimits("rad", -1e4, 1e4, "it looks like degrees: divide by 57.3", others={"deg": DEGREE}),
         ColumnLimits("m/s^2", -1e3, 1e3, _FORCE, others={"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}),
         ColumnLimits("V", -200.0, 200.0, _VOLTAGE, others={"mV": 1e-3}, zero=False),
     )
@@ -128,10 +128,6 @@ class Plausible(NamedTuple):
     clipped: Mapping[str, tuple[int, float, float]]
 
 
-# The usual range of a channel is that from its quantile 0.005 to 0.995.
-MIN_VALUES = 20  # fewer have no usual range
-
-
 def plausible(recording: Recording) -> Plausible:
     """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before.
 
@@ -146,7 +142,7 @@ def plausible(recording: Recording) -> Plausible:
             continue
         logged = getattr(recording, field)
         column = logged.reshape(len(logged), -1)[:, place].copy()  # one at a time: a long log has 400 MB
-        wrong = _isolated(column)
+        wrong = _among_measured(column, _isolated)
         if name.startswith("rotor") and not recording.commanded:
             wrong |= dropped(recording.time, column)
         if wrong.any():
@@ -154,8 +150,8 @@ def plausible(recording: Recording) -> Plausible:
             impossible[name] = int(wrong.sum()), float(worst)
             column[wrong] = np.nan
         known = np.count_nonzero(np.isfinite(column))
-        for sign in (1.0, -1.0) if name in ("p", "q", "r", *FORCE_NAMES) else ():
-            stuck = _stuck(sign * column)
+        for sign in (1.0, -1.0) if name in (*RATE_NAMES, *FORCE_NAMES) else ():
+            stuck = _among_measured(sign * column, _stuck)
             if stuck.any():
                 end, number = float(column[stuck][0]), int(stuck.sum())
                 count, share, before = clipped.get(name, (0, 0.0, end))
@@ -168,26 +164,33 @@ def plausible(recording: Recording) -> Plausible:
     return Plausible(recording._replace(**cleaned) if cleaned else recording, impossible, clipped)
 
 
+Samples = Float[np.ndarray, " samples"]
+Places = Int[np.ndarray, " places"]
+# The range of a channel is that from its quantile 0.005 to 0.995.
+MIN_VALUES = 20  # fewer have no range
+
+
+def _among_measured(values: Samples, check: Callable[[Samples], Places]) -> Bool[np.ndarray, " samples"]:
+    """Whether each value is among those that a check finds, which takes the measured ones."""
+    out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
+    if known.size >= MIN_VALUES:
+        out[known[check(values[known])]] = True
+    return out
+
+
 # A value is impossible if it lies this many times further from the median than the end of the range, and most of the
 # six around it do not. Fast manoeuvres last for more than three samples.
 FAR = 8.0
 AROUND = np.array([-3, -2, -1, 1, 2, 3])
 
 
-def _isolated(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Whether each value lies far outside of the usual range, while most of those around it do not."""
-    out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
-    if known.size < MIN_VALUES:
-        return out
-    x = values[known]
+def _isolated(x: Samples) -> Places:
+    """The values that lie far outside of the range, while most of those around them do not."""
     least, middle, most = np.quantile(x, (0.005, 0.5, 0.995))
     far = (x < middle - FAR * (middle - least)) | (x > middle + FAR * (most - middle))
-    if least == most or not far.any():
-        return out
-    at = np.flatnonzero(far)
+    at = np.flatnonzero(far if least < most else [])
     wild = far[np.clip(at[:, None] + AROUND, 0, x.size - 1)].sum(axis=1)
-    out[known[at[wild < AROUND.size / 2]]] = True
-    return out
+    return at[wild < AROUND.size / 2]
 
 
 # Values are clipped if this many are equal to the largest one, and this many times more than lie just below, within a
@@ -198,27 +201,20 @@ EQUAL, TIMES, NEAR = 4, 3.0, 0.01
 LEVELS = 10
 
 
-def _stuck(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Whether each value equals the largest one, if too many do to be chance."""
-    out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
-    if known.size < MIN_VALUES:
-        return out
-    x = values[known]
-    near = NEAR * float(np.subtract(*np.quantile(x, (0.995, 0.005))))
+def _stuck(x: Samples) -> Places:
+    """The values that equal the largest one, if too many do to be chance."""
+    none, near = np.empty(0, dtype=int), NEAR * float(np.subtract(*np.quantile(x, (0.995, 0.005))))
     top = x >= x.max() - 1e-4 * near
     if near <= 0 or top.sum() < EQUAL:
-        return out
+        return none
     held = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]])))
     usual = float(np.quantile(held, 0.9))  # samples for which a value is held
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], top.astype(int), [0]])))
-    at_top = np.ceil((edges[1::2] - edges[::2]) / usual).sum()
+    at_top = sum(math.ceil((end - begin) / usual) for begin, end in runs(top))
     levels, counts = np.unique(x, return_counts=True)
     if 2 * np.sort(counts)[-LEVELS:].sum() > x.size:
-        return out
+        return none
     levels = levels[counts > 1]
     if levels.size > LEVELS:
         near = max(near, 1.01 * float(np.median(np.diff(levels))))
     beside = np.count_nonzero(x[~top] >= x.max() - near) / usual
-    if at_top >= max(EQUAL, TIMES * (beside + 1)):
-        out[known[top]] = True
-    return out
+    return np.flatnonzero(top) if at_top >= max(EQUAL, TIMES * (beside + 1)) else none

@@ -34,7 +34,7 @@ class Parameter(NamedTuple):
     - `in_forcing`: whether the forcing depends on it; set by the model. If not, the rate equations are linear in it.
     - `nonnegative`: whether physics forbids a negative value.
     - `scales_torque`: whether torque exceeds the airframe's by this factor.
-    - `plain`: the usual value, at which the parameter is fixed unless the flights clearly contradict it.
+    - `nominal`: the usual value, at which the parameter is fixed unless the flights clearly contradict it.
     - `contradiction`: a function of a value and its error. It returns cause and remedy if physics or the airframe
       forbids the value, otherwise `None`.
     """
@@ -48,7 +48,7 @@ class Parameter(NamedTuple):
     in_forcing: bool = False
     nonnegative: bool = False
     scales_torque: bool = False
-    plain: float | None = None
+    nominal: float | None = None
     contradiction: Contradiction | None = None
 
 

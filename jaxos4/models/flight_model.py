@@ -100,11 +100,11 @@ class FlightModel(AbstractModel):
 
     @property
     def quantities(self) -> dict[str, list[str]]:
-        """The quantities that the terms describe, with their parameters but without biases; see `Term.quantity`."""
+        """The quantities that the terms describe, with their parameters but without biases; see `Term.verdict`."""
         found: dict[str, list[str]] = {}
         for term, _, parameter in self._table:
-            if term.quantity and parameter.force_axis is None:
-                found.setdefault(term.quantity, []).append(parameter.name)
+            if term.verdict and parameter.force_axis is None:
+                found.setdefault(term.verdict, []).append(parameter.name)
         return found
 
     @property
@@ -195,11 +195,11 @@ class FlightModel(AbstractModel):
         grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=parts > 0)
         if inputs.length is not None:
             whole = self.batch - self.batch % max(parts, 1)  # a batch holds all parts of its samples
-            return self._driven_in_batches(inputs, inputs.length, grid, parameters, whole, of_parts)
+            return self._rotor_forcing_in_batches(inputs, inputs.length, grid, parameters, whole, of_parts)
         every = Batch(grid, jnp.arange(len(inputs.omega)), jnp.zeros_like(inputs.omega[0]))
-        return of_parts(self._driven(inputs, grid, every, parameters)[0])
+        return of_parts(self._rotor_forcing(inputs, grid, every, parameters)[0])
 
-    def _driven(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
+    def _rotor_forcing(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
         """The forcing by the rotors over some samples, and the rotor speeds at the end of the last sample."""
         airframe = self.airframe
 
@@ -224,10 +224,10 @@ class FlightModel(AbstractModel):
         )
         return found, speeds.end[-1]
 
-    def _driven_in_batches(
+    def _rotor_forcing_in_batches(
         self, inputs: Inputs, length: Count, grid: Grid, parameters, rows: int, of_parts: Callable[[Forcing], Forcing]
     ) -> Forcing:
-        """`of_parts` of `_driven` for the samples that count, `rows` at a time, so that padding takes no time."""
+        """Transforms `_rotor_forcing` by `of_parts`, `rows` samples at a time, so that padding takes no time."""
         samples, zeros = inputs.omega.shape[0], jnp.zeros(-(-inputs.omega.shape[0] // rows) * rows, float)
         nothing = of_parts(Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros))
         many = nothing.roll.shape[0] * rows // zeros.shape[0]
@@ -235,7 +235,7 @@ class FlightModel(AbstractModel):
         def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
             filled, before = carry
             batch = Batch(grid, jnp.minimum(i * rows + jnp.arange(rows), samples - 1), before)
-            found, before = self._driven(inputs, grid, batch, parameters)
+            found, before = self._rotor_forcing(inputs, grid, batch, parameters)
             place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * many, axis=0)
             return jax.tree.map(place, filled, of_parts(found)), before
 
@@ -303,11 +303,9 @@ class FlightModel(AbstractModel):
         values = {c: as_float(c(self.airframe) if callable(c) else c) for c in dict.fromkeys(constants)}
         return jnp.stack([values[c] for c in constants]) if constants else jnp.zeros(0)
 
-    def _contributions(
-        self, quantity: str, parameters, forcing: Forcing | None = None
-    ) -> list[tuple[Callable, Values]]:
+    def _contributions(self, field: str, parameters, forcing: Forcing | None = None) -> list[tuple[Callable, Values]]:
         """The contributions of the terms to a field of `Term`, each with the values of its parameters."""
-        acting = [(term, getattr(term, quantity)) for term in self._terms]
+        acting = [(term, getattr(term, field)) for term in self._terms]
         return [(change, self._values(term, parameters, forcing)) for term, change in acting if change]
 
     def _values(self, term: Term, parameters, forcing: Forcing | None) -> Values:

@@ -24,8 +24,8 @@ class AbstractOS4(AbstractModel):
     gyroscopic_unit: ClassVar[str]
 
     @abc.abstractmethod
-    def acceleration(self, orientation: Orientation, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """x'', y'', z'' [m/s^2]."""
+    def horizontal_thrust(self, orientation: Orientation) -> tuple[Scalar, Scalar]:
+        """The shares of the thrust along x and y of the earth's frame."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -62,8 +62,9 @@ class AbstractOS4(AbstractModel):
         attitude = attitude_rates(state.rates, orientation)
         if t is None:
             return State(rates, attitude)
-        ax, ay, az = self.acceleration(orientation, forcing)
-        return State(rates, attitude, Translation(t.vx, ax, t.vy, ay, t.vz, az))
+        x, y = self.horizontal_thrust(orientation)
+        az = orientation.cos_theta * orientation.cos_phi * forcing.thrust - self.airframe.gravity  # Eq. (9)
+        return State(rates, attitude, Translation(t.vx, x * forcing.thrust, t.vy, y * forcing.thrust, t.vz, az))
 
 
 class PublishedOS4(AbstractOS4):
@@ -91,13 +92,12 @@ class PublishedOS4(AbstractOS4):
             p * q * a7 + a8 * forcing.yaw,
         )
 
-    def acceleration(self, orientation: Orientation, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """x'', y'', z'' [m/s^2]: Eqs. (7)-(9)."""
-        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = orientation
+    def horizontal_thrust(self, orientation: Orientation) -> tuple[Scalar, Scalar]:
+        """The shares of the thrust along x and y: Eqs. (7) and (8)."""
+        sin_phi, cos_phi, sin_theta, _, sin_psi, cos_psi = orientation
         return (
-            (sin_phi * cos_psi - sin_psi * sin_theta * cos_phi) * forcing.thrust,
-            (-sin_psi * sin_phi - sin_theta * cos_phi * cos_psi) * forcing.thrust,
-            cos_theta * cos_phi * forcing.thrust - self.airframe.gravity,
+            sin_phi * cos_psi - sin_psi * sin_theta * cos_phi,
+            -sin_psi * sin_phi - sin_theta * cos_phi * cos_psi,
         )
 
 
@@ -126,11 +126,10 @@ class CorrectedOS4(AbstractOS4):
             p * q * a7 + a8 * forcing.yaw,
         )
 
-    def acceleration(self, orientation: Orientation, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """The thrust along the body's z axis, rotated into the earth frame, and gravity."""
-        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = orientation
+    def horizontal_thrust(self, orientation: Orientation) -> tuple[Scalar, Scalar]:
+        """The body's z axis, rotated into the earth frame."""
+        sin_phi, cos_phi, sin_theta, _, sin_psi, cos_psi = orientation
         return (
-            (cos_psi * sin_theta * cos_phi + sin_psi * sin_phi) * forcing.thrust,
-            (sin_psi * sin_theta * cos_phi - cos_psi * sin_phi) * forcing.thrust,
-            cos_theta * cos_phi * forcing.thrust - self.airframe.gravity,
+            cos_psi * sin_theta * cos_phi + sin_psi * sin_phi,
+            sin_psi * sin_theta * cos_phi - cos_psi * sin_phi,
         )

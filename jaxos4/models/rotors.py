@@ -200,7 +200,7 @@ class Motor(NamedTuple):
         return w * self.full
 
 
-def driven(omega: RotorSpeeds, motor: Motor, batch: Batch) -> Speeds:
+def commanded_speeds(omega: RotorSpeeds, motor: Motor, batch: Batch) -> Speeds:
     """Speeds of rotors whose motors follow commands [rad/s]. A stretch begins at the speed of its first command."""
 
     def over_a_sample(speed: Speed, row):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Scalar
-from ..trigonometry import sincos
+from ..rotations import sincos
 
 # One value, or one for each sample.
 Samples = Float[Array, "*samples"]

@@ -1,5 +1,7 @@
-"""The paper's neural network (ANN): settings, training, and estimator. The paper does not describe it."""
+"""The paper's neural network (ANN): settings, use, and networks for one flight. The paper does not describe it."""
 
+import dataclasses
+import os
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -12,13 +14,14 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Parameters, Scalar, as_float, integer, setting
 from ..bracket import UNIFORM_PRIOR, Bracket
+from ..errors import named
 from ..estimate import AbstractEstimator, Calibration, Estimate
 from ..flight import STATE_NAMES
 from ..linalg import invert
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem, Unknowns, in_blocks
-from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
+from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling
 from .features import FEATURES, Coordinates, Features
 from .training import calibrate, train, untrained
 
@@ -52,7 +55,7 @@ class NetworkEstimator(eqx.Module):
       bracket; attitude and position hold more information, but are far from linear.
     - `noise`: the lowest and highest noise scale of training, in multiples of the problem's sigma. Scales are drawn
       log-uniformly, and the scale is an input of the network.
-    - `architecture`: what corrects a linear map: `"mlp"`, a multilayer perceptron, or `"cmac"`, a table of weights.
+    - `architecture`: the correction of a linear map: `"mlp"`, a multilayer perceptron, or `"cmac"`, a table of weights.
     - `width`, `depth`: of the perceptron.
     - `tilings`, `cells`: of CMAC, for each pair of score features: the number of tilings, and of cells along each side.
       Finer cells represent more, and learn more slowly.
@@ -107,11 +110,9 @@ class NetworkEstimator(eqx.Module):
         """
         self._check(problem, bracket)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, as_float(self.noise[1]))
-        scaling, regressor = untrained(features, self.noise, self.architecture, self.shape, key)
-        names = "noise", "steps", "batch", "learning_rate", "patience"
-        how = {name: getattr(self, name) for name in names}
-        regressor, history = train(regressor, scaling, features, key, **how)
-        errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
+        scaling, regressor = untrained(features, self, key)
+        regressor, history = train(regressor, scaling, features, self, key)
+        errors = calibrate(regressor, scaling, features, self, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
     def _check(self, problem: ShootingProblem, bracket: Bracket) -> None:
@@ -175,7 +176,7 @@ class TrainedNetwork(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight in the network's own bracket; that of the problem must only be valid.
 
-        If the problem holds parameters, the answer is that for their values.
+        If the problem fixes parameters, the answer is that for their values.
 
         **Returns:** an estimate, `at_bound` if the answer lies outside of the bracket of training by more than its
         interval, `unidentifiable` if an interval is hardly narrower than the bracket, and `network_mismatch` for more
@@ -196,16 +197,6 @@ class TrainedNetwork(AbstractEstimator):
 
     def _compare(self, problem: ShootingProblem) -> Estimate | str:
         """The estimate, or how the problem differs from that of training. One program computes both."""
-        if (kind := self._other_kind(problem)) is not None:
-            return kind
-        estimate, differences = self._identify(problem.restrict(self.channels))
-        for what, differs in differences.items():
-            if not isinstance(differs, Tracer) and differs:
-                return f"it was trained for another {what}"
-        return estimate
-
-    def _other_kind(self, problem: ShootingProblem) -> str | None:
-        """The difference in words as `mismatch` gives it, but not of numbers."""
         own = self.problem
         if CHANNELS[self.channels] > problem.size:
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"
@@ -217,7 +208,11 @@ class TrainedNetwork(AbstractEstimator):
             looked_at = [i for i in CASCADE_ORDER[: own.size] if not not_needed[:, i].all()]
             if missing := [STATE_NAMES[i] for i in looked_at if absent[:, i].all()]:
                 return f"it looks at {', '.join(missing)}, which this flight did not measure"
-        return None
+        estimate, differences = self._identify(problem.restrict(self.channels))
+        for what, differs in differences.items():
+            if not isinstance(differs, Tracer) and differs:
+                return f"it was trained for another {what}"
+        return estimate
 
     def _differences(self, problem: ShootingProblem) -> dict[str, Bool[Array, ""]]:
         """For each quantity, whether its numbers differ from those of training."""
@@ -252,7 +247,7 @@ class TrainedNetwork(AbstractEstimator):
         rms, correlation, factors, simultaneous = self.errors.at(within)
         std = jnp.exp(log_spread[:count]) * self.scaling.bound(within)[:count] * rms * inflation
         deviations = std * coordinates.width[:count]
-        parameters, correlation = _given_held(problem.unknowns, parameters, deviations, correlation)
+        parameters, correlation = _given_fixed(problem.unknowns, parameters, deviations, correlation)
         shot = problem.shots(parameters, initial_state)
         free = problem.unknowns.free
         outside = (jnp.abs(u[:count]) > 1 + factors[-1] * std) & free
@@ -281,15 +276,66 @@ class TrainedNetwork(AbstractEstimator):
         return estimate, differences
 
 
-def _given_held(
+def _given_fixed(
     unknowns: Unknowns, parameters: Parameters, deviations: Parameters, correlation: Float[Array, "count count"]
 ) -> tuple[Parameters, Float[Array, "count count"]]:
-    """The mean and the correlations of a Gaussian answer if the held parameters are known."""
-    free, held = unknowns.free, ~unknowns.free
-    among_held = jnp.where(held[:, None] & held, correlation, jnp.eye(free.size))
-    across = jnp.where(free[:, None] & held, correlation, 0.0)
-    gain = across @ invert(among_held)
-    off = jnp.where(held, (unknowns.center - parameters) / deviations, 0.0)
-    shifted = parameters + jnp.where(held.any(), deviations * (gain @ off), 0.0)
+    """The mean and the correlations of a Gaussian answer if the fixed parameters are known."""
+    free, fixed = unknowns.free, ~unknowns.free
+    among_fixed = jnp.where(fixed[:, None] & fixed, correlation, jnp.eye(free.size))
+    across = jnp.where(free[:, None] & fixed, correlation, 0.0)
+    gain = across @ invert(among_fixed)
+    off = jnp.where(fixed, (unknowns.center - parameters) / deviations, 0.0)
+    shifted = parameters + jnp.where(fixed.any(), deviations * (gain @ off), 0.0)
     known = jnp.where(free[:, None] & free, correlation - gain @ across.T, 0.0)
-    return jnp.where(held, unknowns.center, shifted), known
+    return jnp.where(fixed, unknowns.center, shifted), known
+
+
+GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
+"""A network, or its file."""
+SEED_STEPS = 2000  # of training a network that only gives a search its start
+VEHICLE = NetworkEstimator(steps=250, batch=64, noise=(1.0, 1.0), held_out=2000)
+MAX_WINDOWS = 24  # that the network of a vehicle sees, however long the flight is
+FLYABLE = 0.5  # share of a vehicle's bracket in which nearly all simulated flights can be flown
+
+
+def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
+    """Train a network for one flight, named `name`: briefly if shooting follows (`shoots`)."""
+    steps = SEED_STEPS if shoots else NetworkEstimator.steps
+    settings = NetworkEstimator(channels=seen_channels(problem), steps=steps)
+    with named(name):
+        return settings.fit(problem, bracket, key=jax.random.key(seed))
+
+
+def most_agile_windows(problem: ShootingProblem) -> ShootingProblem:
+    """The part of a vehicle's flight that a network sees: the windows in a row with the largest rates."""
+    windows = min(MAX_WINDOWS, problem.windows)
+    samples = problem.flight.time.shape[0] // problem.windows
+    motion = np.nansum(np.square(problem.recorded()), axis=1).reshape(problem.windows, samples).sum(axis=1)
+    first = samples * int(np.convolve(motion, np.ones(windows), "valid").argmax())
+    part = slice(first, first + samples * windows)
+    flight = jax.tree.map(lambda leaf: leaf[part] if leaf.ndim else leaf, problem.flight)
+    return dataclasses.replace(problem, flight=flight, windows=windows)
+
+
+def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> TrainedNetwork:
+    """Train a network for a part of a vehicle's flight in windows, at the noise levels of the problem."""
+    unknowns = problem.unknowns
+    bracket = Bracket.around(unknowns.center, FLYABLE * unknowns.half_width)
+    with named(name):
+        return VEHICLE.fit(problem, bracket, key=jax.random.key(seed))
+
+
+def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:
+    """The origin of a network and its training, for JSON."""
+    bracket = network.bracket
+    return {
+        "file": None if given is None or isinstance(given, TrainedNetwork) else os.fspath(given),
+        "settings": {f.name: getattr(network.settings, f.name) for f in dataclasses.fields(network.settings)},
+        "bracket": {"lower": bracket.lower.tolist(), "upper": bracket.upper.tolist()},
+    }
+
+
+def seen_channels(problem: ShootingProblem) -> str:
+    """The channels of a network by default: the rates, and the attitude if a rate was not measured."""
+    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
+    return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"

@@ -1,7 +1,7 @@
 """The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -11,8 +11,11 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import Key, Numeric, Scalar, as_float
 from ..errors import TrainingError, percent
-from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
+from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales, compress, first_regressor, loss
 from .features import CHUNK, Features, Flights, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
+
+if TYPE_CHECKING:
+    from .estimator import NetworkEstimator
 
 WARM_UP = 200  # steps in which the learning rate rises, at most half of all
 LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
@@ -33,19 +36,13 @@ def _rates(steps: int, largest: float) -> Float[np.ndarray, " steps"]:
 
 
 def untrained(
-    features: Features,
-    noise: tuple[float, float],
-    architecture: str,
-    shape: dict[str, Any],
-    key: Key,
-    *,
-    per_feature: int = 4,
+    features: Features, settings: "NetworkEstimator", key: Key, *, per_feature: int = 4
 ) -> tuple[Scaling, Regressor]:
-    """Scaling and a linear map fitted to `per_feature` simulated flights for each feature, in a range of `noise`."""
-    scales = np.asarray(noise, float)
+    """Scaling, and a linear map fitted to `per_feature` simulated flights for each feature."""
+    scales = np.asarray(settings.noise, float)
     count, purpose = max(CHUNK, per_feature * features.size), Purpose.LINEAR_MAP
     chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)
-    return _untrained(features, chunks, scales, key, architecture, shape)
+    return _untrained(features, chunks, scales, key, settings.architecture, settings.shape)
 
 
 @eqx.filter_jit
@@ -78,26 +75,15 @@ def _untrained(
 
 
 def train(
-    regressor: Regressor,
-    scaling: Scaling,
-    features: Features,
-    key: Key,
-    *,
-    noise: tuple[float, float],
-    steps: int,
-    batch: int,
-    learning_rate: float,
-    patience: int,
+    regressor: Regressor, scaling: Scaling, features: Features, settings: "NetworkEstimator", key: Key
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count. Each step has new noise.
-
-    The settings are those of a `NetworkEstimator`.
 
     **Returns:** the regressor at the check with the best validation loss, and the losses at every check.
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
-    scales = np.asarray(noise, float)
+    scales, steps, batch = np.asarray(settings.noise, float), settings.steps, settings.batch
     held_out = draw_chunks(features, VALIDATION, key=key, purpose=Purpose.VALIDATION)
     held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
     flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
@@ -106,7 +92,8 @@ def train(
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
-    state, rates = _first_state(regressor), _rates(steps, learning_rate)
+    state = eqx.filter_jit(_optimiser(0.0).init)(eqx.filter(regressor, eqx.is_inexact_array))
+    rates = _rates(steps, settings.learning_rate)
     flown = batch * CHECK // USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
     for number, first in enumerate(range(0, steps, CHECK)):
@@ -129,7 +116,7 @@ def train(
         without_improvement += 1
         if current < lowest - IMPROVEMENT * abs(current):
             best, lowest, without_improvement = regressor, current, 0
-        if without_improvement >= patience:
+        if without_improvement >= settings.patience:
             break
     whole = jax.tree.map(lambda x: as_float(np.asarray(x)) if eqx.is_inexact_array_like(x) else x, best)
     return whole, np.asarray(history)
@@ -181,11 +168,6 @@ def _joined(chunks: list[Flights]) -> Flights:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
 
 
-@eqx.filter_jit
-def _first_state(regressor: Regressor) -> PyTree:
-    return _optimiser(0.0).init(eqx.filter(regressor, eqx.is_inexact_array))
-
-
 def _optimiser(rate: Scalar | float) -> Any:
     """Muon, a `GradientTransformation` of Optax."""
     import optax  # slow to import
@@ -200,15 +182,16 @@ def _single(tree: PyTree) -> PyTree:
 
 
 def calibrate(
-    regressor: Regressor, scaling: Scaling, features: Features, scales: Float[Array, " scales"], count: int, key: Key
+    regressor: Regressor, scaling: Scaling, features: Features, settings: "NetworkEstimator", key: Key
 ) -> ErrorTable:
-    """Measures a network's errors on `count` new simulated flights, with new noise at each noise scale.
+    """Measures a network's errors on new simulated flights, with new noise at each noise scale.
 
     Each quantile is the smallest that holds its level for one more flight. Raises `TrainingError` if too few can be
     flown.
     """
     parameters, tables, purpose = len(features.problem.model.parameter_names), [], Purpose.CALIBRATION
-    flights = draw_chunks(features, count, key=key, purpose=purpose, uniform=True)
+    flights = draw_chunks(features, settings.held_out, key=key, purpose=purpose, uniform=True)
+    scales = calibrated_scales(settings.noise)
     for number, scale in enumerate(np.asarray(scales)):
         chunks = noisy_chunks(features, flights, np.stack([scale, scale]), key, purpose, 1 + number)
         error = np.concatenate([_standardised(regressor, scaling, chunk, scale) for chunk in chunks])[:, :parameters]

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from .._templates import templates
+from .._files import templates
 from ..airframe import GRAVITY, GUESS, Airframe
 from ..errors import printable
 from ..logs import Recording
@@ -75,7 +75,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     seconds = fair_share([recording], finest(recording.dt, commands=recording.dt * recording.commanded))
     evidence, stretches = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
-        excited = {} if stretch.reason else excitation(cut(evidence.plausible.recording, stretch), airframe)
+        excited = {} if stretch.reason else excitation(cut(evidence.recording, stretch), airframe)
         stretches.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
     nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)

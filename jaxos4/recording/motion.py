@@ -12,13 +12,12 @@ from ..flight import ANGLES, RATES, VELOCITY, Flight
 from ..logs import Recording, as_recording
 from ..logs.sampling import averages, filled
 from ..rotations import rotations_to_body
-from .noise import white_noise
+from .sensor_errors import Ups, white_noise
 
 # Two rotors against the other two: the three ways are roll, pitch and yaw of an X, in an order that depends on the log.
 _PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
 
 Signs = tuple[float, ...]
-Ups = tuple[Float[np.ndarray, "_samples 3"], Float[np.ndarray, "_samples 3"]]
 
 
 # An axis is excited weakly or well from these standard deviations of its rate on [rad/s], and weakly only if they

@@ -16,10 +16,9 @@ from ..logs import Recording
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
-from .level import force_level
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
-from .noise import force_noise, vibrating_rates, without_noise
 from .richest import fair_share, note_of
+from .sensor_errors import force_level, force_noise, vibrating_rates, without_noise
 from .stretches import Stretch, cut, end_of_tumble, nothing_usable
 from .windows import averaged, concatenate, hold_out, whole_windows
 
@@ -48,15 +47,15 @@ class Prepared(NamedTuple):
     - `fitted`: one flight of all stretches; measurements that are held out are missing.
     - `tested`: the same samples with only the held-out measurements; `None`: nothing is held out.
     - `recordings`: for each stretch, the number of its recording, from 0.
-    - `time`: of each sample in its log [s].
-    - `length`: of a window, in samples.
-    - `available`: what every recording offers to the terms of a model, see `Term.needs`.
+    - `time`: the time of each sample in its log [s].
+    - `length`: the number of samples of a window.
+    - `available`: the data that every recording offers to the terms of a model, see `Term.needs`.
     - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `force_level`.
       `None`: unknown.
     - `force_noise`: the least standard deviation of the accelerometer's noise in a sample, along x, y, z [m/s^2].
     - `seconds`: how long the fitted and the tested measurements last [s].
-    - `notes`: what the reader changed, and which stretches are not used.
-    - `findings`: what the logs show that concerns moments of inertia, or contradicts another quantity.
+    - `notes`: changes by the reader, and stretches that are not used.
+    - `findings`: faults of the logs that concern moments of inertia, or contradict another quantity.
     - `log_step`: the longest sample of the logs [s].
     - `motor_step`: the longest time between new values of the motors in the logs [s].
     - `vibrates`: the rates with a line in the gyro's spectrum, and its frequency [Hz], see `vibrating_rates`.
@@ -86,15 +85,6 @@ class Prepared(NamedTuple):
     def battery_voltage(self) -> float | None:
         """The median of the battery's voltage [V]. `None`: not logged."""
         return None if self.fitted.voltage is None else float(np.median(self.fitted.voltage))
-
-
-class _Cleaned(NamedTuple):
-    """One recording: its usable stretches with plausible values, and what the checks of it found."""
-
-    stretches: list[Recording]
-    notes: list[str]
-    findings: list[Finding]
-    evidence: Evidence
 
 
 def prepare(
@@ -131,29 +121,34 @@ def prepare(
     step = finest(logged, sample_time, commands=logged * commanded)
     seconds = math.inf if predicted else fair_share(recordings, step)
     evidences = [Evidence(each, airframe, seconds=seconds) for each in recordings]
-    every = [_cleaned(each, airframe, begin, end, predicted=predicted) for each in evidences]
-    if len({stretch.commanded for each in every for stretch in each.stretches}) > 1:
+    pieces, notes, found = [], [], []
+    for evidence in evidences:
+        stretches, remarks, faults = _cleaned(evidence, airframe, begin, end, predicted=predicted)
+        pieces.append(stretches)
+        notes += remarks
+        found += faults
+    if len({stretch.commanded for stretches in pieces for stretch in stretches}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
-    different = different_thrust([each.evidence for each in every])
-    found = [*(one for each in every for one in each.findings), *([] if different is None else [different])]
-    notes, stretched = [note for each in every for note in each.notes], []
-    for number, (recording, each) in enumerate(zip(recordings, every, strict=True)):
-        smooth, noise, share = without_noise(each.stretches, airframe)
-        stretched += [(number, stretch) for stretch in smooth]
+    if (different := different_thrust(evidences)) is not None:
+        found.append(different)
+    numbers, stretched = [], []
+    for number, (recording, stretches) in enumerate(zip(recordings, pieces, strict=True)):
+        smooth, noise, share = without_noise(stretches, airframe)
+        numbers += [number] * len(smooth)
+        stretched += smooth
         if share > NOISY:
             how = f"{noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
             notes.append(f"{recording.name}: rotor speeds are noisy ({how}) and were smoothed")
-    slowest = max(stretch.dt for _, stretch in stretched)
-    motor_step = max(slowest, *(each.evidence.motor_step for each in every))
+    slowest = max(stretch.dt for stretch in stretched)
+    motor_step = max(slowest, *(each.motor_step for each in evidences))
     commands = motor_step * commanded
     steps = _sample_times(recordings[0].name, slowest, sample_time, commands=commands, predicted=predicted)
-    coarse = zip(*(averaged(stretch, steps) for _, stretch in stretched), strict=True)
-    numbers = [number for number, _ in stretched]
-    vibrates = {name: at for each in every for name, at in vibrating_rates(each.stretches).items()}
+    coarse = zip(*(averaged(stretch, steps) for stretch in stretched), strict=True)
+    vibrates = {name: at for stretches in pieces for name, at in vibrating_rates(stretches).items()}
     noise = np.min([force_noise(in_body_axes(each, airframe)) for each in recordings], axis=0)
-    rests = [rest for each in every if (rest := each.evidence.rest) is not None]
+    rests = [rest for each in evidences if (rest := each.rest) is not None]
     return tuple(
         _sampled(recordings, numbers, flown, airframe, step, holdout, rests, noise)._replace(
             notes=tuple(notes),
@@ -167,58 +162,55 @@ def prepare(
 
 
 def _cleaned(
-    evidence: Evidence,
-    airframe: Airframe,
-    begin: float | None,
-    end: float | None,
-    *,
-    predicted: bool,
-) -> _Cleaned:
-    """The stretches of one recording to fit, and what its checks find. Raises `InputError` if it cannot be used."""
+    evidence: Evidence, airframe: Airframe, begin: float | None, end: float | None, *, predicted: bool
+) -> tuple[list[Recording], list[str], list[Finding]]:
+    """The plausible stretches of one recording to fit, notes, and the findings that concern a moment of inertia.
+
+    Findings that contradict another quantity are among the latter too. Raises `InputError` if it cannot be used.
+    """
     recording = evidence.logged
     name, facts = recording.name, recording.facts
     if np.isnan(recording.states[:, RATES]).all(axis=0).any():
         raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
     found = [msgspec.structs.replace(each, cause=f"{name}: {each.cause}") for each in findings(evidence)]
-    judged = [each for each in found if _is_judged(each)]
+    judged = [
+        each
+        for each in found
+        if {*each.quantities} & {*INERTIAS} or (each.contradicted and each.quantities != ("attitude",))
+    ]
     notes = [str(each) for each in found if each not in judged]
     slow = (facts._replace(gyro=None) if predicted else facts).too_slow
     usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
     if slow:
         raise InputError(f"{name}: {slow}.")
-    if limited := at_limit(evidence.plausible.recording, airframe):
-        notes.append("; ".join(limited))
-    if begin is None and (recovered := end_of_tumble(evidence.plausible.recording, airframe)) is not None:
+    if limited := at_limit(evidence.recording, airframe):
+        notes.append(limited)
+    if begin is None and (recovered := end_of_tumble(evidence.recording, airframe)) is not None:
         notes.append(f"{name}: tumbles at launch until {recovered:.1f} s (`begin` {recovered:.1f} leaves this out)")
     opposite = opposite_axes(usable, airframe)
     if refused := refused_note(opposite):
         raise InputError(f"{name}: {refused}.")
     if yaw := opposite_yaw(opposite.get("yaw")):
         judged.append(msgspec.structs.replace(yaw, cause=f"{name}: {yaw.cause}"))
-    return _Cleaned(usable, [*notes, *recording.named_notes, *note], judged, evidence)
+    return usable, [*notes, *recording.named_notes, *note], judged
 
 
-def _is_judged(finding: Finding) -> bool:
-    """Whether it concerns a moment of inertia, or contradicts another quantity of the vehicle."""
-    return bool({*finding.quantities} & {*INERTIAS}) or (finding.contradicted and finding.quantities != ("attitude",))
-
-
-def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None:
-    """Cause and remedy, if rotors are at full speed for a noticeable time. These stretches are not used."""
+def at_limit(recording: Recording, airframe: Airframe) -> str:
+    """The rotors that are often at full speed, and the remedy; empty if none is. These stretches are not used."""
     shares = (recording.omega >= FULL * float(airframe.max_rotor_speed)).mean(axis=0)
     often = [
         f"rotor {i + 1} is at its limit for {100 * share:.0f} % of the time"
         for i, share in enumerate(shares)
         if share > OFTEN
     ]
-    return (f"{recording.name}: {', '.join(often)}", "fly more gently, or with a fuller battery") if often else None
+    return f"{recording.name}: {', '.join(often)}; fly more gently, or with a fuller battery" if often else ""
 
 
 def _usable(
     evidence: Evidence, begin: float | None, end: float | None, slow: str, *, predicted: bool
 ) -> tuple[list[Recording], list[str]]:
     """The usable stretches, or those from `begin` to `end`; notes on the others. `slow`: why the log is too slow."""
-    recording = evidence.plausible.recording
+    recording = evidence.recording
     name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
     if begin is not None or end is not None:
         given = Stretch(first if begin is None else begin, last if end is None else end)
@@ -245,7 +237,7 @@ def _usable(
 
 def _richest(evidence: Evidence, parts: Sequence[Stretch]) -> tuple[list[Recording], list[str]]:
     """The parts, or if they are too long those that tell the most; and a note on that."""
-    recording, chosen = evidence.plausible.recording, evidence.richest(parts)
+    recording, chosen = evidence.recording, evidence.richest(parts)
     return [cut(recording, each) for each in chosen], note_of(recording.name, chosen, parts)
 
 

@@ -16,6 +16,7 @@ from ..airframe import STANDARD_GRAVITY, Airframe
 from ..errors import InputError
 from ..flight import RATES, Flight
 from ..logs import Recording, as_recording
+from ..logs.sampling import runs
 
 ON_GROUND, IDLE = "on the ground", "motors idle"
 # Labels of samples; the last one that applies counts. The reason of a rotor at its limit names the rotor.
@@ -65,13 +66,13 @@ def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> t
     labels[ground] = _IDLE
     labels[landed] = _GROUND
     weight = np.full(time.size, np.nan) if force is None else np.linalg.norm(force, axis=1) / STANDARD_GRAVITY
-    for begin, end in _runs(labels == _IDLE):
+    for begin, end in runs(labels == _IDLE):
         felt = weight[begin:end][np.isfinite(weight[begin:end])]
         if felt.size and abs(np.median(felt) - 1) < ONE_G:
             labels[begin:end] = _GROUND
     if force is not None:
         labels[_resting(omega, force, rates, labels == _USABLE, dt) & (labels != _LOST)] = _GROUND
-    for begin, end in _runs(labels == _USABLE):
+    for begin, end in runs(labels == _USABLE):
         if time[end - 1] - time[begin] < MIN_STRETCH - dt / 2:
             labels[begin:end] = _SHORT
 
@@ -159,11 +160,11 @@ def _ground(share: Float[np.ndarray, " samples"], dt: float) -> Samples:
     """The samples on the ground, with a margin toward flight."""
     carried = share >= CARRIES
     for value in (True, False):  # short pauses in flight first, then short bursts on the ground
-        for begin, end in _runs(carried != value):
+        for begin, end in runs(carried != value):
             if (end - begin) * dt < SUSTAINED and begin > 0 and end < carried.size:
                 carried[begin:end] = value
     ground, margin = ~carried, _samples(MARGIN, dt)
-    for begin, end in _runs(~carried):
+    for begin, end in runs(~carried):
         ground[max(begin - margin, 0) : end + margin] = True
     return ground
 
@@ -295,16 +296,10 @@ def _unfelt(means: Float[np.ndarray, "bins 5"], step: float) -> Bool[np.ndarray,
 def _lasting(where: Samples, most: float) -> Samples:
     """`where`, without the runs of at most `most` samples."""
     out = np.zeros_like(where)
-    for begin, end in _runs(where):
+    for begin, end in runs(where):
         out[begin:end] = end - begin > most
     return out
 
 
 def _samples(seconds: float, dt: float) -> int:
     return math.ceil(seconds / dt - 1e-6)
-
-
-def _runs(where: Samples) -> list[tuple[int, int]]:
-    """Begin and end (exclusive) of each run of `True`."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
-    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

@@ -94,7 +94,7 @@ def hold_out(
     **Arguments:**
 
     - `recording`: whole windows, see `whole_windows`, of `length` samples.
-    - `share`: of the windows to hold out, 0 to 0.5.
+    - `share`: the share of the windows to hold out, 0 to 0.5.
     - `seconds`: about how long a batch is [s]: short enough for all phases of a flight to have batches of both kinds.
 
     **Returns:** two recordings of the same samples: in each, the measurements of the other are NaN. The second keeps

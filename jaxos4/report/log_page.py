@@ -95,7 +95,7 @@ def write_log_page(
     given = isinstance(log, Recording | Flight)
     recording = as_recording(log) if given else read_recording(log, airframe, full_scale=1.0)
     found = inspect_log(recording, airframe) if found is None else found
-    plausible = Evidence(recording, airframe).plausible.recording
+    plausible = Evidence(recording, airframe).recording
     flown = [cut(plausible, Stretch(part.begin, part.end)) for part in found.stretches if part.usable]
     full = 1.0 if is_share(recording) else float("inf") if airframe is None else float(airframe.max_rotor_speed)
     label = recording.facts.format.label if recording.facts.format else "recording"

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup, escape
 
-from .._files import write_file
-from .._templates import templates
+from .._files import templates, write_file
 from .panels import Figure, Line
 from .style import Style
 from .svg import inline, swatch

@@ -96,10 +96,10 @@ def _means(
     both = np.stack([series[:, :parts].mean(axis=1), series[:, parts]])
     found = np.empty((len(MEANS), *both.shape))
     edges = [0, *(np.flatnonzero(np.diff(stretch)) + 1), len(series)]
-    for means, time in zip(found, MEANS, strict=True):
+    for place, time in enumerate(MEANS):
         kept = np.exp(-dt / time)
         for start, end in itertools.pairwise(edges):
-            means[:, start:end] = lfilter([1 - kept], [1, -kept], both[:, start:end])
+            found[place, :, start:end] = lfilter([1 - kept], [1, -kept], both[:, start:end])
     return found.reshape(-1, len(series)).T
 
 

@@ -1,7 +1,6 @@
 """Checks of channels against each other: scales, axes and clocks of gyro, accelerometer, attitude and velocity."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -115,15 +114,6 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
 LIKELIER = 6.0  # of chi^2: a clock 20 times less likely to be wrong than another is not named
 
 
-class _Delay(NamedTuple):
-    """A delay [s] with its standard error, the share of each clock in it, and the part that no clock causes."""
-
-    clocks: tuple[int, int, int, int]
-    late: float
-    error: float
-    usual: float
-
-
 def sensor_clocks(evidence: Evidence) -> Finding | None:
     """One clock that differs from the others.
 
@@ -133,8 +123,7 @@ def sensor_clocks(evidence: Evidence) -> Finding | None:
     delays, differ = _delays(evidence)
     if not differ:
         return None
-    clocks, late = np.array([each.clocks for each in delays]), np.array([each.late for each in delays])
-    error = np.array([math.hypot(each.error, each.usual) for each in delays])
+    clocks, late, error = (np.array(each) for each in zip(*delays, strict=True))
     weights = clocks / error[:, None]
     measured = np.abs(clocks).any(axis=0)
     squares = np.where(measured, np.square(weights).sum(axis=0), 1.0)
@@ -173,13 +162,16 @@ FILTERS, DAMPING, LAGS, USUAL_LAG = 0.003, 0.004, 0.025, 0.05
 ANSWERED = 0.014  # s; the delay that a gyro seems to have if the rotors do nothing but answer gusts
 
 
-def _delays(evidence: Evidence) -> tuple[list[_Delay], bool]:
-    """The delays that the log shows, and whether one of them is a finding."""
+def _delays(evidence: Evidence) -> tuple[list[tuple[tuple[int, int, int, int], float, float]], bool]:
+    """The delays that the log shows, and whether one of them is a finding.
+
+    Each has the share of each clock, the delay [s], and its standard error with that of delays that no clock causes.
+    """
     turns, response = evidence.turns, evidence.response
     delays, differ = [], False
     if turns is not None and turns.explained[:2].max() > FOLLOWS:
         late, error = float(turns.delay.value), float(turns.delay.error)
-        delays.append(_Delay((-1, 0, 1, 0), late, error, FILTERS))
+        delays.append(((-1, 0, 1, 0), late, math.hypot(error, FILTERS)))
         differ |= abs(late) > max(LATE_ATTITUDE, STANDARD_ERRORS * error)
     if response is not None and response.explained[:2].max() > EXPLAINED[0]:
         gyro, _, between = zip(response.delays.value.tolist(), response.delays.error.tolist(), strict=True)
@@ -187,13 +179,13 @@ def _delays(evidence: Evidence) -> tuple[list[_Delay], bool]:
         late, usual = _beyond(gyro[0], answered), DAMPING
         if response.lag:  # commands: the rotors' own lag and delay are unknown
             late, usual = gyro[0] + response.lag - USUAL_LAG, LAGS
-        delays.append(_Delay((1, 0, 0, -1), late, gyro[1], usual))
+        delays.append(((1, 0, 0, -1), late, math.hypot(gyro[1], usual)))
         before = min(gyro[0] + response.lag, 0.0) if response.lag else late
         differ |= abs(before) > max(LATE, STANDARD_ERRORS * gyro[1])
         felt = response.explained[2] > EXPLAINED[1] and math.isfinite(between[1])
         if felt and not tilted_force(evidence):  # the force along another axis is not the thrust's
             late, error = _beyond(between[0], answered + DAMPING), between[1]
-            delays.append(_Delay((1, -1, 0, 0), late, error, DAMPING))
+            delays.append(((1, -1, 0, 0), late, math.hypot(error, DAMPING)))
             differ |= abs(late) > max(DELAY, STANDARD_ERRORS * error)
     return delays, differ
 

@@ -47,7 +47,7 @@ class Turns(msgspec.Struct, frozen=True):
     """The turns of the attitude: `matrix` times the turns of the gyro, `delay` later.
 
     - `matrix`: the identity if both agree. Rows are the axes of the attitude, columns the axes of the gyro.
-    - `delay`: of the attitude behind the gyro [s].
+    - `delay`: the delay of the attitude behind the gyro [s].
     - `explained`: by axis of the attitude, the share of its turns that the gyro explains.
     """
 

@@ -28,10 +28,10 @@ class Finding(msgspec.Struct, frozen=True):
     """A fault that a log shows.
 
     - `name`: an identifier for programs.
-    - `cause`: what is wrong with the log. If several causes are possible, it names all of them.
+    - `cause`: the fault of the log. If several causes are possible, it names all of them.
     - `size`: the figure behind it, with its unit.
     - `remedy`: what to do.
-    - `quantities`: what the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
+    - `quantities`: the quantities that the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
     - `contradicted`: whether the log contradicts these quantities. Otherwise the finding is only noted.
     """
 
@@ -66,6 +66,8 @@ class Evidence:
     """The facts of one recording that its checks share. `airframe`: `None` if it is not known.
 
     **Arguments:** as in `self_checks`. `seconds`: the longest duration that is examined [s], see `richest`.
+
+    `turns`, `velocity` and `tilt` are the comparisons of channels in `jaxos4.recording.checks.estimates`.
     """
 
     def __init__(self, recording: Recording, airframe: Airframe | None, *, seconds: float = math.inf):
@@ -73,14 +75,18 @@ class Evidence:
 
     @functools.cached_property
     def plausible(self) -> Plausible:
-        """The recording without faulty values, along the body's axes. Clipping is found along the sensors' axes."""
-        found = plausible(self.logged)
-        return found._replace(recording=in_body_axes(found.recording, self.airframe))
+        """The recording without faulty values, along the sensors' axes, and these values."""
+        return plausible(self.logged)
+
+    @functools.cached_property
+    def recording(self) -> Recording:
+        """The recording without faulty values, along the body's axes."""
+        return in_body_axes(self.plausible.recording, self.airframe)
 
     @functools.cached_property
     def every(self) -> tuple[Stretch, ...]:
         """Every stretch of the flight: usable ones, and others with the reason."""
-        return stretches(self.plausible.recording, self.airframe)
+        return stretches(self.recording, self.airframe)
 
     @property
     def usable(self) -> list[Stretch]:
@@ -89,12 +95,12 @@ class Evidence:
 
     def richest(self, parts: Sequence[Stretch]) -> list[Stretch]:
         """The most informative pieces of some parts, of at most `seconds` together."""
-        return richest(self.plausible.recording, parts, torques_of(self.airframe), self.seconds)
+        return richest(self.recording, parts, torques_of(self.airframe), self.seconds)
 
     @functools.cached_property
     def stretches(self) -> tuple[Recording, ...]:
         """The usable stretches of the flight; only the most informative pieces if it is longer than `seconds`."""
-        recording = self.plausible.recording
+        recording = self.recording
         if recording.stretch is not None:  # concatenated flights are usable
             edges = np.flatnonzero(np.diff(recording.stretch)) + 1
             ends = zip([0, *edges], [*edges, recording.time.size], strict=True)
@@ -108,7 +114,7 @@ class Evidence:
 
         A vehicle whose accelerometer is turned seems to lie on the ground.
         """
-        whole = self.plausible.recording
+        whole = self.recording
         thrust = self.thrust(whole)
         if self.stretches or self.airframe is None or thrust is None:
             return self.stretches
@@ -133,7 +139,7 @@ class Evidence:
     @functools.cached_property
     def rest(self) -> Float[np.ndarray, "3"] | None:
         """The specific force at rest before the first stretch in flight [m/s^2]. `None`: never at rest, or moved."""
-        recording = self.plausible.recording
+        recording = self.recording
         begin = min((each.begin for each in self.usable), default=0.0) if self.stretches else 0.0
         before = np.count_nonzero(recording.time < begin - MARGIN)
         length = max(round(REST / recording.dt), 4)
@@ -148,20 +154,9 @@ class Evidence:
         alike = np.abs(means - np.median(means, axis=0)).max(axis=1) < STILL * GRAVITY
         return means[alike].mean(axis=0) if alike.mean() > 0.75 else None  # otherwise it was in a hand
 
-    @functools.cached_property
-    def turns(self) -> Turns | None:
-        """Attitude against gyro."""
-        return attitude_turns(self.stretches)
-
-    @functools.cached_property
-    def velocity(self) -> Measured | None:
-        """See `velocity_slopes`."""
-        return velocity_slopes(self.stretches)
-
-    @functools.cached_property
-    def tilt(self) -> Measured | None:
-        """See `tilt_slopes`."""
-        return tilt_slopes(self.stretches)
+    turns = functools.cached_property[Turns | None](lambda self: attitude_turns(self.stretches))
+    velocity = functools.cached_property[Measured | None](lambda self: velocity_slopes(self.stretches))
+    tilt = functools.cached_property[Measured | None](lambda self: tilt_slopes(self.stretches))
 
     @functools.cached_property
     def response(self) -> Response | None:

@@ -11,7 +11,6 @@ Reference: Ljung 1999, System Identification, ch. 13, the direct method in close
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,7 +20,7 @@ from ...airframe import Airframe
 from ...flight import RATES
 from ...logs import Recording
 from ..motion import velocity_of
-from ..noise import spectra
+from ..sensor_errors import spectra
 from ..windows import averaged
 from .estimates import BATCHES, Measured, interpolated, peak
 
@@ -50,7 +49,7 @@ class Response(msgspec.Struct, frozen=True):
     """The answer of roll and pitch acceleration and vertical force to the rotors.
 
     - `turning`: the matrix from roll and pitch torque to roll and pitch acceleration [1/(kg m^2)].
-    - `delays`: of gyro and accelerometer after the rotors, and of the gyro after the accelerometer [s].
+    - `delays`: the delays of gyro and accelerometer after the rotors, and of the gyro after the accelerometer [s].
     - `explained`: the shares that the rotors explain: of the squared errors with which roll and pitch rate are
       predicted, and of the power of the vertical force. NaN: not measured.
     - `lag`: lag of the rotors [s]; 0 if their speeds were measured.
@@ -74,13 +73,12 @@ def rotor_response(
         return None
     lags = LAGS if stretches[0].commanded else (0.0,)
     flown = [averaged(each, [max(STEP, step)])[0] for each in stretches]
-    model = _Turning.of(flown[0].dt)
-    turns = {lag: model.products([_turns(each, airframe, lag) for each in flown]) for lag in lags}
-    answers = {lag: model.answer(products.sum(axis=0)) for lag, products in turns.items()}
+    turns = {lag: _products([_turns(each, airframe, lag) for each in flown], flown[0].dt) for lag in lags}
+    answers = {lag: _answer(products.sum(axis=0), flown[0].dt) for lag, products in turns.items()}
     lag = max(lags, key=lambda lag: float(-np.log1p(-np.nan_to_num(answers[lag][2])).sum()))
     if np.isnan(answers[lag][1]):
         return None
-    found = Measured.of(turns[lag], lambda products: np.append(*model.answer(products)[:2]))
+    found = Measured.of(turns[lag], lambda products: np.append(*_answer(products, flown[0].dt)[:2]))
     turning, late = Measured(found.value[:4].reshape(2, 2), found.error[:4].reshape(2, 2)), found[4:]
     felt, share = _felt([averaged(each, [max(FORCE_STEP, step)])[0] for each in stretches], airframe, lag)
     between = Measured(late.value - felt.value, np.hypot(late.error, felt.error))
@@ -90,70 +88,69 @@ def rotor_response(
     return Response(turning, Measured(value, error), np.append(answers[lag][2], share), lag)
 
 
-class _Turning(NamedTuple):
-    """The prediction of roll and pitch rate: its step [s], how many past errors count, the first and last delay.
+def _delays(step: float) -> tuple[int, int]:
+    """The first and the last delay that are tried, in samples of this step [s]."""
+    return round(DELAYS[0] / step), round(DELAYS[1] / step)
 
-    A rate depends on the integrals of both torques, and on its slow motion, which has no delay. Delays are in samples.
+
+def _products(every: Sequence[np.ndarray], step: float) -> Float[np.ndarray, "batches columns columns"]:
+    """Sums of products of `_lagged` signals in batches."""
+    thin = max(sum(len(each) for each in every) // PREDICTIONS, 1)
+    table = np.concatenate([_lagged(each, *_delays(step))[::thin] for each in every])
+    return np.array([batch.T @ batch for batch in np.array_split(table, BATCHES)])
+
+
+def _lagged(signals: Signals, first: int, last: int) -> Float[np.ndarray, "rows columns"]:
+    """Complete rows of rates and slow motions, now and before; and of torques at all delays, and before.
+
+    A rate depends on the integrals of both torques, and on its slow motion, which has no delay.
     """
+    spans = [(0, ORDER)] * 4 + [(first, last + ORDER)] * 2
+    signals = signals - np.nan_to_num(signals).sum(axis=0) / np.maximum(np.isfinite(signals).sum(axis=0), 1)
+    rows = np.arange(last + ORDER, len(signals) + first)
+    columns = [x[rows[:, None] - np.arange(a, b + 1)] for x, (a, b) in zip(signals.T, spans, strict=True)]
+    table = np.hstack(columns)
+    return table[np.isfinite(table).all(axis=1)]
 
-    step: float
-    order: int
-    first: int
-    last: int
 
-    @classmethod
-    def of(cls, step: float) -> "_Turning":
-        """The prediction for samples of this step [s]."""
-        return cls(step, ORDER, *(round(delay / step) for delay in DELAYS))
+def _places(shifts: int) -> Int[np.ndarray, "delays rates signals past"]:
+    """By delay and rate: the columns of `_lagged` that hold it, both torques at this delay, and its slow motion."""
+    past = np.arange(ORDER + 1)
+    torques = 4 * past.size + (past.size + shifts - 1) * np.arange(2)[:, None] + past
+    every = [
+        [[past.size * i + past, *(torques + shift), past.size * (2 + i) + past] for i in range(2)]
+        for shift in range(shifts)
+    ]
+    return np.array(every)
 
-    def products(self, every: Sequence[np.ndarray]) -> Float[np.ndarray, "batches columns columns"]:
-        """Sums of products of `_lagged` signals in batches."""
-        thin = max(sum(len(each) for each in every) // PREDICTIONS, 1)
-        table = np.concatenate([self._lagged(each)[::thin] for each in every])
-        return np.array([batch.T @ batch for batch in np.array_split(table, BATCHES)])
 
-    def _lagged(self, signals: Signals) -> Float[np.ndarray, "rows columns"]:
-        """Complete rows of rates and slow motions, now and before; and of torques at all delays, and before."""
-        spans = [(0, self.order)] * 4 + [(self.first, self.last + self.order)] * 2
-        signals = signals - np.nan_to_num(signals).sum(axis=0) / np.maximum(np.isfinite(signals).sum(axis=0), 1)
-        rows = np.arange(self.last + self.order, len(signals) + self.first)
-        columns = [x[rows[:, None] - np.arange(a, b + 1)] for x, (a, b) in zip(signals.T, spans, strict=True)]
-        table = np.hstack(columns)
-        return table[np.isfinite(table).all(axis=1)]
+def _answer(
+    products: Float[np.ndarray, "columns columns"], step: float
+) -> tuple[Float[np.ndarray, "4"], float, Float[np.ndarray, "2"]]:
+    """The gains from torques to rates, their delay [s], and the explained shares; NaN: not measured.
 
-    def _places(self) -> Int[np.ndarray, "delays rates signals past"]:
-        """By delay and rate: the columns of `_lagged` that hold it, both torques at this delay, and its slow motion."""
-        past, shifts = np.arange(self.order + 1), np.arange(self.last - self.first + 1)
-        torques = 4 * past.size + (past.size + shifts.size - 1) * np.arange(2)[:, None] + past
-        every = [[[past.size * i + past, *(torques + s), past.size * (2 + i) + past] for i in range(2)] for s in shifts]
-        return np.array(every)
-
-    def answer(
-        self, products: Float[np.ndarray, "columns columns"]
-    ) -> tuple[Float[np.ndarray, "4"], float, Float[np.ndarray, "2"]]:
-        """The gains from torques to rates, their delay [s], and the explained shares; NaN: not measured.
-
-        Errors are those of predicting the rates, minus inputs times gains, from their past.
-        """
-        if not products.any():
-            return np.full(4, np.nan), math.nan, np.full(2, np.nan)
-        places = self._places()
-        size = np.sqrt(np.maximum(np.diagonal(products)[places[..., 0]], 1e-300))  # of each signal
-        sums = products[places[..., :, None, :, None], places[..., None, :, None, :]]
-        sums = sums / (size[..., :, None] * size[..., None, :])[..., None, None]
-        noise = np.zeros(places.shape[:2] + places.shape[3:])
-        noise[..., 0], noise[..., 1] = 1.0, -1.0  # unknown torques add up in the rates
-        alone, _ = _predicted(np.eye(size.shape[2])[0] + np.zeros(size.shape), sums)
-        weights, squares = np.zeros(size.shape), alone
-        for _ in range(PASSES):
-            weights = _least(np.einsum("koi,koabi->koab", noise, np.einsum("koj,koabij->koabi", noise, sums)))
-            squares, noise = _predicted(weights, sums)
-        shares = np.where(alone > 0, 1 - squares / np.maximum(alone, 1e-300), 0.0)
-        gains = (-weights * size[..., :1] / size)[..., 1:3]
-        # A controller's torque opposes the motion, so the motion before it seems to answer with the opposite sign.
-        along, across = np.trace(gains, axis1=1, axis2=2), np.abs(gains[:, 0, 1] - gains[:, 1, 0])
-        best, after = peak(np.where(along > -across, -np.log1p(-shares).sum(axis=1), 0.0))
-        return gains[best].ravel(), (self.first + best + after) * self.step, shares[best]
+    Errors are those of predicting the rates, minus inputs times gains, from their past.
+    """
+    if not products.any():
+        return np.full(4, np.nan), math.nan, np.full(2, np.nan)
+    first, last = _delays(step)
+    places = _places(last - first + 1)
+    size = np.sqrt(np.maximum(np.diagonal(products)[places[..., 0]], 1e-300))  # of each signal
+    sums = products[places[..., :, None, :, None], places[..., None, :, None, :]]
+    sums = sums / (size[..., :, None] * size[..., None, :])[..., None, None]
+    noise = np.zeros(places.shape[:2] + places.shape[3:])
+    noise[..., 0], noise[..., 1] = 1.0, -1.0  # unknown torques add up in the rates
+    alone, _ = _predicted(np.eye(size.shape[2])[0] + np.zeros(size.shape), sums)
+    weights, squares = np.zeros(size.shape), alone
+    for _ in range(PASSES):
+        weights = _least(np.einsum("koi,koabi->koab", noise, np.einsum("koj,koabij->koabi", noise, sums)))
+        squares, noise = _predicted(weights, sums)
+    shares = np.where(alone > 0, 1 - squares / np.maximum(alone, 1e-300), 0.0)
+    gains = (-weights * size[..., :1] / size)[..., 1:3]
+    # A controller's torque opposes the motion, so the motion before it seems to answer with the opposite sign.
+    along, across = np.trace(gains, axis1=1, axis2=2), np.abs(gains[:, 0, 1] - gains[:, 1, 0])
+    best, after = peak(np.where(along > -across, -np.log1p(-shares).sum(axis=1), 0.0))
+    return gains[best].ravel(), (first + best + after) * step, shares[best]
 
 
 def _predicted(weights: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""White noise and vibration of sensors, and rotor speeds without their noise.
+"""Errors of sensors: white noise and vibration, the accelerometer's constant error, and the sag that a voltage lacks.
 
 A noisy input makes the slope of a regression too small, so moments of inertia come out too large. The expectation of
 the speeds given all measurements, by a Wiener filter without delay, has no such bias: its error does not correlate with
@@ -186,3 +186,79 @@ def vibrating_rates(stretches: Sequence[Recording]) -> dict[str, float]:
         if ratio.max() > TIMES:
             found[axis.rate] = float(frequency[high[np.argmax(ratio)]])
     return found
+
+
+Ups = tuple[Float[np.ndarray, "_samples 3"], Float[np.ndarray, "_samples 3"]]
+"""The upright direction along the body's axes in a stretch, by two time constants, see `velocity_of`."""
+
+KEEPS = 0.2  # m/s^2; standard deviation of the error's change from rest to flight, as sensors warm up and vibrate
+AGREE = 3.0  # standard deviations; if flight and rest differ by more, drag or manoeuvres have misled the flight
+
+
+def force_level(
+    fitted: Recording, ups: Sequence[Ups], rests: Sequence[Float[np.ndarray, "3"]], gravity: float
+) -> tuple[float, float] | None:
+    """The constant error of the accelerometer along z, and its standard deviation [m/s^2]. `None`: unknown.
+
+    It follows from flight and from rest before take-off.
+
+    **Arguments:**
+
+    - `fitted`, `ups`: a flight, and the upright direction in its stretches, see `velocity_of`.
+    - `rests`: the specific force before take-off, where it is known [m/s^2].
+    """
+    flown = _by_flight(fitted, ups, gravity)
+    if not rests:
+        return flown
+    rest = float(np.mean([np.linalg.norm(force) for force in rests])) - gravity
+    if flown is None or abs(flown[0] - rest) > AGREE * math.hypot(flown[1], KEEPS):
+        return rest, KEEPS
+    weights = np.array([flown[1], KEEPS]) ** -2.0
+    return float(weights @ [flown[0], rest] / weights.sum()), float(weights.sum() ** -0.5)
+
+
+GAINED = 1.0  # m/s; the most velocity that a vehicle gains over a stretch
+UNCARRIED = 0.003  # share of the weight that the mean force may miss
+UPRIGHT = 0.5  # smallest mean cosine of the tilt
+
+
+def _by_flight(fitted: Recording, every: Sequence[Ups], gravity: float) -> tuple[float, float] | None:
+    """The mean vertical component of the specific force minus gravity, and its standard deviation [m/s^2].
+
+    A vehicle gains little velocity over a stretch, so on average the force carries its weight.
+    """
+    force = fitted.specific_force
+    if not every or force is None or not (known := np.isfinite(force).all(axis=1)).any():
+        return None
+    ups = [np.concatenate(each)[known] for each in zip(*every, strict=True)]
+    other, along = ((force[known] * up).sum(axis=1).mean() for up in ups)
+    cosine = ups[-1][:, 2].mean()
+    if cosine < UPRIGHT or force[known, 2].mean() < 0:  # the second: the z axis points down
+        return None
+    drift = GAINED * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
+    return (along - gravity) / cosine, math.hypot(drift, UNCARRIED * gravity, along - other) / cosine
+
+
+MANOEUVRE = 0.2  # s; the load of the rotors changes within about this time
+SAG = 0.04  # the share of the voltage that a load takes: a coarser voltage does not show it
+LEAST_UNSEEN = 0.1  # even a voltage in each row has noise, and is measured before or after the load
+
+
+def unseen_sag(recording: Recording) -> float:
+    """The share of the sag that the logged voltage does not show, 0 to 1, from its rate and its resolution.
+
+    A slowly logged voltage is held or interpolated between its measurements. The measurements are counted by the steps
+    of a held voltage, or by the changes of slope of an interpolated one.
+    """
+    voltage = np.empty(0) if recording.voltage is None else recording.voltage[recording.voltage > 0]
+    if voltage.size < 3:
+        return 1.0
+    steps, usual = np.diff(voltage), float(np.median(voltage))
+    changes = np.abs(np.diff(steps)) > 1e-9 * usual
+    is_held = np.count_nonzero(steps) <= np.count_nonzero(changes) / 2 + 1
+    measured = np.count_nonzero(steps if is_held else changes)
+    if not measured:
+        return 1.0
+    period = float(recording.time[-1] - recording.time[0]) / measured
+    resolution = float(np.abs(steps[steps != 0]).min()) / usual
+    return float(np.clip(max(1 - math.exp(-period / MANOEUVRE), resolution / SAG), LEAST_UNSEEN, 1.0))
