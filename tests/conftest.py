@@ -45,10 +45,10 @@ hypothesis.settings.load_profile("ci")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Checks shapes and types of all annotated functions and modules, but not in the daily loop of a developer."""
+    """Checks shapes and types of all annotated functions and modules; in the daily loop only if CI asks for it."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         return  # this process only hands tests to workers
-    if config.option.markexpr != "not slow":
+    if config.option.markexpr != "not slow" or os.environ.get("JAXOS4_CHECK_TYPES"):
         package = pathlib.Path(__file__).resolve().parents[1] / "jaxos4"
         modules = [path.relative_to(package.parent) for path in package.rglob("*.py") if path.stem not in UNCHECKED]
         jaxtyping.install_import_hook([".".join(each.with_suffix("").parts) for each in modules], "typechecker.check")

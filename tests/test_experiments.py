@@ -222,16 +222,18 @@ def test_bracket_and_seeds(run):
 
 # Experiments that are scripts.
 
+FLIGHTS = 128  # of most of them, so that they share programs
+
 
 @pytest.mark.slow
 def test_efficiency(tmp_path):
     case = "published, rates"
-    (row,) = result_of(tmp_path, "efficiency", flights=48, seed=0, scale=1.0, cases=[case])["cases"]
-    assert row["results"] == {"successful": 48}
+    (row,) = result_of(tmp_path, "efficiency", flights=FLIGHTS, seed=0, scale=1.0, cases=[case])["cases"]
+    assert row["results"] == {"successful": FLIGHTS}
     # Within four Monte-Carlo standard errors of the bound, on each of the eight parameters.
     assert near(row["efficiency"], 1, 4 * row["monte_carlo_error"])
-    assert near(row["bias"], 0, 4 / np.sqrt(48))
-    assert near(row["covered"], 0.95, 4 * np.sqrt(0.95 * 0.05 / 48))
+    assert near(row["bias"], 0, 4 / np.sqrt(FLIGHTS))
+    assert near(row["covered"], 0.95, 4 * np.sqrt(0.95 * 0.05 / FLIGHTS))
 
 
 @pytest.mark.slow
@@ -244,9 +246,9 @@ def test_speed(tmp_path):
 @pytest.mark.slow
 def test_networks(tmp_path):
     trained = {"networks": ["score, mlp", "score, cmac"], "channels": "rates", "separate": False}
-    report = result_of(tmp_path, "networks", flights=128, seed=7, steps=100, many=128, noises=[1.0], **trained)
+    report = result_of(tmp_path, "networks", flights=FLIGHTS, seed=7, steps=100, many=FLIGHTS, noises=[1.0], **trained)
     rows = {row["estimator"]: row for row in report["rows"]}
-    assert report["one_call"]["flights"] == 128
+    assert report["one_call"]["flights"] == FLIGHTS
     hybrids = [f"hybrid from {label}" for label in trained["networks"]]
     assert list(rows) == ["score, mlp", hybrids[0], "ibss", "score, cmac", hybrids[1]]
     # Each of eight parameters within five Monte-Carlo errors of the bound.
@@ -280,9 +282,9 @@ def test_precision(tmp_path):
 @pytest.mark.slow
 def test_baselines(tmp_path):
     cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
-    rows = result_of(tmp_path, "baselines", flights=48, seed=5, channels="rates", **cases)["rows"]
+    rows = result_of(tmp_path, "baselines", flights=FLIGHTS, seed=5, channels="rates", **cases)["rows"]
     exact, noisy = rows[:2], rows[2:]
-    assert all(row["answers"] == 48 for row in rows)
+    assert all(row["answers"] == FLIGHTS for row in rows)
     assert all(max(row["efficiency"]) < 1e-6 for row in exact)
     # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
     assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
@@ -292,12 +294,12 @@ def test_baselines(tmp_path):
 @pytest.mark.slow
 def test_coverage(tmp_path):
     cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
-    rows = result_of(tmp_path, "coverage", flights=128, seed=11, scales=[1.0], steps=100, **cases)["rows"]
+    rows = result_of(tmp_path, "coverage", flights=FLIGHTS, seed=11, scales=[1.0], steps=100, **cases)["rows"]
     assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
-        assert row["results"] == {"successful": 128}
+        assert row["results"] == {"successful": FLIGHTS}
         assert near(row["std"], 1, 0.05)  # the intervals are not too wide
-        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
+        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / FLIGHTS))
 
 
 @pytest.mark.slow

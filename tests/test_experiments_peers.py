@@ -98,9 +98,10 @@ def test_a_fast_log_is_averaged_and_what_was_not_measured_is_interpolated():
     assert late[50:53, 0] == pytest.approx([1, 2 - np.exp(-0.2), 2 - np.exp(-0.4)])
 
 
+@pytest.mark.usefixtures("optimised")
 def test_all_tools_get_the_same_flights_and_who_is_missing_is_skipped(capsys, monkeypatch, shared_flights, tmp_path):
     monkeypatch.setitem(load("peers").PEERS, "CasADi", "no_such_module")
-    cases = {"flights": 2, "duration": 10.0, "only": ["Crazyflie, 0"], "tools": ["jaxos4", "regression", "CasADi"]}
+    cases = {"flights": 2, "duration": 16.0, "only": ["Crazyflie, 0"], "tools": ["jaxos4", "regression", "CasADi"]}
     report = result_of(tmp_path, "peers", recorded=["CineRat"], recordings=shared_flights, **cases)
     plot(tmp_path, "peers")
     assert [(row["flight"], row["tool"]) for row in report["rows"]] == [

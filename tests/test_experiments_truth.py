@@ -34,6 +34,7 @@ def simulator(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_cases_are_flown_identified_and_counted(capsys, simulator, tmp_path):
     """The second case has a false truth: the estimate is wrong, and is counted as wrong."""
     report = result_of(tmp_path, "truth", truth=simulator)

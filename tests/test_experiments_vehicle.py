@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
 def test_real_flight(shared_flights, tmp_path):
     report = result_of(
-        tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
+        tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=8.0
     )
     plot(tmp_path, "real_flight")
     (row,) = report["estimators"]["filter-error"]["flights"].values()
@@ -57,7 +57,7 @@ def test_closed_loop(monkeypatch, tmp_path):
 
 def test_effects(tmp_path):
     """The effects of real flights are flown, identified and drawn."""
-    report = result_of(tmp_path, "closed_loop", "effects", flights=1, duration=10.0, effects=["clock"])
+    report = result_of(tmp_path, "closed_loop", "effects", flights=1, duration=16.0, effects=["clock"])
     plot(tmp_path, "closed_loop", "plot_effects")
     (row,) = report["rows"]
     assert row["result"] == "successful"
@@ -66,7 +66,7 @@ def test_effects(tmp_path):
 
 def test_a_soft_flight_has_no_steps_and_the_mix_of_effects_stays_what_it_was():
     effects = load("closed_loop", "effects")
-    hard, soft = (effects.flights_of(kind, 1, 8.0, 22, gust=0.0)[0] for kind in ("gusts", "soft"))
+    hard, soft = (effects.flights_of(kind, 1, 16.0, 22, gust=0.0)[0] for kind in ("gusts", "soft"))
     jumps = [np.abs(np.diff(flight.omega, axis=0)).max() / flight.omega.std() for flight in (hard, soft)]
     assert jumps[1] < 0.5 * jumps[0]
     assert {"battery", "filtered gyro", "soft", "soft, fast controller"} == set(effects.EFFECTS) - set(effects.MIXED)
@@ -129,7 +129,7 @@ def test_sample_times(tmp_path):
 
 def test_rotorpy(tmp_path):
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
-    cases = {"flights": 1, "kinds": ["calm"], "duration": 8.0, "estimators": ["filter-error"]}
+    cases = {"flights": 1, "kinds": ["calm"], "duration": 16.0, "estimators": ["filter-error"]}
     report = result_of(tmp_path, "rotorpy", recordings=tmp_path / "flights", **cases)
     (path,) = (tmp_path / "flights").iterdir()
     flight = jaxos4.read_flight(path)

@@ -58,19 +58,22 @@ def test_the_hybrid_begins_at_the_initial_state_that_the_network_saw():
     assert hybrid.sweeps.mean() < 1.2
 
 
-def test_a_file_gives_back_the_same_network(tmp_path):
-    others = trained(features="raw", steps=1), trained(**CMAC)
-    for number, network in enumerate((trained(), trained(free=True), *others)):
-        path = tmp_path / f"{number}.net"
-        jaxos4.save_network(network, path)
-        loaded, problem = jaxos4.load_network(path), problem_of(free=number == 1)
-        assert same(loaded(problem, BRACKET), network(problem, BRACKET))
-        assert same(loaded.history, network.history)
-    with np.load(tmp_path / "0.net") as file:
+OTHERS = {"free": True}, {"features": "raw", "steps": 1}, CMAC
+KINDS = [{}, *(pytest.param(each, marks=pytest.mark.slow) for each in OTHERS)]
+
+
+@pytest.mark.parametrize("changes", KINDS, ids=str)
+def test_a_file_gives_back_the_same_network(changes, tmp_path):
+    network, path = trained(**changes), tmp_path / "some.net"
+    jaxos4.save_network(network, path)
+    loaded, problem = jaxos4.load_network(path), problem_of(free="free" in changes)
+    assert same(loaded(problem, BRACKET), network(problem, BRACKET))
+    assert same(loaded.history, network.history)
+    with np.load(path) as file:
         header = json.loads(str(file["header"]))
     assert header["version"] == jaxos4.__version__
     assert header["model"] == "published"
-    assert header["settings"]["steps"] == SMALL["steps"]
+    assert header["settings"]["steps"] == (SMALL | changes)["steps"]
 
 
 @pytest.fixture(scope="module")

@@ -269,6 +269,7 @@ def test_recordings_are_parts_of_their_own_if_there_are_enough_and_widen_more_th
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_a_recorded_flight_does_not_end_successful_without_skill_or_against_physics(shared_flights):
     vehicle = jaxos4.load_airframe(AIRFRAME)
     found = jaxos4.identify(read_recording(shared_flights / "arpl_crazyflie_yaw_b.csv", vehicle), vehicle)

@@ -8,7 +8,7 @@ import pytest
 from helpers import CRAZYFLIE
 
 import jaxos4
-from jaxos4.shooting import InnovationsProblem
+from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise
 from jaxos4.shooting.segments import Segments
 
@@ -51,8 +51,11 @@ def joined(flights):
 
 
 def problem_of(flight, recordings, segments):
+    """Flights of one recording are padded, and share one program."""
     model = jaxos4.FlightModel(CRAZYFLIE, terms=("offset", "damping", "lag"), recordings=recordings)
-    shooting = jaxos4.ShootingProblem(model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4")
+    capacity = max(LENGTHS) if len(recordings) == 1 else flight.time.size
+    known = {"sigma": np.full(12, 0.02), "channels": "rates", "method": "rk4", "length": jnp.asarray(flight.time.size)}
+    shooting = jaxos4.ShootingProblem(model, pad_flight(flight, capacity), **known)
     return InnovationsProblem(shooting, segments=segments, settling=SETTLING)
 
 
