@@ -179,7 +179,7 @@ def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented
       its mean over the window of a measurement, and the outputs of the sensors.
     - `positions`: indices of the parameters on which the forcing depends.
     """
-    return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)
+    return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)()
 
 
 def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:

@@ -9,6 +9,7 @@ References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, Sys
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
@@ -18,13 +19,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import Numeric, Parameters, as_float
+from .._custom_types import Count, Numeric, Parameters, as_float
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
-from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
+from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
 from .filters import InputGains, Point, Segmented, innovate
 from .gains import INSTANT, LogNoise, Observed, Window
 from .noise_unknowns import TIMES, levels, own_names, with_noise
@@ -212,35 +213,32 @@ class InnovationsProblem(AbstractProblem):
     @property
     def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """See `AbstractProblem`. `parts` are the segments."""
-        at, noise_feedthrough = self._local_model(), jnp.nan_to_num(self.noise_feedthrough)
-        return lambda unknowns: at(unknowns, noise_feedthrough)
+        return functools.partial(self._local_model(), jnp.nan_to_num(self.noise_feedthrough))
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The whole problem. If it has feedthroughs, a second stage counts as noise the innovations they explain."""
         del shares
-        number, at = 2 if self.noise_feedthrough.size else 1, self._local_model()
+        number, model_at, unknowns = 2 if self.noise_feedthrough.size else 1, self._local_model(), self.unknowns
         is_known = ~jnp.isnan(self.noise_feedthrough).any()
 
-        def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
+        def at(stage: Count | int, before: WindowUnknowns) -> Stage:
             found = jnp.where(is_known, self.noise_feedthrough, self._of_inputs(before[0])[2])
-            return at(unknowns, jnp.where(is_known | (stage > 0), found, 0.0))
+            noise_feedthrough = jnp.where(is_known | (stage > 0), found, 0.0)
+            return Stage(
+                unknowns=unknowns,
+                off=unknowns.usable.half_width[None],
+                local_model=functools.partial(model_at, noise_feedthrough),
+                searched=unknowns.free,
+                measurements=jnp.zeros((), dtype=float),
+                smallest_step=jnp.sqrt(jnp.finfo(float).eps),
+                last=jnp.asarray(stage == number - 1),
+            )
 
-        unknowns, none = self.unknowns, jnp.zeros(number, dtype=float)
         first = is_known.astype(int) if number == 2 else 0
-        return Stages(
-            unknowns=unknowns,
-            off=unknowns.usable.half_width[None],
-            number=number,
-            first=first,
-            whole=first,
-            local_model=local_model,
-            searched=jnp.broadcast_to(unknowns.free, (number, unknowns.count)),
-            measurements=none,
-            smallest_step=none + jnp.sqrt(jnp.finfo(float).eps),
-        )
+        return Stages(number, first, first, at)
 
-    def _local_model(self) -> Callable[[WindowUnknowns, Float[Array, "channels feedthroughs"]], LocalModel]:
-        """`local_model` as a function of the unknowns and of `noise_feedthrough`."""
+    def _local_model(self) -> Callable[[Float[Array, "channels feedthroughs"], WindowUnknowns], LocalModel]:
+        """`local_model` as a function of `noise_feedthrough` and of the unknowns."""
         unknowns, innovations = self.unknowns.usable, self._innovations()
         count, free = self.problem.unknowns.count, unknowns.free
         both, places = free & free[:, None], None
@@ -248,7 +246,7 @@ class InnovationsProblem(AbstractProblem):
             others = np.broadcast_to(np.arange(count, free.size), (self.segments, free.size - count))
             places = jnp.concatenate([jnp.asarray(each.places)[self.segmentation.recording], others], axis=1)
 
-        def at(row: WindowUnknowns, noise_feedthrough: Float[Array, "channels feedthroughs"]) -> LocalModel:
+        def at(noise_feedthrough: Float[Array, "channels feedthroughs"], row: WindowUnknowns) -> LocalModel:
             values = row[0]
             found = innovations(values[:count], self.noise(values), self._of_inputs(values), noise_feedthrough)
             shared = found.gradient.shape[1] - len(self._own)
@@ -333,7 +331,7 @@ class InnovationsProblem(AbstractProblem):
 def _move(problem: ShootingProblem, state: State, forcing: Forcing, parameters) -> State:
     """The rates one sample later: by the midpoint rule if measurements are means, else by the problem's method."""
     if forcing.early is None:
-        return problem.step(state, forcing, parameters)
+        return problem.advance(forcing, state, parameters)[0]
     return midpoint_step(problem.model, state, forcing, parameters, problem.flight.dt)
 
 

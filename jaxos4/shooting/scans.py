@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import InitialState, Numeric, Parameters, Scalar
+from .._custom_types import Count, InitialState, Numeric, Parameters, Scalar
 from ..batching import computed_once, in_blocks, with_batch
 from ..models.state import Forcing, State, Translation, unstack
 from .abstract import LocalModel, Shot
@@ -24,9 +24,8 @@ from .sparsity import Panel, panels_of, symmetric
 # rad/s; no quadrotor reaches this body rate and no gyro measures it, so a faster trajectory has diverged.
 FASTEST = 1e3
 
-# Returns the state one sample later and the output of noise-free sensors, from a state, the forcing and the parameters.
-Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
-Carry = TypeVar("Carry")
+# Returns the state one sample later and the output of noise-free sensors, from the forcing, a state and the parameters.
+Advance = Callable[[Forcing, State, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
 Series = TypeVar("Series", Forcing, tuple[Array, ...])
 # One value, or one for each lane of a batch.
 Lanes = Float[Array, "*#lanes"]
@@ -54,7 +53,7 @@ def predict_window(
     scalars, first = tuple(parameters), unstack(initial_state)
 
     def step(state: State, forcing: Forcing) -> tuple[State, tuple[Scalar, ...]]:
-        return advance(state, forcing, scalars)
+        return advance(forcing, state, scalars)
 
     if length is None:
         return jnp.stack(jax.lax.scan(step, first, forcing)[1], axis=-1)
@@ -84,13 +83,6 @@ def with_tangents(
     return new, slopes._replace(recording=zeros.recording, velocity=zeros.velocity)
 
 
-def _fold(step: Callable[[Carry, Rows], tuple[Carry, None]], first: Carry, rows: Rows, length: Length) -> Carry:
-    """The last carry of a scan over the rows that count."""
-    if length is None:
-        return jax.lax.scan(step, first, rows)[0]
-    return jax.lax.fori_loop(0, length, lambda i, x: step(x, jax.tree.map(lambda leaf: leaf[i], rows))[0], first)
-
-
 def shoot(
     advance: Advance,
     rows: Rows,
@@ -108,47 +100,49 @@ def _shoot(
 ) -> Shot:
     scalars = tuple(at)
 
-    def step(carry: tuple[State, Shot], row: Rows) -> tuple[tuple[State, Shot], None]:
-        state, shot = carry
+    def step(i: Count, carry: tuple[State, Shot]) -> tuple[State, Shot]:
+        row, (state, shot) = jax.tree.map(lambda leaf: leaf[i], rows), carry
         feasible = shot.feasible & _is_feasible(state)
-        following, predicted = advance(state, row.forcing, scalars)
+        following, predicted = advance(row.forcing, state, scalars)
         cost = shot.cost + _half_square(_errors(row, predicted, weights, feasible))
-        return (following, Shot(cost, feasible)), None
+        return following, Shot(cost, feasible)
 
     nothing = Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
-    return _fold(step, (unstack(start), nothing), rows, length)[1]
+    return jax.lax.fori_loop(0, _samples(rows, length), step, (unstack(start), nothing))[1]
 
 
-def shoot_with_derivatives(
+def _samples(rows: Rows, length: Length) -> Count | int:
+    """The number of rows that count."""
+    return rows.forcing.roll.shape[0] if length is None else length
+
+
+def shot_with_derivatives(
     advance: Advance,
+    length: Length,
     weights: tuple[Scalar, ...],
-    rows: Rows,
-    parameters: Parameters,
-    initial_state: InitialState,
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
-    length: Length = None,
-) -> LocalModel:
+) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
     """`shoot` with gradient and information in the parameters and a free initial state. A batch runs in lanes."""
     how = {"forcing_parameters": forcing_parameters, "initial_state_is_free": initial_state_is_free}
     alone = functools.partial(_linearised_shot, **how)
 
     def together(lanes: int, many: Any, shared: Any) -> LocalModel:
-        if many[-1] is not None:  # lanes of different lengths
+        if many[1] is not None:  # lanes of different lengths
             return jax.vmap(lambda one: alone(*eqx.combine(one, shared)))(many)
-        last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), many[1:-1])
-        same = jax.tree.map(lambda leaf: leaf[..., None], shared[1:-1])
-        rows, weights, *at = eqx.combine(last, same)
-        at = (jnp.broadcast_to(values, (values.shape[0], lanes)) for values in at)
+        last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), many[2:])
+        same = jax.tree.map(lambda leaf: leaf[..., None], shared[2:])
+        weights, rows, *at = eqx.combine(last, same)
 
         def advance(*at: Any) -> tuple[State, tuple[Lanes, ...]]:
             return jax.vmap(lambda one, *at: eqx.combine(one, shared[0])(*at))(many[0], *at)
 
-        out = alone(advance, rows, weights, *at, shared[-1])
+        parameters, initial_state = (jnp.broadcast_to(values, (values.shape[0], lanes)) for values in at)
+        out = alone(advance, shared[1], weights, rows, parameters, initial_state)
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), out)
 
-    return with_batch(alone, together, advance, rows, weights, parameters, initial_state, length)
+    return with_batch(alone, together, advance, length, weights)
 
 
 class _Carried(NamedTuple):
@@ -170,16 +164,16 @@ class _Carried(NamedTuple):
 
 def _linearised_shot(
     advance: Advance,
-    rows: Rows,
+    length: Length,
     weights: tuple[Lanes, ...],
+    rows: Rows,
     parameters: Float[Array, "parameters *lanes"],
     initial_state: Float[Array, "size *lanes"],
-    length: Length,
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
 ) -> LocalModel:
-    """`shoot_with_derivatives` for one flight, or for flights in lanes, which are then the last axis of all arrays.
+    """`shot_with_derivatives` for one flight, or for flights in lanes, which are then the last axis of all arrays.
 
     Rows and weights that all lanes share have a last axis of 1.
     """
@@ -188,12 +182,13 @@ def _linearised_shot(
     def along_lanes(leaf: Array) -> Array:
         return jnp.broadcast_to(leaf, tuple(lanes))
 
-    at = unstack(initial_state), jax.tree.map(lambda leaf: along_lanes(leaf[0]), rows.forcing), scalars
+    at = jax.tree.map(lambda leaf: along_lanes(leaf[0]), rows.forcing), unstack(initial_state), scalars
     first_late, panels = panels_of(advance, at, forcing_parameters, free=initial_state_is_free)
     # NumPy, so that they are constants of the program.
     parameter_tangents = tuple(np.eye(count, first_late, dtype=parameters.dtype))
 
-    def step(carry: _Carried, row: Rows) -> tuple[_Carried, None]:
+    def step(i: Count, carry: _Carried) -> _Carried:
+        row = jax.tree.map(lambda leaf: leaf[i], rows)
         feasible = carry.shot.feasible & _is_feasible(carry.state)
         # After a failure the state is 0, so that no derivative overflows.
         state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), carry.state)
@@ -201,14 +196,14 @@ def _linearised_shot(
 
         # If only the rates are simulated, repeating them is cheaper.
         repeated = not lanes or state.attitude is None
-        at, late = (state, forcing, scalars), carry.late
+        at, late = (forcing, state, scalars), carry.late
         sample = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
         following, push, push_late, cost, pull, squares = sample() if repeated else computed_once(feasible, sample)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
             nothing, positions = jnp.zeros((first_late, *lanes), parameters.dtype), np.asarray(forcing_parameters)
             wide = jax.tree.map(lambda slope: nothing.at[positions].set(slope), row.forcing_tangents)
-            directions.insert(1, wide)
+            directions.insert(0, wide)
 
         def pushed(*direction: Any) -> tuple[State, tuple[Lanes, ...]]:
             return push(*jax.tree.map(along_lanes, direction))
@@ -224,11 +219,13 @@ def _linearised_shot(
             for panel, blocks in zip(panels, carry.panels, strict=True)
         ]
         shot = Shot(carry.shot.cost + cost, feasible)
-        return _Carried(following, tangent, late, shot, gradient, information), None
+        return _Carried(following, tangent, late, shot, gradient, information)
 
-    last = _fold(step, _before(initial_state, count, first_late, panels), rows, length)
+    first = _before(initial_state, count, first_late, panels)
+    last = jax.lax.fori_loop(0, _samples(rows, length), step, first)
     information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)
-    return LocalModel(*last.shot, jnp.concatenate(last.gradient), symmetric(information))
+    cost, feasible = last.shot
+    return LocalModel(cost, feasible, jnp.concatenate(last.gradient), symmetric(information))
 
 
 def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: int, panels: list[Panel]) -> _Carried:
@@ -266,7 +263,7 @@ def _added(
 def _linearised_sample(
     advance: Advance,
     row: Rows,
-    at: tuple[State, Forcing, tuple[Lanes, ...]],
+    at: tuple[Forcing, State, tuple[Lanes, ...]],
     weights: tuple[Lanes, ...],
     feasible: Bool[Array, "*lanes"],
     late: bool,
@@ -275,9 +272,9 @@ def _linearised_sample(
 
     The second derivative is in the translation alone; `None` unless `late`.
     """
-    state, forcing, scalars = at
+    forcing, state, scalars = at
     if row.forcing_tangents is None:
-        linear = jax.linearize(lambda state, scalars: advance(state, forcing, scalars), state, scalars)
+        linear = jax.linearize(functools.partial(advance, forcing), state, scalars)
     else:
         linear = jax.linearize(advance, *at)
     (following, predicted), push = linear
@@ -287,7 +284,7 @@ def _linearised_sample(
     push_late = None
     if late:
         _, push_late = jax.linearize(
-            lambda t: advance(state._replace(translation=t), forcing, scalars), state.translation
+            lambda t: advance(forcing, state._replace(translation=t), scalars), state.translation
         )
     return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 

@@ -38,18 +38,18 @@ def panels_of(
 ) -> tuple[int, list[Panel]]:
     """The index after the last unknown that acts on rates or attitude, and the panels of all rows.
 
-    - `advance`: returns the next state and the outputs, from a state, the forcing and the parameters, which are `at`.
+    - `advance`: returns the next state and the outputs, from the forcing, a state and the parameters, which are `at`.
     - `free`: whether the initial state is unknown too. Its leaves then follow the parameters.
     """
     leaves = dependence(advance, *at)
-    size, forces, count = (len(jax.tree.leaves(part)) for part in at)
+    forces, size, count = (len(jax.tree.leaves(part)) for part in at)
     unknowns = np.eye(count + size * free, dtype=bool)
     reached = unknowns[count:] if free else np.zeros((size, count), dtype=bool)
-    given = np.concatenate([np.zeros((forces, len(unknowns)), dtype=bool), unknowns[:count]])
-    given[:forces, list(forcing_parameters)] = True
+    driven = np.zeros((forces, len(unknowns)), dtype=bool)
+    driven[:, list(forcing_parameters)] = True
     for _ in range(size):  # an effect reaches the last state after at most `size` samples
-        reached = reached | (leaves @ np.concatenate([reached, given]))[:size]
-    acting, panels = (leaves @ np.concatenate([reached, given]))[size:], []
+        reached = reached | (leaves @ np.concatenate([driven, reached, unknowns[:count]]))[:size]
+    acting, panels = (leaves @ np.concatenate([driven, reached, unknowns[:count]]))[size:], []
     first_late = max(count, *(np.flatnonzero(reached[: CHANNELS["attitude"]].any(axis=0)) + 1).tolist())
     for row, outputs in enumerate(tuple(np.flatnonzero(column).tolist()) for column in acting.T):
         top, _, before = panels[-1] if panels else (row, row, ())
