@@ -12,7 +12,7 @@ from disturbances import joint_cost, sample
 import jaxos4
 from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.flight import RATES
-from jaxos4.identification.vehicle import prepare_vehicle
+from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.logs.sampling import PARTS
 from jaxos4.shooting import InnovationsProblem, pad_flight

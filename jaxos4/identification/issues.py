@@ -17,6 +17,7 @@ from ..recording.checks import Finding
 from ..results import meaning
 from .answers import Answer, VehicleAnswer, dominated
 from .data import Data
+from .fit import is_white, moved
 from .intervals import consequences
 from .issues_of_values import ALL_INERTIAS, issues_of_alphas, issues_of_iz, issues_of_values
 from .results import (
@@ -29,7 +30,6 @@ from .results import (
     SampleTime,
     VehicleIdentification,
 )
-from .sample_time import is_white, moved
 from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_BODY, Issue, Move, Moves
 
 # s; with less fitted data, moments of inertia have a reservation; with less than half of it, they are not identified.

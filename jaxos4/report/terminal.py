@@ -11,8 +11,8 @@ from ..estimators import ESTIMATORS
 from ..flight import SIGNALS, UNITS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
-from ..identification.physical import PhysicalQuantity, physical_quantities, possible
 from ..identification.results import COLOURED, Constant, Identification, OS4Identification, VehicleIdentification
+from ..identification.tables import PhysicalQuantity, physical_quantities, possible
 from ..identification.verdict import (
     CONTRADICTED,
     IDENTIFIED,

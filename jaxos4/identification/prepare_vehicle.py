@@ -21,7 +21,7 @@ from ..recording.voltage import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, input_innovations, lagged
 from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions
-from .problem import Intervals, bracket_of
+from .prepare_os4 import Intervals, bracket_of
 
 SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
 RECORDINGS = 4  # twice this many or more have more segments
