@@ -15,20 +15,19 @@ from ..shooting import LocalModel, Stage, WindowUnknowns
 from .bisection import Brackets, Directions, Flag, PerDirection
 from .solver import AbstractSolver, Found, before_shots, chosen
 
-# Settings of the search. Steps are in standard deviations, scaled like those of `tolerance`.
-_COARSE = 0.5  # every stage except the last ends when the minimum is at most this far away
+# All lengths are in standard deviations of the estimate, which grow with the misfit, see `tolerance`.
+_COARSE = 0.5  # a stage other than the last ends once the minimum is this close
 _OPENING = 4.0  # the longest step of a stage's first sweep, in standard deviations of the stage's start
-_NARROW = 0.05  # half-width of a stage's first brackets, as a share of `_OPENING`
-_SAFETY = 2.0  # half-width of later brackets, in relative errors of the last predictions
-_MIN_WIDTH = 0.01  # smallest half-width of later brackets, as a share of the longest step; the largest is that step
-_WIDENING, _MAX_WIDENING = 4.0, 256.0  # of the next bracket, repeated while the last shot is at an end
-_KEPT_RISE = 1.0  # the largest rise of the cost in a sweep that is kept
-_RETREAT, _ADVANCE = 0.25, 1.4  # factors of the longest step, after a sweep that was not kept and after any other
-# The slopes of unknowns with a stride are inexact, so the search also ends after a sweep whose predicted steps are at
-# most this long, if it lowered the cost by at most this gain.
+_NARROW = 0.05  # half-width of a stage's first brackets, relative to that longest step
+_SAFETY = 2.0  # half-width of later brackets, relative to the error of the last prediction
+_MIN_WIDTH = 0.01  # smallest half-width of later brackets, relative to the longest predicted step, which is the largest
+_WIDENING, _MAX_WIDENING = 4.0, 256.0  # growth of a bracket each time its last shot was at an end, and in total
+_KEPT_RISE = 1.0  # a sweep that raises the cost by more is undone
+_RETREAT, _ADVANCE = 0.25, 1.4  # growth of the longest step after a sweep that was undone, and after any other
+# Unknowns with a stride have inexact slopes. A search with such unknowns also ends after a sweep that lowered the cost
+# by at most `_SMALL_GAIN`, if its predicted steps were at most `_SHORT_STEP`.
 _SHORT_STEP, _SMALL_GAIN = 0.3, 1e-4
-_DAMPING = 0.1  # added information in 1/stride^2: unknowns with a stride have inexact information
-
+_DAMPING = 0.1  # information that is added for unknowns with a stride, in 1/stride^2: theirs is inexact too
 
 # The shots of a sweep: the brackets after them, unknowns and local model of the last one, their number, and whether the
 # minimum is near.

@@ -28,10 +28,10 @@ from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
 from .filters import InputGains, Point, Segmented, innovate
 from .gains import INSTANT, LogNoise, Observed, Window
+from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, levels, own_names, with_noise
 from .problem import ShootingProblem
 from .scans import with_tangents
-from .segments import Segments, observe_in_segments
 from .sums import Innovations, joined, placed
 
 SETTLING = 128
@@ -205,7 +205,7 @@ class InnovationsProblem(AbstractProblem):
     def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "channels own"]:
         return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
 
-    def _of_inputs(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "3 channels feedthroughs"]:
+    def _input_unknowns(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "3 channels feedthroughs"]:
         """The gains of input innovations on rate and disturbance, then the feedthroughs."""
         own = self._of_channels(unknowns)[:, self._levels :]
         return jnp.moveaxis(own.reshape(len(own), 3, self.input_innovations.shape[-2]), 1, 0)
@@ -222,7 +222,7 @@ class InnovationsProblem(AbstractProblem):
         is_known = ~jnp.isnan(self.noise_feedthrough).any()
 
         def at(stage: Count | int, before: WindowUnknowns) -> Stage:
-            found = jnp.where(is_known, self.noise_feedthrough, self._of_inputs(before[0])[2])
+            found = jnp.where(is_known, self.noise_feedthrough, self._input_unknowns(before[0])[2])
             noise_feedthrough = jnp.where(is_known | (stage > 0), found, 0.0)
             return Stage(
                 unknowns=unknowns,
@@ -248,7 +248,7 @@ class InnovationsProblem(AbstractProblem):
 
         def at(noise_feedthrough: Float[Array, "channels feedthroughs"], row: WindowUnknowns) -> LocalModel:
             values = row[0]
-            found = innovations(values[:count], self.noise(values), self._of_inputs(values), noise_feedthrough)
+            found = innovations(values[:count], self.noise(values), self._input_unknowns(values), noise_feedthrough)
             shared = found.gradient.shape[1] - len(self._own)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, shared)
             if places is not None:
@@ -272,16 +272,19 @@ class InnovationsProblem(AbstractProblem):
         return observe_in_segments(self.problem, self.segmentation, self.settling)
 
     def innovations(
-        self, parameters: Parameters, noise: LogNoise, by_input: Float[Array, "3 channels feedthroughs"] | None = None
+        self,
+        parameters: Parameters,
+        noise: LogNoise,
+        input_unknowns: Float[Array, "3 channels feedthroughs"] | None = None,
     ) -> Innovations:
         """The innovations of all segments, with derivatives in the parameters of the segment's recording.
 
-        `by_input`: the gains of input innovations on rate and disturbance, and the feedthroughs; by default 0.
+        `input_unknowns`: the gains of input innovations on rate and disturbance, and the feedthroughs; by default 0.
         """
         nothing = jnp.zeros((3, self.problem.columns.size, self.input_innovations.shape[-2]))
-        by_input = nothing if by_input is None else by_input
+        input_unknowns = nothing if input_unknowns is None else input_unknowns
         noise_feedthrough = jnp.nan_to_num(self.noise_feedthrough)
-        return self._innovations()(parameters, noise, by_input, noise_feedthrough)
+        return self._innovations()(parameters, noise, input_unknowns, noise_feedthrough)
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
         """`innovations` for a loop: everything that does not depend on parameters and noise is computed once."""
@@ -295,11 +298,11 @@ class InnovationsProblem(AbstractProblem):
         fixed = self.segmentation.rows, self.flight.dt, self.window
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
-        def at(parameters: Parameters, noise: LogNoise, by_input: Array, noise_feedthrough: Array) -> Innovations:
+        def at(parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
             flight = Segmented(observed, inputs, forcing, tangents, *fixed)
-            driven, disturbance, feedthrough = (tuple(each.T) for each in by_input)
+            driven, disturbance, feedthrough = (tuple(each.T) for each in input_unknowns)
             gains = InputGains(driven, disturbance)
             point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), gains)
             return innovate(functions, model.forcing_parameters, flight, point)

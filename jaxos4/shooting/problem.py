@@ -28,18 +28,8 @@ from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stage, Stages, Unknowns, WindowUnknowns
-from .scans import (
-    Length,
-    Rows,
-    each_window,
-    first_measured,
-    predict_window,
-    shoot,
-    shot_with_derivatives,
-    window_samples,
-    windowed,
-    with_tangents,
-)
+from .layout import each_window, first_measured, window_samples, windowed
+from .scans import Length, Rows, predict_window, shoot, shot_with_derivatives, with_tangents
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
 ROUNDING = 64.0

@@ -7,26 +7,30 @@ inside a scan are scalars of a lane, because stacking them in every step is slow
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Count, InitialState, Numeric, Parameters, Scalar
+from .._custom_types import Count, InitialState, Parameters, Scalar
 from ..batching import computed_once, in_blocks, with_batch
-from ..models.state import Forcing, State, Translation, unstack
+from ..models.state import CHANNELS, Forcing, State, Translation, unstack
 from .abstract import LocalModel, Shot
-from .sparsity import Panel, panels_of, symmetric
 
 # rad/s; no quadrotor reaches this body rate and no gyro measures it, so a faster trajectory has diverged.
 FASTEST = 1e3
 
+# Rows of the information that are summed together, without the columns to the right of their diagonal block.
+_ROWS = 4
+# The first row, the row after the last, and the outputs on which the unknowns of these rows act.
+Panel = tuple[int, int, tuple[int, ...]]
+
 # Returns the state one sample later and the output of noise-free sensors, from the forcing, a state and the parameters.
 Advance = Callable[[Forcing, State, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
-Series = TypeVar("Series", Forcing, tuple[Array, ...])
 # One value, or one for each lane of a batch.
 Lanes = Float[Array, "*#lanes"]
 # The number of rows that count in a padded flight. It is data and not a shape, so that flights of different lengths
@@ -308,37 +312,49 @@ def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
 
 
-def window_samples(
-    samples: int, windows: int
-) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-    """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
-    ends = np.arange(windows + 1) * samples // windows
-    index = ends[:-1, None] + np.arange(np.diff(ends).max())
-    within = index < ends[1:, None]
-    return np.where(within, index, ends[1:, None] - 1), within
+def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results arguments"]:
+    """Which leaves of a function's result depend on which arguments. An inner function counts as one operation."""
+    program = jax.make_jaxpr(function)(*arguments).jaxpr
+    nothing = np.zeros(len(program.invars), dtype=bool)
+    known = dict(zip(program.invars, np.eye(nothing.size, dtype=bool), strict=True))
+
+    def sources(variables: list) -> np.ndarray:
+        return np.any([nothing, *(known.get(v, nothing) for v in variables if not isinstance(v, Literal))], axis=0)
+
+    for equation in program.eqns:
+        known |= dict.fromkeys(equation.outvars, sources(equation.invars))
+    return np.array([sources([v]) for v in program.outvars])
 
 
-def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
-    """The series of each window, from the series of the flight. Windows of equal length need no copy."""
+def panels_of(
+    advance: Callable, at: tuple[Any, Any, tuple], forcing_parameters: tuple[int, ...], *, free: bool
+) -> tuple[int, list[Panel]]:
+    """The index after the last unknown that acts on rates or attitude, and the panels of all rows.
 
-    def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:
-        return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
+    - `advance`: returns the next state and the outputs, from the forcing, a state and the parameters, which are `at`.
+    - `free`: whether the initial state is unknown too. Its leaves then follow the parameters.
+    """
+    leaves = dependence(advance, *at)
+    forces, size, count = (len(jax.tree.leaves(part)) for part in at)
+    unknowns = np.eye(count + size * free, dtype=bool)
+    reached = unknowns[count:] if free else np.zeros((size, count), dtype=bool)
+    driven = np.zeros((forces, len(unknowns)), dtype=bool)
+    driven[:, list(forcing_parameters)] = True
+    for _ in range(size):  # an effect reaches the last state after at most `size` samples
+        reached = reached | (leaves @ np.concatenate([driven, reached, unknowns[:count]]))[:size]
+    acting, panels = (leaves @ np.concatenate([driven, reached, unknowns[:count]]))[size:], []
+    first_late = max(count, *(np.flatnonzero(reached[: CHANNELS["attitude"]].any(axis=0)) + 1).tolist())
+    for row, outputs in enumerate(tuple(np.flatnonzero(column).tolist()) for column in acting.T):
+        top, _, before = panels[-1] if panels else (row, row, ())
+        joined = before == outputs and row - top < _ROWS and row != first_late
+        panels = [*panels[:-1], (top, row + 1, outputs)] if joined else [*panels, (row, row + 1, outputs)]
+    return first_late, panels
 
-    return jax.tree.map(rows, series)
 
-
-def each_window(function: Callable, *arguments: Any) -> Any:
-    """`function` for each window. A single window needs no `vmap`, which takes long to trace."""
-    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
-        return jax.vmap(function)(*arguments)
-    only = jax.tree.map(lambda leaf: leaf[0], arguments)
-    return jax.tree.map(lambda leaf: leaf[None], function(*only))
-
-
-def first_measured(
-    measured: Float[Array, "windows length columns"],
-) -> tuple[Float[Array, "windows columns"], Bool[Array, "windows columns"]]:
-    """The first measurement of each window, or 0 if there is none; and whether it was made at the first sample."""
-    first = jnp.argmin(jnp.isnan(measured), axis=1)
-    value = jnp.take_along_axis(measured, first[:, None], axis=1)[:, 0]
-    return jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)
+def symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *lanes"]:
+    """The symmetric matrix from panels of its rows, which end with their diagonal blocks."""
+    size, lanes = panels[-1].shape[1], panels[0].ndim - 2
+    filled = [jnp.pad(panel, ((0, 0), (0, size - panel.shape[1]), *((0, 0),) * lanes)) for panel in panels]
+    lower = jnp.concatenate(filled)
+    below = np.tri(size, dtype=bool).reshape(size, size, *(1,) * lanes)
+    return jnp.where(below, lower, jnp.swapaxes(lower, 0, 1))
