@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar
 from ..bracket import Bracket
-from ..estimate import AbstractEstimator, Estimate, estimate_at
+from ..estimate import AbstractEstimator, Estimate, as_estimate
+from ..linalg import covariance_of_shared
 from ..shooting import AbstractProblem, LocalModel, Stage, Stages, WindowUnknowns, in_blocks
 
 State = TypeVar("State")
@@ -131,7 +132,20 @@ def solve(
 
     # One loop, so that the search is compiled once for all starts and stages.
     end = jax.lax.fori_loop(0, count + stages.number - 1 - number, search, begin)
-    return estimate_at(problem, end.unknowns, end.model, end.rollouts, end.steps, done=end.done, reach=solver.reach)
+    shared = problem.unknowns.count
+    return as_estimate(
+        problem,
+        parameters=end.unknowns[0, :shared],
+        covariance=covariance_of_shared(end.model.information, shared),
+        initial_state=jnp.concatenate([problem.initial_guess.known, end.unknowns[:, shared:]], axis=1).ravel(),
+        cost=end.model.cost.sum(),
+        rollouts=end.rollouts,
+        sweeps=end.steps,
+        feasible=end.model.feasible.all(),
+        done=end.done,
+        reach=solver.reach,
+        parts=end.model.parts,
+    )
 
 
 def before_search(

@@ -134,8 +134,8 @@ def _issues_of_search(search: str, quantities: Iterable[str]) -> Iterator[Issue]
 
 def _issues_of_limits(answer: Answer) -> Iterator[Issue]:
     """Parameters that ended at their limit, and the quantities that depend on them."""
-    model, own, values = answer.problem.model, answer.problem.unknowns, np.asarray(answer.estimate.parameters)
-    off = np.abs(values[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
+    model, own, values = answer.problem.model, answer.problem.unknowns, answer.parameters
+    off = np.abs(values - np.asarray(own.center)) / np.asarray(own.half_width)
     for i in (place for place in answer.free if off[place] > 0.99 * REACH):
         concerned = dict.fromkeys(model_quantities(model, own.names[i]))
         cause = f"{own.names[i]} = {values[i]:.3g} {own.units[i]} is at the limit of the search around its bracket"

@@ -29,7 +29,7 @@ from ..models.flight_model import without_recording
 from ..models.state import CASCADE_ORDER
 from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
-from ..shooting import ShootingProblem, padded, with_room
+from ..shooting import ShootingProblem, padded, with_capacity
 from ..shooting.gains import LogNoise
 from .answers import (
     UNIT,
@@ -185,8 +185,7 @@ def judge_vehicle(
         of_yaw = {YAW.coupling, YAW.inverse} & table.keys()
         table |= {name: msgspec.structs.replace(table[name], note=said) for name in of_yaw}
         still = (*still, *({YAW.motion} - {*still}))
-    values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
-    response = frequency_response(with_room(answer.problem, data.capacity), values)
+    response = frequency_response(with_capacity(answer.problem, data.capacity), as_float(answer.parameters))
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(answer, predicted)
     found = msgspec.structs.replace(
@@ -227,7 +226,6 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
     **Returns:** the answer's predictions at `HORIZONS`; its predictions in between, as trajectories; and the skill.
     """
     data, problem, names = answer.optimum.data, held_out.problem, answer.problem.unknowns.names
-    values = np.asarray(answer.estimate.parameters)[: len(names)]
 
     def predicted_by(values: np.ndarray, noise: LogNoise | None, horizons: tuple[float, ...] = HORIZONS) -> Predictions:
         parameters = values
@@ -239,10 +237,12 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
             known, _ = _disturbances(data, _together(data, held_out), parameters, noise)
         return predictions(problem, as_float(parameters), horizons=horizons, disturbance=known, noise=noise)
 
-    every = predicted_by(values, answer.optimum.noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
+    horizons = (*HORIZONS, *trajectory_horizons(float(problem.flight.dt)))
+    every = predicted_by(answer.parameters, answer.optimum.noise, horizons)
     predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
     own, fixed = skill(predicted), [name in answer.fixed for name in names]
-    regressed = np.asarray(_regressed(with_room(answer.problem, data.capacity), as_float(values), np.asarray(fixed)))
+    padded_problem, fitted = with_capacity(answer.problem, data.capacity), as_float(answer.parameters)
+    regressed = np.asarray(_regressed(padded_problem, fitted, np.asarray(fixed)))
     compared = skill(predicted_by(regressed, None))
     tables = (own.skill, own.std, own.rmse, own.persistence, compared.skill)
     rates = {
@@ -269,7 +269,7 @@ def _disturbances(
     its prediction from the sample before. The model is evaluated at the measured rates.
     """
     samples = problem.flight.time.shape[0]
-    problem = with_room(problem, max(samples, data.capacity))
+    problem = with_capacity(problem, max(samples, data.capacity))
     flight, rates = problem.flight, np.asarray(problem.flight.states)[:, RATES]
     modelled = np.pad(modelled_acceleration(problem, as_float(parameters)), ((0, 1), (0, 0)))
     of_rates = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
@@ -285,8 +285,7 @@ def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tupl
     optimum, data = answer.optimum, answer.optimum.data
     other = data.held_out
     problem = answer.problem if other is None or other.recording is not None else _together(data, other)
-    values = np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count]
-    disturbance, innovation = _disturbances(data, problem, values, optimum.noise)
+    disturbance, innovation = _disturbances(data, problem, answer.parameters, optimum.noise)
     flight = answer.problem.flight
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
     position = position_of(np.asarray(problem.flight.states, float))

@@ -88,9 +88,9 @@ class Unknowns(eqx.Module):
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
         """The same unknowns, some fixed at values. Raises `ValueError` for an unknown name, or if none remains free."""
-        strangers = [name for name in values if name not in self.names]
-        if strangers:
-            raise ValueError(f"`values`: {strangers[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
+        unknown = [name for name in values if name not in self.names]
+        if unknown:
+            raise ValueError(f"`values`: {unknown[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
         fixed = np.isin(self.names, list(values))
         if fixed.all() or not (isinstance(self.free, Tracer) or (np.asarray(self.free) & ~fixed).any()):
             raise ValueError("`values` holds every unknown that is still free; leave at least one.")

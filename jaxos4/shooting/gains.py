@@ -36,14 +36,9 @@ _NODES = 8
 _NO_FILTER = 1e-9
 
 
-class Window(NamedTuple):
-    """The part of a sample over which a measurement is averaged: from `begin` on, for `length` [s]; 0: an instant."""
-
-    begin: Scalar | float = 0.0
-    length: Scalar | float = 0.0
-
-
-INSTANT = Window()
+# The part of a sample over which a measurement is averaged: beginning and length [s]; a length of 0: an instant.
+Window = tuple[Scalar | float, Scalar | float]
+INSTANT: Window = (0.0, 0.0)
 """A measurement at the beginning of its sample."""
 
 
@@ -188,14 +183,15 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     rate = is_rate(tau)
     # `strength` is the standard deviation of a force; its disturbance has a larger one.
     drive = jnp.where(rate, variance, variance * (tau + fast) / tau)
-    begin, end = jnp.asarray(window.begin, dtype=float), jnp.asarray(window.begin + window.length, dtype=float)
-    long = jnp.where(window.length > 0, window.length, 1.0)
+    begin, length = window
+    begin, end = jnp.asarray(begin, dtype=float), jnp.asarray(begin + length, dtype=float)
+    long = jnp.where(length > 0, length, 1.0)
 
     def measured(time: Array) -> Array:
         """The change of the measurement for a unit of d at this time of the sample."""
         until_begin, until_end = jnp.maximum(begin - time, 0.0), jnp.maximum(end - time, 0.0)
         mean = (response.driven_sum(until_end) - response.driven_sum(until_begin)) / long
-        return jnp.where(window.length > 0, mean, response.driven(until_begin))
+        return jnp.where(length > 0, mean, response.driven(until_begin))
 
     # The parts of the sample before, in and after the window, and the nodes of a quadrature in each.
     edges = jnp.stack(jnp.broadcast_arrays(jnp.zeros_like(begin), begin, end, dt))
@@ -207,7 +203,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     products = x * x, x * d, d * d, m * m, m * x, m * d
     x_x, x_d, d_d, m_m, m_x, m_d = ((share * each).sum(axis=0) for each in products)
     # The mean over the window of the share of x that remains. It is finite for every filter.
-    in_window = jnp.where(window.length > 0, window.length, 0.0) / fast
+    in_window = jnp.where(length > 0, length, 0.0) / fast
     mean = jnp.where(in_window > 0, -jnp.expm1(-in_window) / jnp.where(in_window > 0, in_window, 1.0), 1.0)
     force = jnp.where(rate, 0.0, variance)
     return Step(
@@ -276,15 +272,10 @@ def basis(unknowns: T) -> T:
     return tree.unflatten([np.multiply.outer(row, np.ones(leaf.shape)) for row, leaf in rows])
 
 
-class InputGains(NamedTuple):
-    """The change of the estimates at the end of a sample for a unit of each input innovation, by feedthrough.
-
-    - `driven`: to the rate [rad/s], or to the force besides the model's [m/s^2].
-    - `disturbance`: to the disturbance [rad/s^2], or [m/s^2].
-    """
-
-    driven: tuple[Float[Array, " channels *segments"], ...]
-    disturbance: tuple[Float[Array, " channels *segments"], ...]
+# The changes of the estimates at the end of a sample for a unit of each input innovation: of the rate [rad/s], or the
+# force besides the model's [m/s^2]; and of the disturbance [rad/s^2], or [m/s^2].
+OfInputs = tuple[Float[Array, " channels *segments"], ...]
+InputGains = tuple[OfInputs, OfInputs]
 
 
 class Feedback(NamedTuple):

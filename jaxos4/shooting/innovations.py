@@ -26,7 +26,7 @@ from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
-from .filters import InputGains, Point, Segmented, innovate
+from .filters import Point, Segmented, innovate
 from .gains import INSTANT, LogNoise, Observed, Window
 from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, levels, own_names, with_noise
@@ -134,21 +134,21 @@ class InnovationsProblem(AbstractProblem):
         if self.flight.within is None:
             return INSTANT
         length = self.flight.averaging_time
-        return Window((self.flight.dt - length) / 2, length)
+        return (self.flight.dt - length) / 2, length
 
     @property
     def segmentation(self) -> Segments:
         """The samples of each segment."""
-        room, length, each = self.flight.time.shape[0], self.problem.length, self._by_recording
+        capacity, length, each = self.flight.time.shape[0], self.problem.length, self._by_recording
         begins = np.zeros(1, int)
         if each is not None:
             numpy = np if isinstance(each.number, np.ndarray) else jnp
             begins = numpy.searchsorted(each.number, np.arange(len(each.places)))
         if isinstance(length, Tracer) or isinstance(begins, jax.Array):
-            edges = jnp.append(jnp.asarray(begins), room if length is None else length)
+            edges = jnp.append(jnp.asarray(begins), capacity if length is None else length)
         else:  # known numbers need no compiled program
-            edges = np.append(begins, room if length is None else int(length))
-        return Segments.of(self.segments, room, edges, self.settling)
+            edges = np.append(begins, capacity if length is None else int(length))
+        return Segments.of(self.segments, capacity, edges, self.settling)
 
     @property
     def _by_recording(self) -> ByRecording | None:
@@ -303,8 +303,7 @@ class InnovationsProblem(AbstractProblem):
             own = parameters if places is None else parameters[places]
             flight = Segmented(observed, inputs, forcing, tangents, *fixed)
             driven, disturbance, feedthrough = (tuple(each.T) for each in input_unknowns)
-            gains = InputGains(driven, disturbance)
-            point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), gains)
+            point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), (driven, disturbance))
             return innovate(functions, model.forcing_parameters, flight, point)
 
         return at

@@ -156,10 +156,10 @@ def padded(problem: "ShootingProblem") -> "ShootingProblem":
     capacity = capacity_of(samples)
     if capacity == samples or problem.windows > 1 or problem.length is not None:
         return problem
-    return with_room(problem, capacity)
+    return with_capacity(problem, capacity)
 
 
-def with_room(problem: "ShootingProblem", capacity: int) -> "ShootingProblem":
+def with_capacity(problem: "ShootingProblem", capacity: int) -> "ShootingProblem":
     """The problem in one window, with a flight that is padded to `capacity` samples."""
     length = jax.device_put(np.asarray(problem.flight.time.shape[0]))
     return dataclasses.replace(problem, flight=pad_flight(problem.flight, capacity), windows=1, length=length)
