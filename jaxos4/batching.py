@@ -26,38 +26,39 @@ _BLOCK = 16
 _CHUNK = 4 * _BLOCK
 
 
-def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
-    """`function(*arguments)`, of which `jax.vmap` computes a batch by `of_batch`.
+def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *first: Any) -> Callable:
+    """`function` with its `first` arguments, as a function of the others: arrays. `of_batch` computes it in `jax.vmap`.
 
-    `of_batch` takes the number of lanes, the arguments that differ between lanes, with the lanes first, and those that
+    `of_batch` takes the number of lanes, all arguments that differ between lanes, with the lanes first, and those that
     they share, each `None` in the place of the other. It returns the results with the lanes first. Derivatives are
     those of `function`, of a batch too.
     """
-    arrays, settings = eqx.partition(arguments, eqx.is_array)
+    arrays, settings = eqx.partition(first, eqx.is_array)
 
     @custom_vmap
-    def one(arrays: Any) -> Any:
+    def one(arrays: Any, *others: Any) -> Any:
         # The context in which a batch is traced, so that JAX finds again what `jax.jit` has traced here.
         with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
-            return function(*eqx.combine(arrays, settings))
+            return function(*eqx.combine(arrays, settings), *others)
 
     # Traced once, although JAX asks several times for the batch of what stands in a loop.
     @functools.partial(jax.jit, static_argnums=0, inline=True)
     def together(lanes: int, many: Any, shared: Any) -> Any:
-        return of_batch(lanes, many, eqx.combine(shared, settings))
+        (own, *others), (same, *common) = many, shared
+        return of_batch(lanes, (*own, *others), (*eqx.combine(same, settings), *common))
 
     differentiable = jax.custom_jvp(one)
 
     @differentiable.defjvp
     def derivative(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(lambda arrays: function(*eqx.combine(arrays, settings)), primals, tangents)
+        return jax.jvp(lambda arrays, *others: function(*eqx.combine(arrays, settings), *others), primals, tangents)
 
     @one.def_vmap
-    def batch(lanes: int, is_batched: list, arrays: Any) -> tuple[Any, Any]:
-        out = together(lanes, *eqx.partition(arrays, is_batched[0]))
+    def batch(lanes: int, is_batched: list, *arguments: Any) -> tuple[Any, Any]:
+        out = together(lanes, *eqx.partition(arguments, tuple(is_batched)))
         return out, jax.tree.map(lambda _: True, out)
 
-    return differentiable(arrays)
+    return functools.partial(differentiable, arrays)
 
 
 def in_blocks(function: Callable, *arguments: Any) -> Any:
@@ -88,7 +89,7 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
         out = jax.lax.map(block, jax.tree.map(cut, many))
         return jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
 
-    return with_batch(one, of_batch, arrays)
+    return with_batch(one, of_batch, arrays)()
 
 
 def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) -> Any:

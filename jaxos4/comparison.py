@@ -11,8 +11,8 @@ from .airframe import INERTIAS
 from .errors import InputError, printable
 from .identification.answers import UNIT
 from .identification.next_flight import next_flight, pooled_statuses
-from .identification.physical import PhysicalQuantity, physical_quantities
 from .identification.results import Identification
+from .identification.tables import PhysicalQuantity, physical_quantities
 from .identification.verdict import IDENTIFIED, RESERVED, STATUSES, pooled_status
 from .result_file import read_result
 from .results import NINETY_FIVE

@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar
 from .bracket import NO_PRIOR, Bracket
-from .linalg import covariance_of_shared, invert
+from .linalg import invert
 from .results import RESULTS
-from .shooting import AbstractProblem, LocalModel, Parts, ShootingProblem, WindowUnknowns, in_blocks
+from .shooting import AbstractProblem, Parts, ShootingProblem, in_blocks
 
 REACH = 4.0  # how many half-widths an answer may lie away from the center of its bracket
 # Gauss-Newton steps to an initial state, with the parameters known: the trajectory is nearly linear in that state.
@@ -140,33 +140,6 @@ def as_estimate(
         result=result,
         history=None if history is None else jnp.where(answered, history, center),
         **more,
-    )
-
-
-def estimate_at(
-    problem: AbstractProblem,
-    x: WindowUnknowns,
-    model: LocalModel,
-    rollouts: Int[Array, ""],
-    sweeps: Int[Array, ""],
-    *,
-    done: Bool[Array, ""],
-    reach: Scalar | float = REACH,
-) -> Estimate:
-    """`as_estimate` of a search that ended at the unknowns `x`, where the cost has this local model."""
-    count = problem.unknowns.count
-    return as_estimate(
-        problem,
-        parameters=x[0, :count],
-        covariance=covariance_of_shared(model.information, count),
-        initial_state=jnp.concatenate([problem.initial_guess.known, x[:, count:]], axis=1).ravel(),
-        cost=model.cost.sum(),
-        rollouts=rollouts,
-        sweeps=sweeps,
-        feasible=model.feasible.all(),
-        done=done,
-        reach=reach,
-        parts=model.parts,
     )
 
 

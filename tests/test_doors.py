@@ -27,7 +27,7 @@ from jaxos4.airframe import load_airframe
 from jaxos4.errors import InputError
 from jaxos4.export import TARGETS, export_vehicle, read_result
 from jaxos4.forecast import vehicle_of
-from jaxos4.identification.problem import bracket_of
+from jaxos4.identification.prepare_os4 import bracket_of
 from jaxos4.logs import read_log
 from jaxos4.models import MODELS
 from jaxos4.networks.file import load_network

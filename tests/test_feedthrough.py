@@ -11,7 +11,7 @@ import pytest
 import jaxos4
 from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.closed_loop import fly_standard
-from jaxos4.identification.vehicle import prepare_vehicle
+from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.feedthrough import FEEDTHROUGHS, input_innovations, lagged

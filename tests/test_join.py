@@ -17,7 +17,7 @@ from jaxos4.logs.sampling import averages
 from jaxos4.recording import Recording
 from jaxos4.recording.stretches import Stretch, cut
 from jaxos4.recording.windows import averaged, concatenate, hold_out
-from jaxos4.shooting.segments import pad_flight
+from jaxos4.shooting.layout import pad_flight
 
 
 def stretch(samples, seed, *, force=False, velocity=False, voltage=False, dt=0.01, start=0.0):

@@ -12,11 +12,11 @@ from disturbances import joint_cost, sample
 import jaxos4
 from experiments.sample_times.run import VEHICLE as CINERAT
 from jaxos4.flight import RATES
-from jaxos4.identification.vehicle import prepare_vehicle
+from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.logs.sampling import PARTS
 from jaxos4.shooting import InnovationsProblem, pad_flight
-from jaxos4.shooting.gains import LogNoise, Window, step_of
+from jaxos4.shooting.gains import LogNoise, step_of
 
 # The filters.
 
@@ -32,7 +32,7 @@ def test_a_sample_has_the_covariance_of_state_disturbance_and_measurement(begin,
     dt, strength = 0.01, 3.0
     begin, length = begin * dt, length * dt
     noise = LogNoise(*(jnp.full(4, np.log(x)) for x in (strength, tau, 0.1, smoothing)))
-    found = one_step(noise, jnp.asarray(dt), Window(begin, length))
+    found = one_step(noise, jnp.asarray(dt), (begin, length))
     for channel, own in ((0, None), (3, smoothing)):
         total, added = sample(dt, tau, begin, length, own)
         drive = strength**2 * (1.0 if own is None else (tau + own) / tau)

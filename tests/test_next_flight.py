@@ -7,7 +7,7 @@ from synthetic_identification import identified_flight, identified_vehicle
 
 from jaxos4.identification.next_flight import next_flight, spreads_of
 from jaxos4.identification.results import Constant, RigidBody
-from jaxos4.identification.verdict import RESERVATION, RESERVED, Issue, Quantity, Verdict, judge
+from jaxos4.identification.verdict import RESERVATION, RESERVED, Issue, Quantity, Verdict, verdicts_of
 from jaxos4.report import write_flight_page
 
 HALF = {"Ix": 0.16, "Iy": 0.05, "Iz": 0.64}
@@ -16,7 +16,7 @@ HALF = {"Ix": 0.16, "Iy": 0.05, "Iz": 0.64}
 def vehicle(half=HALF, issues=(), seconds=32.0):
     """A vehicle whose moments of inertia are known to these shares, with verdicts to match."""
     constants = {name: Constant(1e-5, 1e-5 * each / 1.959963984540054, "kg m^2") for name, each in half.items()}
-    verdicts = judge({name: Quantity("", each) for name, each in half.items()}, issues)
+    verdicts = verdicts_of({name: Quantity("", each) for name, each in half.items()}, issues)
     about = {"verdicts": verdicts, "issues": tuple(issues), "provenance": {"fitted_seconds": seconds}}
     return identified_vehicle(rigid_body=RigidBody(constants), **about)
 

@@ -10,7 +10,7 @@ from helpers import CRAZYFLIE
 import jaxos4
 from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.gains import LogNoise
-from jaxos4.shooting.segments import Segments
+from jaxos4.shooting.layout import Segments
 
 SETTLING, LENGTHS = 30, (200, 330, 100)
 NOISE = LogNoise(*(jnp.log(jnp.full(3, x)) for x in (5.0, 0.1, 0.02)))

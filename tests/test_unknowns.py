@@ -36,7 +36,7 @@ def test_information_about_held_unknowns_is_left_out(kind):
     held = free.hold(
         {name: float(value) for name, value in zip(HELD, free.unknowns.center[np.array(PLACES)], strict=True)}
     )
-    model_at = eqx.filter_jit(lambda problem, at: problem.stages().local_model(jnp.asarray(0), at, at))
+    model_at = eqx.filter_jit(lambda problem, at: problem.stages().at(0, at).local_model(at))
     at = eqx.filter_jit(lambda problem: problem.initial_guess.starts[0])(free)
     whole, part = (jax.tree.map(np.asarray, model_at(problem, at)) for problem in (free, held))
     others = np.delete(np.arange(free.unknowns.count), PLACES)

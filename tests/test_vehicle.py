@@ -12,11 +12,11 @@ from lanes import names
 
 import jaxos4
 from jaxos4.identification import intervals
-from jaxos4.identification.checks import judge_vehicle
 from jaxos4.identification.data import Clock, Data
+from jaxos4.identification.fit import sample_time_of
 from jaxos4.identification.intervals import at_lowest, corrected
+from jaxos4.identification.judge import judge_vehicle
 from jaxos4.identification.results import Provenance
-from jaxos4.identification.sample_time import sample_time_of
 from jaxos4.identification.search import search
 from jaxos4.networks import estimator as networks
 from jaxos4.results import NINETY_FIVE

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import answers, intervals, vehicle
+from jaxos4.identification import answers, intervals, prepare_vehicle as preparation
 from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.fit import chosen_place, moved, sample_time_of, search_sample_times
 from jaxos4.identification.intervals import corrected
+from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
-from jaxos4.identification.sample_time import chosen_place, moved, sample_time_of, search_sample_times
 from jaxos4.identification.search import USUAL_DELAY_OF_COMMANDS, _lowest_in_delay
-from jaxos4.identification.vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
 from jaxos4.recording.prepared import finest, prepare
@@ -143,7 +143,7 @@ def chosen():
         patch.setattr(intervals, "WELL_KNOWN", 0.0)
         patch.setattr(answers, "NOTED", 1.002)
         # Samples of commands at all sample times hold answers of the controller, so that all are compared.
-        patch.setattr(vehicle, "UNANSWERED", 0.0)
+        patch.setattr(preparation, "UNANSWERED", 0.0)
         with compiled_programs() as programs:
             rule = identified()
         given = {place: identified(sample_time=rule.sample_times[place].sample_time) for place in (0, 2)}

@@ -15,15 +15,15 @@ from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification import verdict
 from jaxos4.identification.answers import vehicle_constants
-from jaxos4.identification.checks import judge_vehicle
 from jaxos4.identification.intervals import consequences, corrected
 from jaxos4.identification.issues import few_parts, issues_of_log, stronger_or_weaker
 from jaxos4.identification.issues_of_values import issues_of_values
+from jaxos4.identification.judge import judge_vehicle
+from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.identification.search import search
-from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, judge, reason_lines, result_of
+from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, reason_lines, result_of, verdicts_of
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -39,7 +39,7 @@ def flown(airframe=CRAZYFLIE, *, duration=20.0, seed=0, name="flight.csv", **loo
 
 
 def verdict_of(name, quantity, issues):
-    return judge({name: quantity}, issues)[name]
+    return verdicts_of({name: quantity}, issues)[name]
 
 
 @pytest.mark.parametrize(("share", "words"), [(0.004, "0.4 %"), (0.8149, "81 %"), (1.1, "110 %"), (10.0, "1000 %")])
@@ -95,7 +95,7 @@ def test_reservations_add_up_beside_an_impossible_parameter(moves, results, stat
         found = verdict_of("Ix", Quantity(), order)
         assert found.status == status
         assert verdict_of("Iy", Quantity(), order).status == IDENTIFIED
-    assert result_of(judge({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == result
+    assert result_of(verdicts_of({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == result
     assert status == RESERVED or len(found.reasons) == 2
 
 
@@ -140,14 +140,14 @@ def test_an_axis_that_answers_otherwise_than_the_model_has_a_reservation(ratio, 
 def test_a_reservation_that_moves_a_quantity_by_more_than_itself_contradicts_it(share, status):
     issues = [Issue(RESERVATION, "cause", "b", {"Ix": Move(share, 9.0)})]
     assert verdict_of("Ix", Quantity(), issues).status == status
-    assert result_of(judge({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == (
+    assert result_of(verdicts_of({"Ix": Quantity()}, issues), issues, "successful", ["Ix"]) == (
         "successful" if status == RESERVED else "implausible"
     )
 
 
 def test_a_quantity_is_not_identified_without_those_that_it_requires():
     unknown = Quantity(missing="it hardly rolls")
-    found = judge({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, [])
+    found = verdicts_of({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, [])
     assert found["damping"].status == MISSING
     assert found["damping"].reasons == ("it cannot be trusted without Ix",)
 
@@ -169,11 +169,11 @@ def test_predictions_reach_as_far_as_their_skill_is_clear():
 
 def test_the_result_is_that_of_what_was_asked():
     issues = [Issue("no_skill", "a", "b", {"predictions": None}), Issue("implausible", "c", "d", {"Ix": None})]
-    judged = judge(dict.fromkeys(("Ix", "Iy", "predictions"), Quantity()), issues)
+    judged = verdicts_of(dict.fromkeys(("Ix", "Iy", "predictions"), Quantity()), issues)
     assert result_of(judged, issues, "successful", ("Ix", "Iy")) == "implausible"
     assert result_of(judged, issues, "successful", ("Iy",)) == "successful"
     assert result_of(judged, issues, "successful", judged) == "no_skill"
-    vague = judge({"Ix": Quantity(spread=1.0)}, [])
+    vague = verdicts_of({"Ix": Quantity(spread=1.0)}, [])
     assert result_of(vague, [], "successful", ("Ix",)) == "unidentifiable"
     assert result_of(vague, [], "max_sweeps", ("Ix",)) == "max_sweeps"
 

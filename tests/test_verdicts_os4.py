@@ -14,8 +14,8 @@ from jaxos4.airframe import OS4
 from jaxos4.excitation import doublet, multisine
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification.issues_of_values import issues_of_alphas
-from jaxos4.identification.physical import physical_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, RigidBody
+from jaxos4.identification.tables import physical_quantities
 from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, RESERVED
 
 

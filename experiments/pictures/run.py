@@ -122,10 +122,10 @@ def sweep_widths(problem: jaxos4.ShootingProblem) -> np.ndarray:
     """Half-widths of the brackets as each sweep of IBSS opens them: of each parameter, sweep by sweep."""
     solver, count, widths = jaxos4.IBSS(), problem.unknowns.count, []
     stages = problem.stages(solver.shares)
-    stages = stages._replace(local_model=jax.jit(stages.local_model))
     found = before_search(problem, stages)
     for number in range(stages.number):
-        stage = stages.at(jnp.asarray(number), found.unknowns)
+        stage = stages.at(number, found.unknowns)
+        stage = stage._replace(local_model=jax.jit(stage.local_model))
         state = solver.init(stage, found)
         while not solver.terminate(stage, state):
             opened = (state.brackets.highest - state.brackets.lowest)[0] / 2

@@ -24,7 +24,7 @@ from experiments.fits import INERTIAS, identified
 from experiments.monte_carlo import Row, plus_minus, print_table, product, share, statistics, study
 from experiments.shared import Out
 from experiments.verdicts.run import FAR, SURE
-from jaxos4.identification.physical import physical_quantities
+from jaxos4.identification.tables import physical_quantities
 from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, MISSING, RESERVED
 from jaxos4.results import NINETY_FIVE
 

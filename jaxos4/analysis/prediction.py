@@ -150,7 +150,7 @@ def _predict(
         begin, later = (jax.tree.map(lambda leaf, part=part: leaf[part], rows) for part in (0, np.s_[1:]))
 
         def advance(rates: Rates, row: Forcing, added: Array) -> Rates:
-            moved = problem.step(State(rates), row._replace(velocity=begin.velocity), scalars).rates
+            moved = problem.advance(row._replace(velocity=begin.velocity), State(rates), scalars)[0].rates
             return Rates(*(jnp.stack(moved) + added))
 
         def observed(rates: Rates, row: Forcing) -> Float[Array, "3"]:

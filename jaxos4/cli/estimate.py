@@ -129,7 +129,7 @@ def train(
     The network then identifies any flight with these inputs.
     """
     with stages("loading the library") as progress:
-        from ..identification.problem import train_network
+        from ..identification.prepare_os4 import train_network
         from ..models import MODELS
         from ..recording import read_recording
 

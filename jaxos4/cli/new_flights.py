@@ -161,7 +161,7 @@ def design(
 def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "jaxos4.Design":
     """The design of the kind that was asked for, beside the standard inputs."""
     from ..design import model_of
-    from ..identification.problem import bracket_of
+    from ..identification.prepare_os4 import bracket_of
     from ..models import MODELS
 
     limits = {name: asked[name] for name in ("slowest", "fastest", "slew", "angle", "rate", "velocity", "distance")}

@@ -99,7 +99,7 @@ def search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
 
 def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
     answered, unknowns, count = jnp.isfinite(seed.covariance).all(), problem.unknowns, seed.parameters.shape[0]
-    guess = problem.initial_guess
+    guess, stages = problem.initial_guess, problem.stages(ibss.shares)
     # The half-width is two standard deviations.
     wide_spread = jnp.diag(jnp.square(guess.off[0, :count] / 2))
     (windows, size), own = guess.off.shape, unknowns.count
@@ -117,7 +117,7 @@ def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
             is_close=near,
             skip=jnp.where(near, ~answered, hit),
         )
-        measurements = problem.stages(ibss.shares).measurements[-1]
+        measurements = stages.at(stages.number - 1, guess.starts[0]).measurements
         return hit | (near & answered & _confirms(found, seed, measurements)), found
 
     # A loop over the two searches, so that the search is compiled once. A batch of hits skips the second.

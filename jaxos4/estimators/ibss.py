@@ -1,5 +1,6 @@
 """Iterative Bi-Section Shooting (IBSS): brackets are narrowed by the slope of the cost. The steps are our choice."""
 
+import functools
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -14,19 +15,23 @@ from ..shooting import LocalModel, Stage, WindowUnknowns
 from .bisection import Brackets, Directions, Flag, PerDirection
 from .solver import AbstractSolver, Found, before_shots, chosen
 
-# Settings of the search. Steps are in standard deviations, scaled like those of `tolerance`.
-_COARSE = 0.5  # every stage except the last ends when the minimum is at most this far away
+# All lengths are in standard deviations of the estimate, which grow with the misfit, see `tolerance`.
+_COARSE = 0.5  # a stage other than the last ends once the minimum is this close
 _OPENING = 4.0  # the longest step of a stage's first sweep, in standard deviations of the stage's start
-_NARROW = 0.05  # half-width of a stage's first brackets, as a share of `_OPENING`
-_SAFETY = 2.0  # half-width of later brackets, in relative errors of the last predictions
-_MIN_WIDTH = 0.01  # smallest half-width of later brackets, as a share of the longest step; the largest is that step
-_WIDENING, _MAX_WIDENING = 4.0, 256.0  # of the next bracket, repeated while the last shot is at an end
-_KEPT_RISE = 1.0  # the largest rise of the cost in a sweep that is kept
-_RETREAT, _ADVANCE = 0.25, 1.4  # factors of the longest step, after a sweep that was not kept and after any other
-# The slopes of unknowns with a stride are inexact, so the search also ends after a sweep whose predicted steps are at
-# most this long, if it lowered the cost by at most this gain.
+_NARROW = 0.05  # half-width of a stage's first brackets, relative to that longest step
+_SAFETY = 2.0  # half-width of later brackets, relative to the error of the last prediction
+_MIN_WIDTH = 0.01  # smallest half-width of later brackets, relative to the longest predicted step, which is the largest
+_WIDENING, _MAX_WIDENING = 4.0, 256.0  # growth of a bracket each time its last shot was at an end, and in total
+_KEPT_RISE = 1.0  # a sweep that raises the cost by more is undone
+_RETREAT, _ADVANCE = 0.25, 1.4  # growth of the longest step after a sweep that was undone, and after any other
+# Unknowns with a stride have inexact slopes. A search with such unknowns also ends after a sweep that lowered the cost
+# by at most `_SMALL_GAIN`, if its predicted steps were at most `_SHORT_STEP`.
 _SHORT_STEP, _SMALL_GAIN = 0.3, 1e-4
-_DAMPING = 0.1  # added information in 1/stride^2: unknowns with a stride have inexact information
+_DAMPING = 0.1  # information that is added for unknowns with a stride, in 1/stride^2: theirs is inexact too
+
+# The shots of a sweep: the brackets after them, unknowns and local model of the last one, their number, and whether the
+# minimum is near.
+Shots = tuple[Brackets, WindowUnknowns, LocalModel, Count, Flag]
 
 
 class State(NamedTuple):
@@ -104,7 +109,13 @@ class IBSS(AbstractSolver[State]):
     def step(self, stage: Stage, state: State) -> State:
         """The shot at the start, or one sweep: bisect, judge, look around, open. See docs/method/ibss.md."""
         is_start = state.shots == 0
-        brackets, unknowns, model, shots = self._bisect(stage, state)
+        # One shot is enough if all brackets are closed. The last one is at the trials that the others found.
+        most = jnp.where((state.brackets.highest > state.brackets.lowest).any(), self.halvings + 1, 1)
+        brackets, unknowns, model, shots, _ = jax.lax.while_loop(
+            lambda carry: (carry[3] < most) & ~carry[4],
+            functools.partial(self._shoot, stage, state),
+            (state.brackets, state.unknowns, state.model, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)),
+        )
         kept, stalled = self._judge(stage, state, unknowns, model)
         unknowns, model = chosen(kept, (unknowns, model), (state.unknowns, state.model))
         directions = self._look_around(stage, unknowns, model)
@@ -150,31 +161,17 @@ class IBSS(AbstractSolver[State]):
         added = of_bracket.at[:, : stage.unknowns.count].set(jnp.where(has_prior, of_stride, shared))
         return Directions.at(unknowns, model, stage.limits(self.reach), added, stage.unknowns.count)
 
-    def _bisect(self, stage: Stage, state: State) -> tuple[Brackets, WindowUnknowns, LocalModel, Count]:
-        """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
-
-        The last shot is at the trials that the others found, or where the minimum is near. One shot is enough if all
-        brackets are closed.
-
-        **Returns:** the brackets after the shots, the unknowns and local model of the last shot, and the number of
-        shots.
-        """
-        limits, count = stage.limits(self.reach), stage.unknowns.count
-        most = jnp.where((state.brackets.highest > state.brackets.lowest).any(), self.halvings + 1, 1)
-
-        def shoot(carry):
-            brackets, _, _, shots, _ = carry
-            step = jnp.einsum("wud,wd->wu", state.directions.basis, brackets.trial)
-            unknowns = jnp.clip(state.unknowns + step, *limits)
-            model = stage.local_model(unknowns)
-            slope = state.directions.slopes(model.gradient, count)
-            near = model.feasible.all() & self._is_near(stage, model, slope)
-            # A slope that is not finite is replaced by the trial: with unit information, the minimum is then at step 0.
-            brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
-            return brackets, unknowns, model, shots + 1, near
-
-        first = state.brackets, state.unknowns, state.model, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        return jax.lax.while_loop(lambda carry: (carry[3] < most) & ~carry[4], shoot, first)[:4]
+    def _shoot(self, stage: Stage, state: State, before: Shots) -> Shots:
+        """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes."""
+        brackets, _, _, shots, _ = before
+        step = jnp.einsum("wud,wd->wu", state.directions.basis, brackets.trial)
+        unknowns = jnp.clip(state.unknowns + step, *stage.limits(self.reach))
+        model = stage.local_model(unknowns)
+        slope = state.directions.slopes(model.gradient, stage.unknowns.count)
+        near = model.feasible.all() & self._is_near(stage, model, slope)
+        # A slope that is not finite is replaced by the trial: with unit information, the minimum is then at step 0.
+        brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
+        return brackets, unknowns, model, shots + 1, near
 
     def _judge(self, stage: Stage, state: State, unknowns: WindowUnknowns, model: LocalModel) -> tuple[Flag, Flag]:
         """Whether the new point is kept, and whether the search has stalled. A clearly worse point is not kept."""

@@ -123,7 +123,7 @@ def _pass(
         point = jnp.where(first, states, nominal), jnp.where(first, parameters, about[0])
 
         def advance(x: Float[Array, " size"], a: Parameters) -> Float[Array, " size"]:
-            return stack(problem.step(unstack(x), row.forcing, tuple(a)))
+            return stack(problem.advance(row.forcing, unstack(x), tuple(a))[0])
 
         following, linear = jax.linearize(advance, *point)
         predicted = following + linear(states - point[0], parameters - point[1])

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar
 from ..bracket import Bracket
-from ..estimate import AbstractEstimator, Estimate, estimate_at
+from ..estimate import AbstractEstimator, Estimate, as_estimate
+from ..linalg import covariance_of_shared
 from ..shooting import AbstractProblem, LocalModel, Stage, Stages, WindowUnknowns, in_blocks
 
 State = TypeVar("State")
@@ -99,8 +100,6 @@ def solve(
     - `skip`: whether to return no answer, without a step. Other lanes of the batch do not wait for this one.
     """
     stages = problem.stages(solver.shares)
-    # Traced once, although a solver may call it twice.
-    stages = stages._replace(local_model=jax.jit(stages.local_model, inline=True))
     starts, skip = _starts(problem, start), jnp.asarray(skip)
     begin = before_search(problem, stages, spread, skip)
     number = stages.first if is_close is False else jnp.where(is_close, stages.whole, stages.first)
@@ -116,6 +115,8 @@ def solve(
         first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
         before = chosen(from_start, first, best)
         stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
+        # Traced once, although a solver may call it twice.
+        stage = stage._replace(local_model=jax.jit(functools.partial(stage.local_model), inline=True))
         # A start that was given may lie beyond the reach.
         before = before._replace(unknowns=jnp.clip(before.unknowns, *stage.limits(solver.reach)))
         state = jax.lax.while_loop(
@@ -131,7 +132,20 @@ def solve(
 
     # One loop, so that the search is compiled once for all starts and stages.
     end = jax.lax.fori_loop(0, count + stages.number - 1 - number, search, begin)
-    return estimate_at(problem, end.unknowns, end.model, end.rollouts, end.steps, done=end.done, reach=solver.reach)
+    shared = problem.unknowns.count
+    return as_estimate(
+        problem,
+        parameters=end.unknowns[0, :shared],
+        covariance=covariance_of_shared(end.model.information, shared),
+        initial_state=jnp.concatenate([problem.initial_guess.known, end.unknowns[:, shared:]], axis=1).ravel(),
+        cost=end.model.cost.sum(),
+        rollouts=end.rollouts,
+        sweeps=end.steps,
+        feasible=end.model.feasible.all(),
+        done=end.done,
+        reach=solver.reach,
+        parts=end.model.parts,
+    )
 
 
 def before_search(
@@ -143,7 +157,7 @@ def before_search(
     """The knowledge before a search: the first start and its covariance, and nothing about the cost."""
     guess, zero = problem.initial_guess, jnp.zeros((), dtype=int)
     start, wide = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
-    shapes = jax.eval_shape(stages.local_model, zero, start, start)
+    shapes = jax.eval_shape(stages.at(0, start).local_model, start)
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     if spread is not None:
         given = slice(spread.shape[0])

@@ -156,7 +156,7 @@ class SVSF(AbstractEstimator):
         parameters = jnp.clip(parameters + unit * gain * change, -REACH, REACH)
 
         def advance(x: Float[Array, "3"], u: Parameters) -> Float[Array, "3"]:
-            return stack(problem.step(unstack(x), row.forcing, tuple(box.center + box.width * u)))
+            return stack(problem.advance(row.forcing, unstack(x), tuple(box.center + box.width * u))[0])
 
         following = advance(rates, parameters)
         by_rates, by_parameters = jax.jacfwd(advance, argnums=(0, 1))(rates, parameters)

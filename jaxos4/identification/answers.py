@@ -65,6 +65,11 @@ class Answer:
         return has_answer(self.estimate.result)
 
     @property
+    def parameters(self) -> Float[np.ndarray, " parameters"]:
+        """The estimated parameters of the model. The estimate may have further unknowns, such as noise levels."""
+        return np.asarray(self.estimate.parameters)[: self.problem.unknowns.count]
+
+    @property
     def free(self) -> list[int]:
         """The indices of the parameters that are estimated."""
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.fixed]
@@ -120,7 +125,7 @@ def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {
     """
     estimate, unknowns = answer.estimate, answer.problem.unknowns
     std, width = map(np.asarray, _intervals(estimate))
-    values, half_width = np.asarray(estimate.parameters), np.asarray(unknowns.half_width)
+    values, half_width = answer.parameters, np.asarray(unknowns.half_width)
     lower, upper = np.asarray(unknowns.bracket.lower), np.asarray(unknowns.bracket.upper)
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
 
@@ -146,7 +151,7 @@ def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
 
 
 def _note(answer: Answer, i: int, half_width: float) -> str:
-    value, seed = float(np.asarray(answer.estimate.parameters)[i]), answer.estimate.seed
+    value, seed = float(answer.parameters[i]), answer.estimate.seed
     bracket, name = answer.problem.unknowns.bracket, answer.problem.unknowns.names[i]
     if name in answer.negative:
         return NEGATIVE_NOTE
@@ -169,7 +174,7 @@ def dominated(answer: VehicleAnswer) -> dict[str, str]:
     """
     omega, mixer = np.asarray(answer.problem.flight.omega, dtype=float), np.asarray(answer.problem.model.airframe.mixer)
     torques = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0)
-    alpha, weak = np.abs(np.asarray(answer.estimate.parameters)), {}
+    alpha, weak = np.abs(answer.parameters), {}
     strengths = {rate: row.strength for rate, row in answer.disturbances.items()}
     for axis, torque in zip(AXES, torques, strict=True):
         control, strength = alpha[axis.place] * torque, strengths.get(axis.rate, 0.0)
@@ -185,7 +190,7 @@ def dominated(answer: VehicleAnswer) -> dict[str, str]:
 
 def thrust_excess(answer: Answer) -> float:
     """The share by which thrust exceeds the airframe's at the same rotor speeds; 0 if the logs do not show it."""
-    model, values = answer.problem.model, np.asarray(answer.estimate.parameters)
+    model, values = answer.problem.model, answer.parameters
     if isinstance(model, FlightModel) and follows_commands(model.terms):
         return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
     gains = [values[i] for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
@@ -209,7 +214,7 @@ def ratio_error(airframe: Airframe, excess: float) -> float:
 
 def vehicle_constants(answer: Answer) -> RigidBody:
     """Ix, Iy and Iz of a vehicle, as far as alpha3, alpha6 and alpha8 were estimated."""
-    model, free, values = answer.problem.model, answer.free, np.asarray(answer.estimate.parameters)
+    model, free, values = answer.problem.model, answer.free, answer.parameters
     known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), answer.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
     gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
@@ -220,7 +225,8 @@ def vehicle_constants(answer: Answer) -> RigidBody:
             slopes[place, place], slopes[place, gain] = 1 / values[gain], -alpha[place] / values[gain]
     slopes[~known] = 0.0
     unknown = np.where(known, 0.0, (UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
-    covariance = slopes @ np.asarray(answer.estimate.covariance) @ slopes.T + np.diag(unknown)
+    covariance = np.asarray(answer.estimate.covariance)[: values.size, : values.size]
+    covariance = slopes @ covariance @ slopes.T + np.diag(unknown)
     # No likelihood shows an error of the accelerometer's scale, which makes all inertias wrong by one factor.
     scale = SCALE_ERROR * bool(gains)
     shared = scale * np.where(np.isin(np.arange(8), INVERSES), alpha, 0.0)

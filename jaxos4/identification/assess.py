@@ -13,8 +13,8 @@ from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
-from .os4 import fit_os4
-from .problem import Intervals, OS4Settings, bracket_of, os4_problem
+from .fit import fit_os4
+from .prepare_os4 import Intervals, OS4Settings, bracket_of, os4_problem
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):

@@ -1,14 +1,14 @@
 """`jaxos4.identify`: from recorded flights to parameters with intervals.
 
-There are three steps: prepare data with a likelihood, fit the likelihood, and judge the answer. Those for an OS4 are in
-os4.py, those for a vehicle in vehicle.py, sample_time.py and checks.py.
+There are three steps, each for an OS4 and for a vehicle: prepare data with a likelihood (prepare_os4.py and
+prepare_vehicle.py), fit the likelihood (fit.py), and judge the answer (judge.py).
 """
 
 import dataclasses
 import os
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import msgspec
 
@@ -19,16 +19,45 @@ from ..logs import Source, as_recording, as_recordings
 from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..networks import TrainedNetwork
-from .checks import judge_vehicle
 from .data import class_name, silent
-from .os4 import fit_os4, judge_os4, prepare_os4
-from .problem import Intervals, OS4Settings
-from .results import Identification
-from .sample_time import DEFAULT, fit_vehicle, vehicle_estimator
-from .vehicle import VehicleSettings, prepare_vehicle
+from .fit import DEFAULT, fit_os4, fit_vehicle, vehicle_estimator
+from .judge import judge_os4, judge_vehicle
+from .prepare_os4 import Intervals, OS4Settings, prepare_os4
+from .prepare_vehicle import VehicleSettings, prepare_vehicle
+from .results import Identification, OS4Identification, VehicleIdentification
 
 Settings = OS4Settings | VehicleSettings
 S = TypeVar("S", OS4Settings, VehicleSettings)
+
+
+@overload
+def identify(
+    flights: Source | Sequence[Source],
+    subject: AbstractModel,
+    *,
+    settings: Settings | None = None,
+    estimator: str | AbstractEstimator | None = None,
+    bracket: Intervals = None,
+    network: TrainedNetwork | str | os.PathLike[str] | None = None,
+    validate: Source | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = silent,
+) -> OS4Identification: ...
+
+
+@overload
+def identify(
+    flights: Source | Sequence[Source],
+    subject: Airframe,
+    *,
+    settings: Settings | None = None,
+    estimator: str | AbstractEstimator | None = None,
+    bracket: Intervals = None,
+    network: TrainedNetwork | str | os.PathLike[str] | None = None,
+    validate: Source | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = silent,
+) -> VehicleIdentification: ...
 
 
 def identify(
@@ -86,10 +115,19 @@ def identify(
         answer, sample_times = fit_vehicle(several, estimator, choose=choose, seed=seed, progress=progress)
         found = judge_vehicle(answer, sample_times, name, progress=progress)
     else:
-        options = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
-        wanted = _settings(OS4Settings, settings)
-        data, name, method = prepare_os4(recordings, subject, wanted, progress=progress, **options)
-        found = judge_os4(data, fit_os4(method, data.likelihood, progress=progress), method, name)
+        data, name, estimator = prepare_os4(
+            recordings,
+            subject,
+            _settings(OS4Settings, settings),
+            estimator=estimator,
+            bracket=bracket,
+            network=network,
+            validate=other,
+            seed=seed,
+            progress=progress,
+        )
+        answer = fit_os4(estimator, data.likelihood, progress=progress)
+        found = judge_os4(data, answer, estimator, name)
     return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)
 
 

@@ -17,6 +17,7 @@ from ..recording.checks import Finding
 from ..results import meaning
 from .answers import Answer, VehicleAnswer, dominated
 from .data import Data
+from .fit import is_white, moved
 from .intervals import consequences
 from .issues_of_values import ALL_INERTIAS, issues_of_alphas, issues_of_iz, issues_of_values
 from .results import (
@@ -29,7 +30,6 @@ from .results import (
     SampleTime,
     VehicleIdentification,
 )
-from .sample_time import is_white, moved
 from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_BODY, Issue, Move, Moves
 
 # s; with less fitted data, moments of inertia have a reservation; with less than half of it, they are not identified.
@@ -134,8 +134,8 @@ def _issues_of_search(search: str, quantities: Iterable[str]) -> Iterator[Issue]
 
 def _issues_of_limits(answer: Answer) -> Iterator[Issue]:
     """Parameters that ended at their limit, and the quantities that depend on them."""
-    model, own, values = answer.problem.model, answer.problem.unknowns, np.asarray(answer.estimate.parameters)
-    off = np.abs(values[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
+    model, own, values = answer.problem.model, answer.problem.unknowns, answer.parameters
+    off = np.abs(values - np.asarray(own.center)) / np.asarray(own.half_width)
     for i in (place for place in answer.free if off[place] > 0.99 * REACH):
         concerned = dict.fromkeys(model_quantities(model, own.names[i]))
         cause = f"{own.names[i]} = {values[i]:.3g} {own.units[i]} is at the limit of the search around its bracket"

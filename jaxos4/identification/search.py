@@ -61,7 +61,7 @@ class Optimum(NamedTuple):
 
     @property
     def values(self) -> Float[np.ndarray, " unknowns"]:
-        """The parameters, then the logarithms of the noise."""
+        """The values of all unknowns: the parameters, then the logarithms of the noise."""
         return np.asarray(self.estimate.parameters)
 
     @property

@@ -1,21 +1,106 @@
-"""A result as a pandas DataFrame and as an xarray Dataset."""
+"""A result as tables: its physical quantities, a pandas DataFrame, and an xarray Dataset."""
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from .._version import __version__
-from ..airframe import MOTIONS
+from ..airframe import MOTIONS, YAW
+from ..analysis.inertia import CenterOfMass, center_of_mass
 from ..errors import InputError
+from ..models.terms import TERMS
 from ..results import NINETY_FIVE
-from .results import Identification, VehicleIdentification
+from .results import Constant, Identification, RigidBody, VehicleIdentification
+from .verdict import RIGID_BODY, Verdict
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+CENTER = "center of mass"
+_ORDER = ("thrust", "motors", CENTER, "damping", "drag")  # of a vehicle's quantities, after the moments of inertia
 _COLUMNS = ("kind", "unit", "estimate", "std", "low", "high", "bound", "note")
 _NONE = (None, None)
+
+
+class PhysicalQuantity(NamedTuple):
+    """A physical quantity of a vehicle, or a parameter of an OS4.
+
+    - `name`: in words, such as `"rotor lag"`. `unit`: of all numbers; `"1"` without one.
+    - `value`, `std`: the estimate and its standard deviation. `ci95`: its 95 % interval.
+    - `condition`: the condition under which it holds, in words; may be empty.
+    - `judged`: the name of its verdict. `verdict`: the verdict; `None` without one.
+    """
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    ci95: tuple[float, float]
+    condition: str
+    judged: str
+    verdict: Verdict | None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether no verdict refuses it."""
+        return self.verdict is None or self.verdict.trusted
+
+
+def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
+    """Moments of inertia, then thrust, motors, centre of mass, damping and drag; of an OS4 its alphas and J_R too.
+
+    A quantity that was not estimated is not in the table, nor is one that `possible` leaves out.
+    """
+
+    def row(name: str, unit: str, value: float, std: float, judged: str, condition: str = "", ci95=None):
+        half = NINETY_FIVE * std
+        interval = ci95 or (value - half, value + half)
+        return PhysicalQuantity(name, unit, value, std, interval, condition, judged, found.verdicts.get(judged))
+
+    constants = found.rigid_body.constants if found.is_vehicle else possible(found.rigid_body)
+    rows = [
+        row(name, each.unit, each.estimate, each.std, name if found.is_vehicle else RIGID_BODY, each.note or "")
+        for name, each in constants.items()
+    ]
+    judged = _judged() if found.is_vehicle else {name: name for name in found.parameters}
+    rows += [
+        row(name.replace("_", " "), each.unit, each.estimate, each.std, judged[name], "", each.ci95)
+        for name, each in found.parameters.items()
+        if judged.get(name, CENTER) != CENTER and each.estimate is not None and each.std is not None
+    ]
+    if found.is_vehicle:
+        rows += [
+            row(f"{CENTER} {each.axis}", "mm", 1e3 * each.value, 1e3 * each.std, CENTER, "if rotors are alike")
+            for each in centers_of_mass(found)
+        ]
+        rows.sort(key=lambda each: _ORDER.index(each.judged) if each.judged in _ORDER else -1)
+    return rows
+
+
+def possible(body: RigidBody) -> dict[str, Constant]:
+    """The constants of a rigid body that are clearly positive; J_R only if it is not larger than Iz."""
+    vehicle = body.constants.get(YAW.inertia)
+    most = {} if vehicle is None else {"J_R": vehicle.estimate}
+    every = ((name, row, most.get(name, np.inf)) for name, row in body.constants.items())
+    return {name: row for name, row, limit in every if NINETY_FIVE * row.std < row.estimate <= limit}
+
+
+def centers_of_mass(found: Identification) -> list[CenterOfMass]:
+    """The coordinates of the centre of mass that were estimated; see `jaxos4.center_of_mass`."""
+    if found.covariance is None:
+        return []
+    values = [np.nan if row.estimate is None else row.estimate for row in found.parameters.values()]
+    with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
+        every = center_of_mass(tuple(found.parameters), np.array(values), np.array(found.covariance), found.airframe)
+    return [each for each in every if np.isfinite([each.value, each.std]).all()]
+
+
+def _judged() -> dict[str, str]:
+    """The name of the verdict on each parameter of a vehicle's terms."""
+    terms = [term for term in TERMS.values() if term.verdict]
+    return {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}
 
 
 def dataframe(found: Identification) -> "pd.DataFrame":

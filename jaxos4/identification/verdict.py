@@ -139,7 +139,7 @@ class Quantity(NamedTuple):
     requires: tuple[str, ...] = ()
 
 
-def judge(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> dict[str, Verdict]:
+def verdicts_of(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> dict[str, Verdict]:
     """The verdict for each quantity. `issues`: all issues of the identification."""
     verdicts = {}
     for name, quantity in quantities.items():

@@ -10,8 +10,8 @@ from markupsafe import Markup
 
 from ..airframe import INERTIAS, MOTIONS
 from ..errors import printable
-from ..identification.physical import centers_of_mass, physical_quantities
 from ..identification.results import Identification, OS4Identification, VehicleIdentification
+from ..identification.tables import centers_of_mass, physical_quantities
 from ..identification.verdict import headline, statuses_of
 from ..results import NINETY_FIVE, meaning
 from . import identification_figures as figures

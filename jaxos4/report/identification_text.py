@@ -9,8 +9,8 @@ from rich.console import Console
 from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
 from ..identification.next_flight import next_flight, spreads_of
-from ..identification.physical import PhysicalQuantity, physical_quantities, possible
 from ..identification.results import COLOURED, Constant, Identification, OS4Identification, VehicleIdentification
+from ..identification.tables import PhysicalQuantity, physical_quantities, possible
 from ..identification.verdict import (
     CONTRADICTED,
     IDENTIFIED,

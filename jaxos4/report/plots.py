@@ -9,8 +9,8 @@ from ..airframe import INERTIAS, MOTIONS
 from ..analysis.frequency_response import HIGHEST
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
-from ..identification.physical import physical_quantities
 from ..identification.results import Identification, VehicleIdentification
+from ..identification.tables import physical_quantities
 from .identification_figures import gain
 from .matplotlib_figures import draw
 from .panels import Scale

@@ -13,7 +13,11 @@ from .abstract import (
     WindowUnknowns as WindowUnknowns,
 )
 from .innovations import InnovationsProblem as InnovationsProblem
-from .problem import ShootingProblem as ShootingProblem
+from .layout import (
+    capacity_of as capacity_of,
+    pad_flight as pad_flight,
+    padded as padded,
+    with_capacity as with_capacity,
+)
+from .problem import ROUNDING as ROUNDING, ShootingProblem as ShootingProblem
 from .scans import FASTEST as FASTEST, Length as Length, Rows as Rows
-from .segments import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded, with_room as with_room
-from .stages import ROUNDING as ROUNDING

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeVar
 
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._custom_types import Count, Numeric, Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket, is_identifiable
@@ -89,9 +88,9 @@ class Unknowns(eqx.Module):
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "Unknowns":
         """The same unknowns, some fixed at values. Raises `ValueError` for an unknown name, or if none remains free."""
-        strangers = [name for name in values if name not in self.names]
-        if strangers:
-            raise ValueError(f"`values`: {strangers[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
+        unknown = [name for name in values if name not in self.names]
+        if unknown:
+            raise ValueError(f"`values`: {unknown[0]} is no unknown; the unknowns are {', '.join(self.names)}.")
         fixed = np.isin(self.names, list(values))
         if fixed.all() or not (isinstance(self.free, Tracer) or (np.asarray(self.free) & ~fixed).any()):
             raise ValueError("`values` holds every unknown that is still free; leave at least one.")
@@ -179,12 +178,6 @@ class LocalModel(NamedTuple):
     information: Float[Array, "*windows unknowns unknowns"]
     parts: Parts | None = None
 
-    def restricted(self, searched: Bool[Array, " unknowns"]) -> "LocalModel":
-        """The model in the searched unknowns only; derivatives in all others are 0."""
-        gradient = jnp.where(searched, self.gradient, 0.0)
-        information = jnp.where(searched & searched[:, None], self.information, 0.0)
-        return self._replace(gradient=gradient, information=information)
-
 
 class InitialGuess(NamedTuple):
     """Where a search starts.
@@ -201,7 +194,15 @@ class InitialGuess(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """One stage of a likelihood, see `Stages`."""
+    """One stage of a likelihood, which may search only some of its unknowns, on a part of the data.
+
+    - `unknowns`: of the likelihood. `off`: of its `InitialGuess`.
+    - `local_model`: of the stage's cost, with derivatives of 0 in unknowns that are not searched.
+    - `searched`: the unknowns that it searches.
+    - `measurements`: the number of measurements that its cost compares; 0 if the noise is an unknown.
+    - `smallest_step`: the step in standard deviations below which rounding decides the sign of a slope.
+    - `last`: whether it is the last one.
+    """
 
     unknowns: Unknowns
     off: WindowUnknowns
@@ -233,39 +234,15 @@ class Stage(NamedTuple):
 class Stages(NamedTuple):
     """A likelihood in stages. Each stage is searched from the answer of the stage before; the last is the whole.
 
-    All stages have the same unknowns, but an early stage may search only some of them, on a part of the data.
-
-    - `unknowns`: of the likelihood. `off`: of its `InitialGuess`.
     - `number`: the number of stages. `first`: the stage with which a search begins. `whole`: the first stage that fits
       all data.
-    - `local_model`: a function of the number of a stage, the unknowns found before it, and the unknowns of a shot. It
-      returns the model of the stage's cost around the shot, with derivatives of 0 in unknowns that are not searched.
-    - `searched`: for each stage, the unknowns that it searches.
-    - `measurements`: for each stage, the number of measurements that its cost compares; 0 if the noise is an unknown.
-    - `smallest_step`: for each stage, the step in standard deviations below which rounding decides the sign of a slope.
+    - `at`: a function of the number of a stage, and of the unknowns found before it. It returns the stage.
     """
 
-    unknowns: Unknowns
-    off: WindowUnknowns
     number: int
     first: Count | int
     whole: Count | int
-    local_model: Callable[[Int[Array, ""], WindowUnknowns, WindowUnknowns], LocalModel]
-    searched: Bool[Array, "stages unknowns"]
-    measurements: Float[Array, " stages"]
-    smallest_step: Float[Array, " stages"]
-
-    def at(self, number: Count, before: WindowUnknowns) -> Stage:
-        """The stage of this number, after a stage that found `before`."""
-        return Stage(
-            unknowns=self.unknowns,
-            off=self.off,
-            local_model=functools.partial(self.local_model, number, before),
-            searched=self.searched[number],
-            measurements=self.measurements[number],
-            smallest_step=self.smallest_step[number],
-            last=number == self.number - 1,
-        )
+    at: Callable[[Count | int, WindowUnknowns], Stage]
 
 
 class AbstractProblem(eqx.Module):

@@ -18,23 +18,26 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Count, Scalar
 from ..batching import computed_once, with_batch
 from ..models.state import Forcing, Rates, State
-from .feedback import Feedback, InputGains, by_inputs, feedback_slopes
 from .gains import (
     RATE_COUNT,
     Channels,
     Covariance,
+    Feedback,
+    InputGains,
     LogNoise,
     Observed,
-    Series,
+    PerSegment,
     Step,
     Window,
     basis,
+    by_inputs,
+    feedback_slopes,
     first_covariance,
     next_gains,
     step_of,
 )
 from .scans import FASTEST
-from .sums import LAGS, Innovations, PerSegment, likelihood
+from .sums import LAGS, Innovations, likelihood
 
 Scalars = tuple[Float[Array, "*#segments"], ...]
 Move = Callable[[State, Forcing, Scalars], State]
@@ -57,18 +60,6 @@ class _Row(NamedTuple):
     inputs: Float[Array, "feedthroughs channels segments"]
     restarts: Bool[Array, " segments"]
     restarts_next: Bool[Array, " segments"]
-
-
-class _Explained(NamedTuple):
-    """The parts of the innovations that input innovations explain.
-
-    - `error`: by the feedthroughs, which are estimated. `slopes`: its derivatives in them.
-    - `noise`: by feedthroughs that are known, squared: a variance.
-    """
-
-    error: Series
-    noise: Series
-    slopes: Float[Array, "time channels feedthroughs segments"]
 
 
 class _Known(NamedTuple):
@@ -110,7 +101,7 @@ def _advance(
     driven = tuple(x + gain * e for x, gain, e in zip(known.driven, feedback.driven, errors, strict=True))
     rates = computed_once(going, lambda: move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates)
     driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
-    added = tuple(by_inputs(gains, row.inputs) for gains in feedback.by_input)
+    added = tuple(by_inputs(gains, row.inputs) for gains in feedback.input_gains)
     later = zip(driven, feedback.reach, known.disturbance, feedback.driven_later, errors, added[0], strict=True)
     driven = tuple(x + a * d + gain * e + v for x, a, d, gain, e, v in later)
     faded = zip(feedback.kept, known.disturbance, feedback.disturbance_later, errors, added[1], strict=True)
@@ -167,7 +158,7 @@ class Point(NamedTuple):
     noise: LogNoise
     feedthrough: tuple[Float[Array, " channels *segments"], ...]
     noise_feedthrough: tuple[Float[Array, " channels *segments"], ...]
-    by_input: InputGains
+    input_gains: InputGains
 
 
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
@@ -179,7 +170,7 @@ def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented
       its mean over the window of a measurement, and the outputs of the sensors.
     - `positions`: indices of the parameters on which the forcing depends.
     """
-    return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)
+    return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)()
 
 
 def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
@@ -233,12 +224,11 @@ def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmente
 def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """See `innovate`. `functions` act on all segments. Arrays in `at` may have segments as last axis."""
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
-    parameters, noise, feedthrough, noise_feedthrough, by_input = at
-    count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
-    levels = len(jax.tree.leaves((noise, by_input)))
-    unknowns = count + levels + len(feedthrough)
-    step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
-    steps = step, jax.vmap(push)(basis(noise))
+    count, (time, channels, segments) = at.parameters.shape[0], observed.measured.shape
+    levels = len(jax.tree.leaves((at.noise, at.input_gains)))
+    unknowns = count + levels + len(at.feedthrough)
+    step, push = jax.linearize(lambda noise: step_of(noise, dt, window), at.noise)
+    steps = step, jax.vmap(push)(basis(at.noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
     zero = jnp.zeros(segments, dtype=float)
     start = (zero,) * RATE_COUNT if observed.known is None else observed.known
@@ -259,13 +249,16 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         nothing,
     )
     advance = functools.partial(_advance, functions)
-    filtered = functools.partial(_filter_rows, advance, parameters, by_input, steps, np.asarray(positions, int))
+    filtered = functools.partial(_filter_rows, advance, at, steps, np.asarray(positions, int))
     missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
-    seen = jnp.where(missing[:, None], 0.0, inputs)
-    row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, seen, observed.restart, following)
-    error, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(by, inputs) for by in (feedthrough, noise_feedthrough))
-    explained = _Explained(error, jnp.square(as_noise), jnp.moveaxis(inputs, 2, 1))
-    data = row, observed.counts, explained, forcing, forcing_tangents
+    row = _Row(
+        measured=jnp.where(missing, 0.0, observed.measured),
+        is_measured=~missing,
+        inputs=jnp.where(missing[:, None], 0.0, inputs),
+        restarts=observed.restart,
+        restarts_next=following,
+    )
+    data = row, observed.counts, forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
     def block(i: Count, carry: _Carry) -> _Carry:
@@ -276,14 +269,12 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
 
 def _filter_rows(
     advance: Callable[..., Any],
-    parameters: Float[Array, "parameters *segments"],
-    by_input: InputGains,
+    point: Point,
     steps: tuple[Step, Step],
     positions: np.ndarray,
     carry: _Carry,
     row: _Row,
     counts: Bool[Array, "time segments"],
-    explained: _Explained,
     forcing: Forcing,
     forcing_tangents: Forcing | None,
 ) -> _Carry:
@@ -291,7 +282,7 @@ def _filter_rows(
 
     `steps`: the disturbance over a sample, with its derivatives in the noise.
     """
-    count, segments = parameters.shape[0], counts.shape[1]
+    parameters, (count, *_), segments = point.parameters, point.parameters.shape, counts.shape[1]
     scalars, own = tuple(parameters), parameters.shape[1:]
     unknowns = jax.tree.leaves(carry.known[1])[0].shape[0]
     units = tuple(np.eye(count, unknowns, dtype=parameters.dtype))
@@ -305,9 +296,9 @@ def _filter_rows(
             lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
-        feedback = Feedback.of(gains, steps[0], by_input)
+        feedback = Feedback.of(gains, steps[0], point.input_gains)
         # The noise acts only through the feedback, and the parameters do not act on the feedback.
-        by_unknowns = feedback_slopes(gain_slopes, steps[1], by_input, count)
+        by_unknowns = feedback_slopes(gain_slopes, steps[1], point.input_gains, count)
 
         def filtered(known: _Known, feedback: Feedback, scalars: tuple, forcing: Forcing = forcing):
             return advance(known, forcing, scalars, feedback, row, feasible)
@@ -328,10 +319,11 @@ def _filter_rows(
     (covariance, known, feasible), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
     (errors, slopes), variance, variance_slopes = found
     counts = row.is_measured & counts[:, None]
-    errors, slopes = errors - explained.error, jnp.concatenate([slopes, -explained.slopes], axis=2)
-    by_noise = slice(count, count + variance_slopes.shape[1])
-    found, last = likelihood(
-        counts, variance, variance_slopes, carry.last, feasible, errors, slopes, explained.noise, by_noise
-    )
+    # Known feedthroughs explain a part of the innovations that counts as noise; the others are estimated.
+    both = point.feedthrough, point.noise_feedthrough
+    explained, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(each, row.inputs) for each in both)
+    errors, slopes = errors - explained, jnp.concatenate([slopes, -jnp.moveaxis(row.inputs, 2, 1)], axis=2)
+    by_noise, squares = slice(count, count + variance_slopes.shape[1]), jnp.square(as_noise)
+    found, last = likelihood(counts, variance, variance_slopes, carry.last, feasible, errors, slopes, squares, by_noise)
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(feasible=feasible)
     return _Carry(covariance, known, last, sums)

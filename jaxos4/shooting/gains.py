@@ -11,7 +11,7 @@ of these three is exact, so innovations of the right model are white at every sa
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Numeric, Scalar
 from ..models.state import CHANNELS
 
+PerSegment = Float[Array, " segments"]
 Channels = Float[Array, "channels segments"]
 Series = Float[Array, "time channels segments"]
 T = TypeVar("T")
@@ -35,14 +36,9 @@ _NODES = 8
 _NO_FILTER = 1e-9
 
 
-class Window(NamedTuple):
-    """The part of a sample over which a measurement is averaged: from `begin` on, for `length` [s]; 0: an instant."""
-
-    begin: Scalar | float = 0.0
-    length: Scalar | float = 0.0
-
-
-INSTANT = Window()
+# The part of a sample over which a measurement is averaged: beginning and length [s]; a length of 0: an instant.
+Window = tuple[Scalar | float, Scalar | float]
+INSTANT: Window = (0.0, 0.0)
 """A measurement at the beginning of its sample."""
 
 
@@ -187,14 +183,15 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     rate = is_rate(tau)
     # `strength` is the standard deviation of a force; its disturbance has a larger one.
     drive = jnp.where(rate, variance, variance * (tau + fast) / tau)
-    begin, end = jnp.asarray(window.begin, dtype=float), jnp.asarray(window.begin + window.length, dtype=float)
-    long = jnp.where(window.length > 0, window.length, 1.0)
+    begin, length = window
+    begin, end = jnp.asarray(begin, dtype=float), jnp.asarray(begin + length, dtype=float)
+    long = jnp.where(length > 0, length, 1.0)
 
     def measured(time: Array) -> Array:
         """The change of the measurement for a unit of d at this time of the sample."""
         until_begin, until_end = jnp.maximum(begin - time, 0.0), jnp.maximum(end - time, 0.0)
         mean = (response.driven_sum(until_end) - response.driven_sum(until_begin)) / long
-        return jnp.where(window.length > 0, mean, response.driven(until_begin))
+        return jnp.where(length > 0, mean, response.driven(until_begin))
 
     # The parts of the sample before, in and after the window, and the nodes of a quadrature in each.
     edges = jnp.stack(jnp.broadcast_arrays(jnp.zeros_like(begin), begin, end, dt))
@@ -206,7 +203,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) 
     products = x * x, x * d, d * d, m * m, m * x, m * d
     x_x, x_d, d_d, m_m, m_x, m_d = ((share * each).sum(axis=0) for each in products)
     # The mean over the window of the share of x that remains. It is finite for every filter.
-    in_window = jnp.where(window.length > 0, window.length, 0.0) / fast
+    in_window = jnp.where(length > 0, length, 0.0) / fast
     mean = jnp.where(in_window > 0, -jnp.expm1(-in_window) / jnp.where(in_window > 0, in_window, 1.0), 1.0)
     force = jnp.where(rate, 0.0, variance)
     return Step(
@@ -273,3 +270,48 @@ def basis(unknowns: T) -> T:
     directions = np.eye(len(leaves))
     rows = zip(directions, leaves, strict=True)
     return tree.unflatten([np.multiply.outer(row, np.ones(leaf.shape)) for row, leaf in rows])
+
+
+# The changes of the estimates at the end of a sample for a unit of each input innovation: of the rate [rad/s], or the
+# force besides the model's [m/s^2]; and of the disturbance [rad/s^2], or [m/s^2].
+OfInputs = tuple[Float[Array, " channels *segments"], ...]
+InputGains = tuple[OfInputs, OfInputs]
+
+
+class Feedback(NamedTuple):
+    """The parts of a filter that depend on the noise, by channel: its `Gains`, `InputGains`, and fields of `Step`."""
+
+    driven: tuple[PerSegment, ...]
+    driven_later: tuple[PerSegment, ...]
+    disturbance_later: tuple[PerSegment, ...]
+    driven_seen: tuple[PerSegment, ...]
+    seen: tuple[PerSegment, ...]
+    kept: tuple[PerSegment, ...]
+    driven_kept: tuple[PerSegment, ...]
+    reach: tuple[PerSegment, ...]
+    input_gains: InputGains
+
+    @classmethod
+    def of(cls, gains: Gains, step: Step, input_gains: InputGains) -> "Feedback":
+        """The feedback by these gains, over one step."""
+        fields = gains.driven, gains.driven_later, gains.disturbance_later, step.driven_seen, step.seen
+        return cls(*map(tuple, (*fields, *step.transition)), input_gains=input_gains)
+
+
+def by_inputs(gains: tuple[Array, ...], inputs: Float[Array, "feedthroughs channels segments"]) -> Channels:
+    """The change of an estimate by input innovations, by channel."""
+    each = (v * (k if k.ndim > 1 else k[:, None]) for k, v in zip(gains, inputs, strict=True))
+    return sum(each, jnp.zeros(inputs.shape[1:], dtype=float))
+
+
+def feedback_slopes(gains: Gains, steps: Step, input_gains: InputGains, count: int) -> Feedback:
+    """The derivatives of the feedback: 0 in `count` parameters, then in the noise and in the gains of inputs."""
+    levels, units = gains.variance.shape[0], basis(input_gains)
+    of_noise = jax.tree.map(lambda leaf: jnp.zeros((levels, *leaf.shape[1:]), leaf.dtype), units)
+    some, more = jax.vmap(Feedback.of)(gains, steps, of_noise), len(jax.tree.leaves(input_gains))
+
+    def padded(before: int, after: int, tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.pad(leaf, ((before, after), *((0, 0),) * (leaf.ndim - 1))), tree)
+
+    inputs = padded(count, 0, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), of_noise, units))
+    return padded(count, more, some)._replace(input_gains=inputs)

@@ -9,6 +9,7 @@ References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, Sys
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
@@ -18,19 +19,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import Numeric, Parameters, as_float
+from .._custom_types import Count, Numeric, Parameters, as_float
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
-from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stages, Unknowns, Values, WindowUnknowns
-from .filters import InputGains, Point, Segmented, innovate
+from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
+from .filters import Point, Segmented, innovate
 from .gains import INSTANT, LogNoise, Observed, Window
+from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, levels, own_names, with_noise
 from .problem import ShootingProblem
 from .scans import with_tangents
-from .segments import Segments, observe_in_segments
 from .sums import Innovations, joined, placed
 
 SETTLING = 128
@@ -133,21 +134,21 @@ class InnovationsProblem(AbstractProblem):
         if self.flight.within is None:
             return INSTANT
         length = self.flight.averaging_time
-        return Window((self.flight.dt - length) / 2, length)
+        return (self.flight.dt - length) / 2, length
 
     @property
     def segmentation(self) -> Segments:
         """The samples of each segment."""
-        room, length, each = self.flight.time.shape[0], self.problem.length, self._by_recording
+        capacity, length, each = self.flight.time.shape[0], self.problem.length, self._by_recording
         begins = np.zeros(1, int)
         if each is not None:
             numpy = np if isinstance(each.number, np.ndarray) else jnp
             begins = numpy.searchsorted(each.number, np.arange(len(each.places)))
         if isinstance(length, Tracer) or isinstance(begins, jax.Array):
-            edges = jnp.append(jnp.asarray(begins), room if length is None else length)
+            edges = jnp.append(jnp.asarray(begins), capacity if length is None else length)
         else:  # known numbers need no compiled program
-            edges = np.append(begins, room if length is None else int(length))
-        return Segments.of(self.segments, room, edges, self.settling)
+            edges = np.append(begins, capacity if length is None else int(length))
+        return Segments.of(self.segments, capacity, edges, self.settling)
 
     @property
     def _by_recording(self) -> ByRecording | None:
@@ -204,7 +205,7 @@ class InnovationsProblem(AbstractProblem):
     def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "channels own"]:
         return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
 
-    def _of_inputs(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "3 channels feedthroughs"]:
+    def _input_unknowns(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "3 channels feedthroughs"]:
         """The gains of input innovations on rate and disturbance, then the feedthroughs."""
         own = self._of_channels(unknowns)[:, self._levels :]
         return jnp.moveaxis(own.reshape(len(own), 3, self.input_innovations.shape[-2]), 1, 0)
@@ -212,35 +213,32 @@ class InnovationsProblem(AbstractProblem):
     @property
     def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """See `AbstractProblem`. `parts` are the segments."""
-        at, noise_feedthrough = self._local_model(), jnp.nan_to_num(self.noise_feedthrough)
-        return lambda unknowns: at(unknowns, noise_feedthrough)
+        return functools.partial(self._local_model(), jnp.nan_to_num(self.noise_feedthrough))
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The whole problem. If it has feedthroughs, a second stage counts as noise the innovations they explain."""
         del shares
-        number, at = 2 if self.noise_feedthrough.size else 1, self._local_model()
+        number, model_at, unknowns = 2 if self.noise_feedthrough.size else 1, self._local_model(), self.unknowns
         is_known = ~jnp.isnan(self.noise_feedthrough).any()
 
-        def local_model(stage: Int[Array, ""], before: WindowUnknowns, unknowns: WindowUnknowns) -> LocalModel:
-            found = jnp.where(is_known, self.noise_feedthrough, self._of_inputs(before[0])[2])
-            return at(unknowns, jnp.where(is_known | (stage > 0), found, 0.0))
+        def at(stage: Count | int, before: WindowUnknowns) -> Stage:
+            found = jnp.where(is_known, self.noise_feedthrough, self._input_unknowns(before[0])[2])
+            noise_feedthrough = jnp.where(is_known | (stage > 0), found, 0.0)
+            return Stage(
+                unknowns=unknowns,
+                off=unknowns.usable.half_width[None],
+                local_model=functools.partial(model_at, noise_feedthrough),
+                searched=unknowns.free,
+                measurements=jnp.zeros((), dtype=float),
+                smallest_step=jnp.sqrt(jnp.finfo(float).eps),
+                last=jnp.asarray(stage == number - 1),
+            )
 
-        unknowns, none = self.unknowns, jnp.zeros(number, dtype=float)
         first = is_known.astype(int) if number == 2 else 0
-        return Stages(
-            unknowns=unknowns,
-            off=unknowns.usable.half_width[None],
-            number=number,
-            first=first,
-            whole=first,
-            local_model=local_model,
-            searched=jnp.broadcast_to(unknowns.free, (number, unknowns.count)),
-            measurements=none,
-            smallest_step=none + jnp.sqrt(jnp.finfo(float).eps),
-        )
+        return Stages(number, first, first, at)
 
-    def _local_model(self) -> Callable[[WindowUnknowns, Float[Array, "channels feedthroughs"]], LocalModel]:
-        """`local_model` as a function of the unknowns and of `noise_feedthrough`."""
+    def _local_model(self) -> Callable[[Float[Array, "channels feedthroughs"], WindowUnknowns], LocalModel]:
+        """`local_model` as a function of `noise_feedthrough` and of the unknowns."""
         unknowns, innovations = self.unknowns.usable, self._innovations()
         count, free = self.problem.unknowns.count, unknowns.free
         both, places = free & free[:, None], None
@@ -248,9 +246,9 @@ class InnovationsProblem(AbstractProblem):
             others = np.broadcast_to(np.arange(count, free.size), (self.segments, free.size - count))
             places = jnp.concatenate([jnp.asarray(each.places)[self.segmentation.recording], others], axis=1)
 
-        def at(row: WindowUnknowns, noise_feedthrough: Float[Array, "channels feedthroughs"]) -> LocalModel:
+        def at(noise_feedthrough: Float[Array, "channels feedthroughs"], row: WindowUnknowns) -> LocalModel:
             values = row[0]
-            found = innovations(values[:count], self.noise(values), self._of_inputs(values), noise_feedthrough)
+            found = innovations(values[:count], self.noise(values), self._input_unknowns(values), noise_feedthrough)
             shared = found.gradient.shape[1] - len(self._own)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, shared)
             if places is not None:
@@ -274,16 +272,19 @@ class InnovationsProblem(AbstractProblem):
         return observe_in_segments(self.problem, self.segmentation, self.settling)
 
     def innovations(
-        self, parameters: Parameters, noise: LogNoise, by_input: Float[Array, "3 channels feedthroughs"] | None = None
+        self,
+        parameters: Parameters,
+        noise: LogNoise,
+        input_unknowns: Float[Array, "3 channels feedthroughs"] | None = None,
     ) -> Innovations:
         """The innovations of all segments, with derivatives in the parameters of the segment's recording.
 
-        `by_input`: the gains of input innovations on rate and disturbance, and the feedthroughs; by default 0.
+        `input_unknowns`: the gains of input innovations on rate and disturbance, and the feedthroughs; by default 0.
         """
         nothing = jnp.zeros((3, self.problem.columns.size, self.input_innovations.shape[-2]))
-        by_input = nothing if by_input is None else by_input
+        input_unknowns = nothing if input_unknowns is None else input_unknowns
         noise_feedthrough = jnp.nan_to_num(self.noise_feedthrough)
-        return self._innovations()(parameters, noise, by_input, noise_feedthrough)
+        return self._innovations()(parameters, noise, input_unknowns, noise_feedthrough)
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
         """`innovations` for a loop: everything that does not depend on parameters and noise is computed once."""
@@ -297,13 +298,12 @@ class InnovationsProblem(AbstractProblem):
         fixed = self.segmentation.rows, self.flight.dt, self.window
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
-        def at(parameters: Parameters, noise: LogNoise, by_input: Array, noise_feedthrough: Array) -> Innovations:
+        def at(parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
             flight = Segmented(observed, inputs, forcing, tangents, *fixed)
-            driven, disturbance, feedthrough = (tuple(each.T) for each in by_input)
-            gains = InputGains(driven, disturbance)
-            point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), gains)
+            driven, disturbance, feedthrough = (tuple(each.T) for each in input_unknowns)
+            point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), (driven, disturbance))
             return innovate(functions, model.forcing_parameters, flight, point)
 
         return at
@@ -333,7 +333,7 @@ class InnovationsProblem(AbstractProblem):
 def _move(problem: ShootingProblem, state: State, forcing: Forcing, parameters) -> State:
     """The rates one sample later: by the midpoint rule if measurements are means, else by the problem's method."""
     if forcing.early is None:
-        return problem.step(state, forcing, parameters)
+        return problem.advance(forcing, state, parameters)[0]
     return midpoint_step(problem.model, state, forcing, parameters, problem.flight.dt)
 
 

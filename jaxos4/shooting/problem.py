@@ -5,33 +5,34 @@ import functools
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
+from .._custom_types import (
+    Count,
+    InitialState,
+    InitialStates,
+    Numeric,
+    Parameters,
+    Scalar,
+    StateVector,
+    as_float,
+)
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
-from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stages, Unknowns, WindowUnknowns
-from .scans import (
-    Length,
-    Rows,
-    each_window,
-    first_measured,
-    predict_window,
-    shoot,
-    shoot_with_derivatives,
-    window_samples,
-    windowed,
-    with_tangents,
-)
-from .stages import ROUNDING, stages_of
+from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stage, Stages, Unknowns, WindowUnknowns
+from .layout import each_window, first_measured, window_samples, windowed
+from .scans import Length, Rows, predict_window, shoot, shot_with_derivatives, with_tangents
 
+# Rounding errors add up over a flight, to about this many times the rounding of one measurement.
+ROUNDING = 64.0
 # Errors that an unmeasured initial state may have, in cascade order: rad/s, rad, then m and m/s.
 _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
 
@@ -137,13 +138,33 @@ class ShootingProblem(AbstractProblem):
     @property
     def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """See `AbstractProblem`."""
-        forced, known, count = self.forced_rows(), self.first_state()[0], self.unknowns.count
+        every = np.ones(self.unknowns.count + self.free_size, dtype=bool)
+        return functools.partial(self._local_model(self.channels), self.length, every)
 
-        def at(unknowns: WindowUnknowns) -> LocalModel:
-            own = unknowns[:, count:] if self.free_size else self.split(known)
-            return each_window(self.model_of_window, forced(unknowns[0, :count]), unknowns[:, :count], own)
+    def _local_model(self, channels: str) -> Callable[[Length, Bool[Numeric, " unknowns"], WindowUnknowns], LocalModel]:
+        """The local model on fewer channels, as a function of `length`, which unknowns are searched, and unknowns."""
+        forced, first, count = self.forced_rows(), self.split(self.first_state()[0]), self.unknowns.count
+        fewer = self.restrict(channels)
+        others = 0, self.free_size - fewer.free_size
 
-        return at
+        def local_model(length: Length, searched: Bool[Numeric, " unknowns"], unknowns: WindowUnknowns) -> LocalModel:
+            rows, own = forced(unknowns[0, :count]), unknowns[:, count:] if self.free_size else first
+            rows = rows._replace(measured=rows.measured[: fewer.size] + rows.measured[self.size :])
+            window = shot_with_derivatives(
+                fewer.advance,
+                length,
+                fewer.weights,
+                forcing_parameters=self.model.forcing_parameters,
+                initial_state_is_free=self.initial_state is None,
+            )
+            model = each_window(window, rows, unknowns[:, :count], own[:, : fewer.size])
+            both = searched & searched[:, None]
+            return model._replace(
+                gradient=jnp.where(searched, jnp.pad(model.gradient, ((0, 0), others)), 0.0),
+                information=jnp.where(both, jnp.pad(model.information, ((0, 0), others, others)), 0.0),
+            )
+
+        return local_model
 
     def fix(self, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> "ShootingProblem":
         """See `AbstractProblem`."""
@@ -236,7 +257,7 @@ class ShootingProblem(AbstractProblem):
         _, within = self.window_samples()
 
         def predict(forcing: Forcing, start: InitialState) -> Float[Array, "length columns"]:
-            return predict_window(self._advance, forcing, parameters, start, self.length)
+            return predict_window(self.advance, forcing, parameters, start, self.length)
 
         return each_window(predict, self.rows(parameters).forcing, self.split(initial_state))[within]
 
@@ -247,24 +268,55 @@ class ShootingProblem(AbstractProblem):
         return Shot(each.cost.sum(), each.feasible.all())
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
-        """See `AbstractProblem`."""
-        return stages_of(self, shares)
+        """The body rates of a short part of the flight first, then more; the last stage fits the whole flight.
+
+        Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, which gives the
+        cost of a long flight other minima, so the first stages are short.
+
+        `shares`: the body rates are first fitted to these shares of the flight. If there are several windows, only a
+        share of 1 counts, because windows are short enough. All stages compare specific force.
+        """
+        wanted = (share for share in shares if share == 1 or self.windows == 1)
+        rates = tuple(("rates", share) for share in wanted if (self.channels, share) != ("rates", 1))
+        stages, unknowns, off = (*rates, (self.channels, 1.0)), self.unknowns, self.initial_guess.off
+        names = tuple(dict.fromkeys(name for name, _ in stages))
+        place = jnp.asarray([names.index(name) for name, _ in stages])
+        sizes = np.array([CHANNELS[name] for name, _ in stages])
+        measured, sigma = self.measured(), self.sigma[self.columns]
+        samples, columns = measured.shape[0], np.arange(measured.shape[1])
+        fitted = (columns < sizes[:, None]) | (columns >= self.size)
+        fitted_shares = np.array([share for _, share in stages])
+        lengths = jnp.ceil(fitted_shares * (samples if self.length is None else self.length)).astype(int)
+        within = (jnp.arange(samples) < lengths[:, None]).astype(float)
+        known, eps = within @ (~jnp.isnan(measured)).astype(float), jnp.finfo(sigma.dtype).eps
+        squares = (within @ jnp.square(jnp.nan_to_num(measured))) / jnp.maximum(known, 1)
+        largest = jnp.where(fitted, jnp.sqrt(squares) / sigma, 0.0).max(axis=1)
+        measurements = jnp.where(fitted, known, 0.0).sum(axis=1)
+        smallest_step = jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * largest)
+        free = jnp.broadcast_to(unknowns.free, (len(stages), unknowns.count))
+        searched = jnp.concatenate([free, np.arange(self.free_size) < sizes[:, None]], axis=1)
+        local_models = [self._local_model(channels) for channels in names]
+
+        def at(number: Count | int, before: WindowUnknowns) -> Stage:
+            del before
+            length = self.length if (fitted_shares == 1).all() else lengths[number]
+            # The stage is the same in all lanes of a batch.
+            models = [functools.partial(local_model, length, searched[number]) for local_model in local_models]
+            return Stage(
+                unknowns=unknowns,
+                off=off,
+                local_model=functools.partial(jax.lax.switch, place[number], models),
+                searched=searched[number],
+                measurements=measurements[number],
+                smallest_step=smallest_step[number],
+                last=jnp.asarray(number == len(stages) - 1),
+            )
+
+        return Stages(len(stages), 0, len(stages) - 1, at)
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""
-        return shoot(self._advance, rows, self._weights(), parameters, initial_state, self.length)
-
-    @property
-    def model_of_window(self) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
-        """The function that returns the local model of one window, in the parameters and a free initial state."""
-        return functools.partial(
-            shoot_with_derivatives,
-            self._advance,
-            self._weights(),
-            forcing_parameters=self.model.forcing_parameters,
-            initial_state_is_free=self.initial_state is None,
-            length=self.length,
-        )
+        return shoot(self.advance, rows, self.weights, parameters, initial_state, self.length)
 
     def reweighted(self, residuals: Float[ArrayLike, "..."]) -> "ShootingProblem":
         """The problem with each channel's sigma estimated from the weighted `residuals` of a fit, by NumPy.
@@ -285,16 +337,16 @@ class ShootingProblem(AbstractProblem):
         after[columns] = np.where(sigma > 0, sigma, before[columns])
         return eqx.tree_at(lambda p: p.sigma, self, as_float(after))
 
-    def step(self, state: State, forcing: Forcing, parameters) -> State:
-        """The state one sample later, down to the same level of the cascade."""
-        return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
-
     def window_samples(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
         """The samples of each window, and which of them belong to it."""
         return window_samples(self.flight.states.shape[-2], self.windows)
 
-    def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
-        return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)
+    def advance(self, forcing: Forcing, state: State, parameters) -> tuple[State, tuple[Scalar, ...]]:
+        """The state one sample later, down to the same level of the cascade, and the output of noise-free sensors."""
+        following = STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
+        return following, self.model.observe(state, forcing, parameters)
 
-    def _weights(self) -> tuple[Scalar, ...]:
+    @property
+    def weights(self) -> tuple[Scalar, ...]:
+        """1 / sigma of each compared channel."""
         return tuple(1 / self.sigma[self.columns])

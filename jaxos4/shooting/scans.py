@@ -7,27 +7,30 @@ inside a scan are scalars of a lane, because stacking them in every step is slow
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import InitialState, Numeric, Parameters, Scalar
+from .._custom_types import Count, InitialState, Parameters, Scalar
 from ..batching import computed_once, in_blocks, with_batch
-from ..models.state import Forcing, State, Translation, unstack
+from ..models.state import CHANNELS, Forcing, State, Translation, unstack
 from .abstract import LocalModel, Shot
-from .sparsity import Panel, panels_of, symmetric
 
 # rad/s; no quadrotor reaches this body rate and no gyro measures it, so a faster trajectory has diverged.
 FASTEST = 1e3
 
-# Returns the state one sample later and the output of noise-free sensors, from a state, the forcing and the parameters.
-Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
-Carry = TypeVar("Carry")
-Series = TypeVar("Series", Forcing, tuple[Array, ...])
+# Rows of the information that are summed together, without the columns to the right of their diagonal block.
+_ROWS = 4
+# The first row, the row after the last, and the outputs on which the unknowns of these rows act.
+Panel = tuple[int, int, tuple[int, ...]]
+
+# Returns the state one sample later and the output of noise-free sensors, from the forcing, a state and the parameters.
+Advance = Callable[[Forcing, State, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
 # One value, or one for each lane of a batch.
 Lanes = Float[Array, "*#lanes"]
 # The number of rows that count in a padded flight. It is data and not a shape, so that flights of different lengths
@@ -54,7 +57,7 @@ def predict_window(
     scalars, first = tuple(parameters), unstack(initial_state)
 
     def step(state: State, forcing: Forcing) -> tuple[State, tuple[Scalar, ...]]:
-        return advance(state, forcing, scalars)
+        return advance(forcing, state, scalars)
 
     if length is None:
         return jnp.stack(jax.lax.scan(step, first, forcing)[1], axis=-1)
@@ -84,13 +87,6 @@ def with_tangents(
     return new, slopes._replace(recording=zeros.recording, velocity=zeros.velocity)
 
 
-def _fold(step: Callable[[Carry, Rows], tuple[Carry, None]], first: Carry, rows: Rows, length: Length) -> Carry:
-    """The last carry of a scan over the rows that count."""
-    if length is None:
-        return jax.lax.scan(step, first, rows)[0]
-    return jax.lax.fori_loop(0, length, lambda i, x: step(x, jax.tree.map(lambda leaf: leaf[i], rows))[0], first)
-
-
 def shoot(
     advance: Advance,
     rows: Rows,
@@ -108,47 +104,49 @@ def _shoot(
 ) -> Shot:
     scalars = tuple(at)
 
-    def step(carry: tuple[State, Shot], row: Rows) -> tuple[tuple[State, Shot], None]:
-        state, shot = carry
+    def step(i: Count, carry: tuple[State, Shot]) -> tuple[State, Shot]:
+        row, (state, shot) = jax.tree.map(lambda leaf: leaf[i], rows), carry
         feasible = shot.feasible & _is_feasible(state)
-        following, predicted = advance(state, row.forcing, scalars)
+        following, predicted = advance(row.forcing, state, scalars)
         cost = shot.cost + _half_square(_errors(row, predicted, weights, feasible))
-        return (following, Shot(cost, feasible)), None
+        return following, Shot(cost, feasible)
 
     nothing = Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
-    return _fold(step, (unstack(start), nothing), rows, length)[1]
+    return jax.lax.fori_loop(0, _samples(rows, length), step, (unstack(start), nothing))[1]
 
 
-def shoot_with_derivatives(
+def _samples(rows: Rows, length: Length) -> Count | int:
+    """The number of rows that count."""
+    return rows.forcing.roll.shape[0] if length is None else length
+
+
+def shot_with_derivatives(
     advance: Advance,
+    length: Length,
     weights: tuple[Scalar, ...],
-    rows: Rows,
-    parameters: Parameters,
-    initial_state: InitialState,
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
-    length: Length = None,
-) -> LocalModel:
+) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
     """`shoot` with gradient and information in the parameters and a free initial state. A batch runs in lanes."""
     how = {"forcing_parameters": forcing_parameters, "initial_state_is_free": initial_state_is_free}
     alone = functools.partial(_linearised_shot, **how)
 
     def together(lanes: int, many: Any, shared: Any) -> LocalModel:
-        if many[-1] is not None:  # lanes of different lengths
+        if many[1] is not None:  # lanes of different lengths
             return jax.vmap(lambda one: alone(*eqx.combine(one, shared)))(many)
-        last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), many[1:-1])
-        same = jax.tree.map(lambda leaf: leaf[..., None], shared[1:-1])
-        rows, weights, *at = eqx.combine(last, same)
-        at = (jnp.broadcast_to(values, (values.shape[0], lanes)) for values in at)
+        last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), many[2:])
+        same = jax.tree.map(lambda leaf: leaf[..., None], shared[2:])
+        weights, rows, *at = eqx.combine(last, same)
 
         def advance(*at: Any) -> tuple[State, tuple[Lanes, ...]]:
             return jax.vmap(lambda one, *at: eqx.combine(one, shared[0])(*at))(many[0], *at)
 
-        out = alone(advance, rows, weights, *at, shared[-1])
+        parameters, initial_state = (jnp.broadcast_to(values, (values.shape[0], lanes)) for values in at)
+        out = alone(advance, shared[1], weights, rows, parameters, initial_state)
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), out)
 
-    return with_batch(alone, together, advance, rows, weights, parameters, initial_state, length)
+    return with_batch(alone, together, advance, length, weights)
 
 
 class _Carried(NamedTuple):
@@ -170,16 +168,16 @@ class _Carried(NamedTuple):
 
 def _linearised_shot(
     advance: Advance,
-    rows: Rows,
+    length: Length,
     weights: tuple[Lanes, ...],
+    rows: Rows,
     parameters: Float[Array, "parameters *lanes"],
     initial_state: Float[Array, "size *lanes"],
-    length: Length,
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
 ) -> LocalModel:
-    """`shoot_with_derivatives` for one flight, or for flights in lanes, which are then the last axis of all arrays.
+    """`shot_with_derivatives` for one flight, or for flights in lanes, which are then the last axis of all arrays.
 
     Rows and weights that all lanes share have a last axis of 1.
     """
@@ -188,12 +186,13 @@ def _linearised_shot(
     def along_lanes(leaf: Array) -> Array:
         return jnp.broadcast_to(leaf, tuple(lanes))
 
-    at = unstack(initial_state), jax.tree.map(lambda leaf: along_lanes(leaf[0]), rows.forcing), scalars
+    at = jax.tree.map(lambda leaf: along_lanes(leaf[0]), rows.forcing), unstack(initial_state), scalars
     first_late, panels = panels_of(advance, at, forcing_parameters, free=initial_state_is_free)
     # NumPy, so that they are constants of the program.
     parameter_tangents = tuple(np.eye(count, first_late, dtype=parameters.dtype))
 
-    def step(carry: _Carried, row: Rows) -> tuple[_Carried, None]:
+    def step(i: Count, carry: _Carried) -> _Carried:
+        row = jax.tree.map(lambda leaf: leaf[i], rows)
         feasible = carry.shot.feasible & _is_feasible(carry.state)
         # After a failure the state is 0, so that no derivative overflows.
         state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), carry.state)
@@ -201,14 +200,14 @@ def _linearised_shot(
 
         # If only the rates are simulated, repeating them is cheaper.
         repeated = not lanes or state.attitude is None
-        at, late = (state, forcing, scalars), carry.late
+        at, late = (forcing, state, scalars), carry.late
         sample = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
         following, push, push_late, cost, pull, squares = sample() if repeated else computed_once(feasible, sample)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
             nothing, positions = jnp.zeros((first_late, *lanes), parameters.dtype), np.asarray(forcing_parameters)
             wide = jax.tree.map(lambda slope: nothing.at[positions].set(slope), row.forcing_tangents)
-            directions.insert(1, wide)
+            directions.insert(0, wide)
 
         def pushed(*direction: Any) -> tuple[State, tuple[Lanes, ...]]:
             return push(*jax.tree.map(along_lanes, direction))
@@ -224,11 +223,13 @@ def _linearised_shot(
             for panel, blocks in zip(panels, carry.panels, strict=True)
         ]
         shot = Shot(carry.shot.cost + cost, feasible)
-        return _Carried(following, tangent, late, shot, gradient, information), None
+        return _Carried(following, tangent, late, shot, gradient, information)
 
-    last = _fold(step, _before(initial_state, count, first_late, panels), rows, length)
+    first = _before(initial_state, count, first_late, panels)
+    last = jax.lax.fori_loop(0, _samples(rows, length), step, first)
     information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)
-    return LocalModel(*last.shot, jnp.concatenate(last.gradient), symmetric(information))
+    cost, feasible = last.shot
+    return LocalModel(cost, feasible, jnp.concatenate(last.gradient), symmetric(information))
 
 
 def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: int, panels: list[Panel]) -> _Carried:
@@ -266,7 +267,7 @@ def _added(
 def _linearised_sample(
     advance: Advance,
     row: Rows,
-    at: tuple[State, Forcing, tuple[Lanes, ...]],
+    at: tuple[Forcing, State, tuple[Lanes, ...]],
     weights: tuple[Lanes, ...],
     feasible: Bool[Array, "*lanes"],
     late: bool,
@@ -275,9 +276,9 @@ def _linearised_sample(
 
     The second derivative is in the translation alone; `None` unless `late`.
     """
-    state, forcing, scalars = at
+    forcing, state, scalars = at
     if row.forcing_tangents is None:
-        linear = jax.linearize(lambda state, scalars: advance(state, forcing, scalars), state, scalars)
+        linear = jax.linearize(functools.partial(advance, forcing), state, scalars)
     else:
         linear = jax.linearize(advance, *at)
     (following, predicted), push = linear
@@ -287,7 +288,7 @@ def _linearised_sample(
     push_late = None
     if late:
         _, push_late = jax.linearize(
-            lambda t: advance(state._replace(translation=t), forcing, scalars), state.translation
+            lambda t: advance(forcing, state._replace(translation=t), scalars), state.translation
         )
     return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 
@@ -311,37 +312,49 @@ def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
 
 
-def window_samples(
-    samples: int, windows: int
-) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-    """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
-    ends = np.arange(windows + 1) * samples // windows
-    index = ends[:-1, None] + np.arange(np.diff(ends).max())
-    within = index < ends[1:, None]
-    return np.where(within, index, ends[1:, None] - 1), within
+def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results arguments"]:
+    """Which leaves of a function's result depend on which arguments. An inner function counts as one operation."""
+    program = jax.make_jaxpr(function)(*arguments).jaxpr
+    nothing = np.zeros(len(program.invars), dtype=bool)
+    known = dict(zip(program.invars, np.eye(nothing.size, dtype=bool), strict=True))
+
+    def sources(variables: list) -> np.ndarray:
+        return np.any([nothing, *(known.get(v, nothing) for v in variables if not isinstance(v, Literal))], axis=0)
+
+    for equation in program.eqns:
+        known |= dict.fromkeys(equation.outvars, sources(equation.invars))
+    return np.array([sources([v]) for v in program.outvars])
 
 
-def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
-    """The series of each window, from the series of the flight. Windows of equal length need no copy."""
+def panels_of(
+    advance: Callable, at: tuple[Any, Any, tuple], forcing_parameters: tuple[int, ...], *, free: bool
+) -> tuple[int, list[Panel]]:
+    """The index after the last unknown that acts on rates or attitude, and the panels of all rows.
 
-    def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:
-        return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
+    - `advance`: returns the next state and the outputs, from the forcing, a state and the parameters, which are `at`.
+    - `free`: whether the initial state is unknown too. Its leaves then follow the parameters.
+    """
+    leaves = dependence(advance, *at)
+    forces, size, count = (len(jax.tree.leaves(part)) for part in at)
+    unknowns = np.eye(count + size * free, dtype=bool)
+    reached = unknowns[count:] if free else np.zeros((size, count), dtype=bool)
+    driven = np.zeros((forces, len(unknowns)), dtype=bool)
+    driven[:, list(forcing_parameters)] = True
+    for _ in range(size):  # an effect reaches the last state after at most `size` samples
+        reached = reached | (leaves @ np.concatenate([driven, reached, unknowns[:count]]))[:size]
+    acting, panels = (leaves @ np.concatenate([driven, reached, unknowns[:count]]))[size:], []
+    first_late = max(count, *(np.flatnonzero(reached[: CHANNELS["attitude"]].any(axis=0)) + 1).tolist())
+    for row, outputs in enumerate(tuple(np.flatnonzero(column).tolist()) for column in acting.T):
+        top, _, before = panels[-1] if panels else (row, row, ())
+        joined = before == outputs and row - top < _ROWS and row != first_late
+        panels = [*panels[:-1], (top, row + 1, outputs)] if joined else [*panels, (row, row + 1, outputs)]
+    return first_late, panels
 
-    return jax.tree.map(rows, series)
 
-
-def each_window(function: Callable, *arguments: Any) -> Any:
-    """`function` for each window. A single window needs no `vmap`, which takes long to trace."""
-    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
-        return jax.vmap(function)(*arguments)
-    only = jax.tree.map(lambda leaf: leaf[0], arguments)
-    return jax.tree.map(lambda leaf: leaf[None], function(*only))
-
-
-def first_measured(
-    measured: Float[Array, "windows length columns"],
-) -> tuple[Float[Array, "windows columns"], Bool[Array, "windows columns"]]:
-    """The first measurement of each window, or 0 if there is none; and whether it was made at the first sample."""
-    first = jnp.argmin(jnp.isnan(measured), axis=1)
-    value = jnp.take_along_axis(measured, first[:, None], axis=1)[:, 0]
-    return jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)
+def symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *lanes"]:
+    """The symmetric matrix from panels of its rows, which end with their diagonal blocks."""
+    size, lanes = panels[-1].shape[1], panels[0].ndim - 2
+    filled = [jnp.pad(panel, ((0, 0), (0, size - panel.shape[1]), *((0, 0),) * lanes)) for panel in panels]
+    lower = jnp.concatenate(filled)
+    below = np.tri(size, dtype=bool).reshape(size, size, *(1,) * lanes)
+    return jnp.where(below, lower, jnp.swapaxes(lower, 0, 1))

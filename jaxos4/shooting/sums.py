@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric
-from .gains import Series
-
-PerSegment = Float[Array, " segments"]
+from .gains import PerSegment, Series
 
 LAGS = 8
 """The largest lag at which innovations are compared, in samples."""

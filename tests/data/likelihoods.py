@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxos4.bracket import NO_PRIOR
 from jaxos4.shooting import AbstractProblem, LocalModel, Unknowns
-from jaxos4.shooting.abstract import InitialGuess, Stages
+from jaxos4.shooting.abstract import InitialGuess, Stage, Stages
 
 NAMES = ("x", "y")
 MINIMUM, SLOPES = np.array([0.4, -0.3]), np.array([[30.0, 10.0], [0.0, 20.0], [5.0, 0.0]])
@@ -69,17 +69,16 @@ class Squares(AbstractProblem):
         return eqx.tree_at(lambda problem: problem.unknowns, self, unknowns)
 
     def stages(self, shares=()):
-        return Stages(
+        stage = Stage(
             unknowns=self.unknowns,
             off=self.initial_guess.off,
-            number=1,
-            first=0,
-            whole=0,
-            local_model=lambda stage, before, unknowns: self._at(unknowns),
-            searched=self.unknowns.free[None],
-            measurements=jnp.zeros(1),
-            smallest_step=jnp.full(1, 1e-8),
+            local_model=self._at,
+            searched=self.unknowns.free,
+            measurements=jnp.zeros(()),
+            smallest_step=jnp.asarray(1e-8),
+            last=jnp.asarray(True),
         )
+        return Stages(number=1, first=0, whole=0, at=lambda number, before: stage)
 
 
 def squares(residuals, center=(0.0, 0.0), half_width=1.0, **more):

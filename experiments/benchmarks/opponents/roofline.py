@@ -29,7 +29,7 @@ def roofline(case: Case, *, size: int = 1024, stream: int = 1 << 24) -> Callable
     @jax.jit
     @jax.vmap
     def advance(state, alpha):
-        return problem.step(state, rows.forcing, tuple(alpha))
+        return problem.advance(rows.forcing, state, tuple(alpha))[0]
 
     counted = advance.lower(states, alphas).compile().cost_analysis() or {}
     matrix, numbers = jnp.ones((size, size)), jnp.ones(stream)

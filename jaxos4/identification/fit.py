@@ -1,4 +1,4 @@
-"""Fits a vehicle at the shortest sample time that does not influence the answer.
+"""Fits one flight of an OS4; fits a vehicle at the shortest sample time that does not influence the answer.
 
 Short samples contain the vibration of the sensors. Long samples hide motion. The flight is fitted at several sample
 times. A sample time that the user gives is fitted in the same way, and longer ones beside it.
@@ -14,26 +14,33 @@ import math
 import time
 from collections.abc import Sequence
 
+import equinox as eqx
+import jax
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from .._custom_types import as_float
 from ..airframe import AXES, PITCH, ROLL, YAW
+from ..analysis.diagnostics import residual_diagnostics
+from ..analysis.evaluation import evaluate, robust_covariance
 from ..errors import InputError, TrainingError
 from ..estimate import REACH, AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..networks.estimator import GivenNetwork, most_agile_windows, vehicle_network_for
-from ..results import result_names
-from ..shooting import InnovationsProblem
-from .answers import VehicleAnswer, dominated, vehicle_constants
+from ..results import has_answer, result_names
+from ..shooting import InnovationsProblem, ShootingProblem, padded
+from .answers import OS4Answer, VehicleAnswer, dominated, vehicle_constants
 from .data import Data, Progress, name_and_class, silent
 from .intervals import at_lowest, corrected
-from .results import Constant, SampleTime
+from .results import COLOURED, Constant, SampleTime
 from .search import Optimum, search
 
 DEFAULT = "filter-error"
 """The estimator of a vehicle, which flies in closed loop."""
 
+MAX_PASSES = 3  # that estimate noise levels from residuals, before the last estimate
+SETTLED = 0.2  # relative change of a noise level that ends the passes; such weights cost under 1 % of the efficiency
 TOLERANCE = 1e-3  # of `FilterError`: it stops within 0.05 standard deviations of the minimum
 WHITE = 0.06  # largest correlation of innovations that count as white, in addition to chance
 CHANCE = 3.0  # standard errors of a correlation; the largest of 24 (3 rates, 8 lags) is compared
@@ -41,6 +48,47 @@ AGREE = 2.0  # most standard deviations between two answers that agree
 DISCRETE = 0.03  # relative error of discretisation
 WIDER = 1.5  # intervals wider than at twice the sample time by this factor would agree with anything
 NEAR_LIMIT = 0.95  # share of the way to its limit; an unknown beyond it starts no other search
+
+
+def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> OS4Answer:
+    """Estimate the parameters and the noise levels of one flight.
+
+    The noise levels follow from the residuals, and the fit is repeated with them. The covariance of an estimator that
+    shoots is the Cramer-Rao bound, or `robust_covariance` if residuals are coloured. The other estimators give their
+    own covariance, and estimate once more with the last noise levels.
+    """
+
+    def search(weighted: ShootingProblem, number: int) -> Estimate:
+        progress(f"fitting with the noise levels of pass {number}" if number else "compiling and fitting")
+        if estimator.shoots and not estimator.needs_network:
+            weighted = padded(weighted)  # flights of other lengths then share the program
+        return jax.block_until_ready(estimator(weighted))
+
+    estimates = [search(problem, 0)]
+    for number in range(1, MAX_PASSES + 2):
+        last, before = estimates[-1], np.asarray(problem.sigma)
+        if not has_answer(last.result):
+            break
+        problem = problem.reweighted(evaluate(problem, last.parameters, last.initial_state).errors)
+        settled = (np.abs(np.asarray(problem.sigma) / before - 1) < SETTLED).all()
+        failed = estimator.shoots and str(result_names(last.result)) != "successful"
+        is_last = settled or failed or number > MAX_PASSES
+        if not is_last or not estimator.shoots:
+            estimates.append(search(problem, number))
+        if is_last:
+            break
+    estimate, rollouts = estimates[-1], sum(int(each.rollouts) for each in estimates)
+    if not has_answer(estimate.result):
+        return OS4Answer(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
+    evaluation = evaluate(problem, estimate.parameters, estimate.initial_state)
+    diagnostics = residual_diagnostics(evaluation)
+    bound, covariance = evaluation.covariance, estimate.covariance
+    if estimator.shoots:
+        covariance = robust_covariance(evaluation) if (diagnostics.colour > COLOURED).any() else bound
+    changed = as_float(covariance), as_float(evaluation.cost)
+    estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, changed)
+    bounds = np.sqrt(np.diagonal(bound))
+    return OS4Answer(problem, estimate, bounds, rollouts, evaluation=evaluation, diagnostics=diagnostics)
 
 
 def vehicle_estimator(estimator: str | AbstractEstimator, network: GivenNetwork) -> str:
@@ -100,15 +148,15 @@ def _with_estimator(
         return data, make_estimator(estimator)
     progress("training a network for these flights")
     begin, seen = time.perf_counter(), most_agile_windows(data.problem)
-    name, method = str((data.provenance.flights or ["flight"])[0]), IBSS()
+    name, solver = str((data.provenance.flights or ["flight"])[0]), IBSS()
     try:
-        method = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)
+        solver = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)
         what = f"its network was trained for these flights in {time.perf_counter() - begin:.0f} s"
     except TrainingError as error:
         what = f"no network for these flights ({error}); IBSS searched the whole bracket"
     notes = [*data.provenance.notes, f"{estimator}: {what}"]
     provenance = msgspec.structs.replace(data.provenance, notes=notes)
-    return dataclasses.replace(data, provenance=provenance), method
+    return dataclasses.replace(data, provenance=provenance), solver
 
 
 def fit_sample_times(

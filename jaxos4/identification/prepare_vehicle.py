@@ -18,10 +18,10 @@ from ..models.flight_model import FlightModel
 from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.sensor_errors import unseen_sag
-from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
+from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_capacity
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, input_innovations, lagged
 from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions
-from .problem import Intervals, bracket_of
+from .prepare_os4 import Intervals, bracket_of
 
 SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
 RECORDINGS = 4  # twice this many or more have more segments
@@ -156,7 +156,7 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     # Torque before a measured instant cannot answer it, and motors take longer to answer than a short sample lasts.
     is_late = float(flight.averaging_time) == 0.0 or commanded
     return InnovationsProblem(
-        with_room(shooting, capacity),
+        with_capacity(shooting, capacity),
         segments=segments,
         least_noise=least_noise,
         input_innovations=_input_innovations(shooting, capacity, commanded=commanded),

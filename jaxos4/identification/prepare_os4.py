@@ -1,25 +1,32 @@
-"""Makes the problem that estimators solve, from a recorded flight and a model."""
+"""From one recorded flight and a model of the OS4 to its data, with the shooting problem that estimators solve."""
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 
 from .._custom_types import as_float
 from ..bracket import Bracket
 from ..errors import InputError, named, shortened
+from ..estimate import AbstractEstimator
+from ..estimators import ESTIMATORS, Hybrid, make_estimator
 from ..flight import STATE_NAMES
 from ..logs import Recording
+from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
-from ..networks.estimator import seen_channels
+from ..networks.estimator import GivenNetwork, network_for, network_provenance, seen_channels
+from ..networks.file import load_network
 from ..noise import SENSOR_SIGMA
+from ..recording.checks import KINEMATIC, self_checks
 from ..shooting import ShootingProblem, Unknowns
+from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, class_name, name_and_class, versions
 
 Intervals = Bracket | Mapping[str, Any] | None
 """A bracket, or `[lower, upper]` by parameter name; the model's default for all others."""
@@ -40,6 +47,102 @@ class OS4Settings:
     channels: str | None = None
     initial_state: str = "free"
     window: float | None = None
+
+
+def prepare_os4(
+    recordings: Sequence[Recording],
+    model: AbstractModel,
+    settings: OS4Settings,
+    *,
+    estimator: str | AbstractEstimator | None,
+    bracket: Intervals,
+    network: GivenNetwork,
+    validate: Recording | None,
+    seed: int,
+    progress: Progress,
+) -> tuple[Data[ShootingProblem], str, AbstractEstimator]:
+    """The data of one flight, and the name and object of its estimator. Arguments as in `identify`."""
+    recording, *others = recordings
+    if others:
+        raise InputError(
+            f"{others[0].name}: the {class_name(model, MODELS)} model explains one flight; several need an airframe "
+            "and the model flight."
+        )
+    estimator = "ibss" if estimator is None else estimator
+    name, kind = name_and_class(estimator)
+    trained = _given_network(estimator, settings, network)
+    if trained is not None and not kind.shoots and bracket is not None:
+        raise InputError("`bracket`: a network searches the bracket that it was trained in; leave one of them out.")
+    where = bracket_of(bracket, model)
+    problem = os4_problem(recording, model, where, settings)
+    other = None
+    if validate is not None:
+        other = os4_problem(validate, model, where, dataclasses.replace(settings, channels=None))
+    if _has_own_channels(kind):
+        problem = problem.restrict(kind.looks_at)
+        if np.isnan(np.asarray(problem.flight.states)[:, CASCADE_ORDER[: problem.size]]).all(axis=0).any():
+            raise InputError(f"{recording.name}: {name} needs p, q and r; use `estimator` output-error.")
+    if kind.needs_network and trained is None:
+        progress("training a network for this flight")
+        trained = network_for(problem, where, recording.name, shoots=kind.shoots, seed=seed)
+    if trained is not None:
+        if mismatch := trained.mismatch(problem):
+            raise InputError(
+                f"`network`: cannot be used on {recording.name}: {mismatch}; train one with `jaxos4 train`."
+            )
+        if not kind.shoots:
+            problem = problem.restrict(trained.channels).within(trained.bracket)
+    notes, held_out = recording.notes, None
+    if validate is not None and other is not None:
+        other = other.restrict(problem.channels) if other.size > problem.size else other
+        if np.isnan(other.recorded()).all():
+            raise InputError(
+                f"{validate.name}: nothing was measured among the {problem.channels} channels; give another flight."
+            )
+        held_out, notes = HeldOut(other, validate.name), notes + validate.named_notes
+    provenance = Provenance(
+        flight=recording.name,
+        airframe=airframe_name(model.airframe),
+        channels=problem.channels,
+        initial_state=settings.initial_state,
+        windows=problem.windows,
+        samples=int(problem.flight.time.shape[0]),
+        sample_time=float(problem.flight.dt),
+        network=msgspec.UNSET if trained is None else network_provenance(network, trained),
+        notes=list(notes),
+        **versions(problem),
+    )
+    findings = self_checks(recording, model.airframe, checks=KINEMATIC)
+    data = Data(problem, problem, Clock(), provenance, held_out=held_out, findings=findings)
+    return data, name, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
+
+
+def _given_network(
+    estimator: str | AbstractEstimator, settings: OS4Settings, network: GivenNetwork
+) -> TrainedNetwork | None:
+    """The network that an estimator has or was given. Raises `InputError` for options that do not fit the estimator."""
+    name, kind = name_and_class(estimator)
+    if network is not None and not kind.needs_network:
+        raise InputError(f"`network`: {name} uses none; use `estimator` network or hybrid, or leave it out.")
+    if settings.window is not None and not (kind.shoots or kind.needs_network):
+        shooting = ", ".join(each for each, other in ESTIMATORS.items() if other.shoots)
+        raise InputError(f"`window`: {name} does not shoot; use one of the estimators {shooting}.")
+    if settings.window is not None and network is not None:
+        raise InputError("`window`: a network of windows serves one flight alone; leave `network` out.")
+    if _has_own_channels(kind) and settings.channels not in (None, kind.looks_at):
+        raise InputError(
+            f"`channels` {settings.channels}: {name} looks at the {kind.looks_at}; use `estimator` output-error."
+        )
+    if network is not None and not isinstance(estimator, str):
+        raise InputError(f"`network`: this {name} estimator has one already; leave it out.")
+    trained = estimator.network if isinstance(estimator, Hybrid) else estimator
+    if isinstance(trained, TrainedNetwork):
+        return trained
+    return network if network is None or isinstance(network, TrainedNetwork) else load_network(network)
+
+
+def _has_own_channels(kind: type[AbstractEstimator]) -> bool:
+    return kind.looks_at != "all" and not kind.needs_network
 
 
 def bracket_of(bracket: Intervals, model: AbstractModel) -> Bracket:

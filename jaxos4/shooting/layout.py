@@ -1,25 +1,65 @@
-"""The layout of a flight's samples: segments, in which Kalman filters run in parallel; padding, to share a program."""
+"""The layout of a flight's samples: windows to simulate, segments to filter, and padding to share a program."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Numeric
 from ..flight import SIGNALS, Flight, Signal
-from ..models.state import CASCADE_ORDER, CHANNELS
+from ..models.state import CASCADE_ORDER, CHANNELS, Forcing
 from .filters import BLOCK
 from .gains import Observed
-from .problem import ShootingProblem
 
+if TYPE_CHECKING:
+    from .problem import ShootingProblem
+
+Series = TypeVar("Series", Forcing, tuple[Array, ...])
 # s; after a gap of this length, a filter restarts.
 _GAP = 0.1
 # A flight is padded to the smallest of these numbers of samples that suffices. A longer flight is not padded: compiling
 # its program takes less time than simulating it.
 _CAPACITIES = (4096, 16384, 65536)
+
+
+def window_samples(
+    samples: int, windows: int
+) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+    """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
+    ends = np.arange(windows + 1) * samples // windows
+    index = ends[:-1, None] + np.arange(np.diff(ends).max())
+    within = index < ends[1:, None]
+    return np.where(within, index, ends[1:, None] - 1), within
+
+
+def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
+    """The series of each window, from the series of the flight. Windows of equal length need no copy."""
+
+    def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:
+        return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
+
+    return jax.tree.map(rows, series)
+
+
+def each_window(function: Callable, *arguments: Any) -> Any:
+    """`function` for each window. A single window needs no `vmap`, which takes long to trace."""
+    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
+        return jax.vmap(function)(*arguments)
+    only = jax.tree.map(lambda leaf: leaf[0], arguments)
+    return jax.tree.map(lambda leaf: leaf[None], function(*only))
+
+
+def first_measured(
+    measured: Float[Array, "windows length columns"],
+) -> tuple[Float[Array, "windows columns"], Bool[Array, "windows columns"]]:
+    """The first measurement of each window, or 0 if there is none; and whether it was made at the first sample."""
+    first = jnp.argmin(jnp.isnan(measured), axis=1)
+    value = jnp.take_along_axis(measured, first[:, None], axis=1)[:, 0]
+    return jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)
 
 
 class Segments(NamedTuple):
@@ -63,7 +103,7 @@ class Segments(NamedTuple):
         return cls(place, owned, rows if isinstance(rows, jax.Array) else int(rows), recording)
 
 
-def observe_in_segments(problem: ShootingProblem, segments: Segments, settling: int) -> Observed:
+def observe_in_segments(problem: "ShootingProblem", segments: Segments, settling: int) -> Observed:
     """The measurements in segments, where filters restart, and which innovations count.
 
     A filter restarts in a gap, and where a stretch begins. Until it has settled, its innovations do not count, except
@@ -107,7 +147,7 @@ def _restarts(
     return jax.lax.scan(follow, first, (missing, another))[1]
 
 
-def padded(problem: ShootingProblem) -> ShootingProblem:
+def padded(problem: "ShootingProblem") -> "ShootingProblem":
     """The problem with a padded flight, unless it is cut into windows. A padded flight has no reverse-mode derivatives.
 
     Padding is not simulated, so it costs memory but no time. Results change by rounding errors only.
@@ -116,10 +156,10 @@ def padded(problem: ShootingProblem) -> ShootingProblem:
     capacity = capacity_of(samples)
     if capacity == samples or problem.windows > 1 or problem.length is not None:
         return problem
-    return with_room(problem, capacity)
+    return with_capacity(problem, capacity)
 
 
-def with_room(problem: ShootingProblem, capacity: int) -> ShootingProblem:
+def with_capacity(problem: "ShootingProblem", capacity: int) -> "ShootingProblem":
     """The problem in one window, with a flight that is padded to `capacity` samples."""
     length = jax.device_put(np.asarray(problem.flight.time.shape[0]))
     return dataclasses.replace(problem, flight=pad_flight(problem.flight, capacity), windows=1, length=length)

@@ -1,4 +1,4 @@
-"""The checks of a vehicle's answer: its verdicts, and predictions of measurements that were not fitted."""
+"""Judges answers: verdicts with the issues behind them, and predictions of measurements that were not fitted."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,30 +12,138 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Numeric, as_float, finite_or_none
 from .._xla import compiled_cheaply
-from ..airframe import AXES, PITCH, ROLL, YAW
-from ..analysis.diagnostics import Correlations, residual_correlations
+from ..airframe import AXES, INERTIAS, MOTIONS, PITCH, ROLL, YAW
+from ..analysis.diagnostics import Correlations, Diagnostics, residual_correlations, residual_diagnostics
+from ..analysis.evaluation import evaluate
 from ..analysis.frequency_response import frequency_response, modelled_acceleration
+from ..analysis.identifiability import identifiability
+from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import HORIZONS, Predictions, filtered, predictions, skill, trajectory_horizons
-from ..analysis.traces import Traces, position_of
+from ..analysis.traces import Traces, os4_traces, position_of
 from ..bracket import GAUSSIAN_PRIOR
+from ..estimate import AbstractEstimator, fit_start
 from ..estimators import EquationError
-from ..flight import CHANNEL_NAMES, RATES
+from ..flight import CHANNEL_NAMES, RATES, STATE_NAMES, STATE_UNITS
+from ..models import MODELS
 from ..models.flight_model import without_recording
+from ..models.state import CASCADE_ORDER
 from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
-from ..shooting import ShootingProblem, with_room
+from ..shooting import ShootingProblem, padded, with_capacity
 from ..shooting.gains import LogNoise
-from .answers import VehicleAnswer, dominated, parameter_table, shared_fields, vehicle_constants
-from .data import Data, HeldOut, Progress, silent
-from .issues import issues_of_log, issues_of_vehicle
-from .quantities import vehicle_quantities
-from .results import PredictionSkill, RateSkill, RigidBody, SampleTime, VehicleIdentification
-from .verdict import judge, result_of
+from .answers import (
+    UNIT,
+    Answer,
+    OS4Answer,
+    VehicleAnswer,
+    dominated,
+    parameter_table,
+    shared_fields,
+    vehicle_constants,
+)
+from .data import Data, HeldOut, Progress, class_name, silent
+from .issues import issues_of_log, issues_of_os4, issues_of_vehicle
+from .quantities import os4_quantities, vehicle_quantities
+from .results import (
+    ChannelFit,
+    Constant,
+    OS4Identification,
+    ParameterEstimate,
+    PredictionSkill,
+    RateSkill,
+    RigidBody,
+    SampleTime,
+    Validation,
+    VehicleIdentification,
+)
+from .verdict import CONTRADICTED, result_of, verdicts_of
 
 # Predictions that a result keeps. They cover four minutes and take 200 kB of a page.
 _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
 REGRESSION = EquationError(memory=0.9)
 """The regression with which predictions are compared. This memory is the best on real flights."""
+
+
+def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name: str) -> OS4Identification:
+    """The result for an OS4, with rigid body, issues and verdicts. `name`: the estimator's name."""
+    search, flown = str(result_names(answer.estimate.result)), answer.evaluation
+    found = OS4Identification(
+        model=class_name(answer.problem.model, MODELS),
+        parameters=_alphas(answer, estimator.prior),
+        result=search,
+        issues=tuple(issues_of_log(data.findings)),
+        **shared_fields(data, answer, name),
+    )
+    if flown is None or answer.diagnostics is None:
+        return found
+    errors = np.where(np.isnan(flown.measured), np.nan, flown.errors)[:, : flown.problem.size]
+    found = msgspec.structs.replace(
+        found,
+        rigid_body=_rigid_body(answer),
+        fit=_channel_fits(answer.problem, answer.diagnostics),
+        validation=None if data.held_out is None else _validate_on(answer, data.held_out),
+        traces=os4_traces(flown) if flown.feasible else None,
+        correlations=residual_correlations(errors, flown.torques) if flown.feasible else None,
+    )
+    # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
+    issues = issues_of_os4(data, found, found.fit if estimator.shoots else {})
+    verdicts = verdicts_of(os4_quantities(found.parameters, found.rigid_body), issues)
+    # Only the alphas were requested. An alpha that the flight does not show is no fault of the answer.
+    wrong = [name for name in found.parameters if verdicts[name].status == CONTRADICTED]
+    result = result_of(verdicts, issues, search, wrong if search == "successful" else found.parameters)
+    return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
+
+
+def _alphas(answer: OS4Answer, prior: float) -> dict[str, ParameterEstimate]:
+    """The estimate of each alpha, with the noise above which it cannot be distinguished from 0."""
+    names, missing, limits = answer.problem.unknowns.names, {}, {}
+    if answer.evaluation is not None:
+        information = identifiability(answer.evaluation, answer.problem.unknowns.bracket)
+        notes, known = information.notes(names), information.identifiable & information.excited
+        missing = {name: notes[name] for i, name in enumerate(names) if not known[i] and name in notes}
+        limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
+    table = parameter_table(answer, prior, missing)
+    return {name: msgspec.structs.replace(row, noise_limit=limits.get(name)) for name, row in table.items()}
+
+
+def _rigid_body(answer: Answer) -> RigidBody:
+    """The moments of inertia that explain the alphas best; none if they are not identifiable."""
+    rigid = fit_inertia(answer.problem.model, answer.estimate.parameters, answer.estimate.covariance)
+    values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
+    if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
+        return RigidBody()
+    table = zip((*INERTIAS, "J_R"), values.tolist(), std.tolist(), strict=True)
+    constants = {name: Constant(value, error, UNIT) for name, value, error in table}
+    return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
+
+
+def _validate_on(answer: Answer, held_out: HeldOut) -> Validation:
+    """The fit of the parameters to another flight; only its initial state is estimated."""
+    other, name = eqx.tree_at(lambda p: p.sigma, held_out.problem, answer.problem.sigma), held_out.recording or ""
+    start, cost, feasible, _ = eqx.filter_jit(fit_start)(padded(other), answer.estimate.parameters)
+    if not bool(feasible):
+        return Validation(name, None, None)
+    diagnostics = residual_diagnostics(evaluate(other, answer.estimate.parameters, start), fitted=False)
+    return Validation(name, finite_or_none(cost), _channel_fits(other, diagnostics))
+
+
+def _channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str, ChannelFit]:
+    """The diagnostics of each measured channel, by its name."""
+    return {
+        STATE_NAMES[column]: ChannelFit(
+            rms=float(diagnostics.rms[i]),
+            unit=STATE_UNITS[column],
+            percent=finite_or_none(diagnostics.percent[i]),
+            level=float(diagnostics.level[i]),
+            level_p=float(diagnostics.level_p[i]),
+            correlation=float(diagnostics.colour[i]),
+            white_p=float(diagnostics.white_p[i]),
+            input_correlation=dict(zip(MOTIONS, diagnostics.input_correlation[i].tolist(), strict=True)),
+            input_p=float(diagnostics.input_p[i]),
+        )
+        for i, column in enumerate(CASCADE_ORDER[: problem.size])
+        if diagnostics.count[i] > 2
+    }
 
 
 def judge_vehicle(
@@ -77,8 +185,7 @@ def judge_vehicle(
         of_yaw = {YAW.coupling, YAW.inverse} & table.keys()
         table |= {name: msgspec.structs.replace(table[name], note=said) for name in of_yaw}
         still = (*still, *({YAW.motion} - {*still}))
-    values = as_float(np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count])
-    response = frequency_response(with_room(answer.problem, data.capacity), values)
+    response = frequency_response(with_capacity(answer.problem, data.capacity), as_float(answer.parameters))
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(answer, predicted)
     found = msgspec.structs.replace(
@@ -95,7 +202,7 @@ def judge_vehicle(
     )
     quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
     issues = issues_of_vehicle(answer, found, response, sample_times=sample_times, quantities=quantities, still=still)
-    verdicts = judge(quantities, issues)
+    verdicts = verdicts_of(quantities, issues)
     result = result_of(verdicts, issues, search, (ROLL.inertia, PITCH.inertia))
     return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
 
@@ -119,7 +226,6 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
     **Returns:** the answer's predictions at `HORIZONS`; its predictions in between, as trajectories; and the skill.
     """
     data, problem, names = answer.optimum.data, held_out.problem, answer.problem.unknowns.names
-    values = np.asarray(answer.estimate.parameters)[: len(names)]
 
     def predicted_by(values: np.ndarray, noise: LogNoise | None, horizons: tuple[float, ...] = HORIZONS) -> Predictions:
         parameters = values
@@ -131,10 +237,12 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
             known, _ = _disturbances(data, _together(data, held_out), parameters, noise)
         return predictions(problem, as_float(parameters), horizons=horizons, disturbance=known, noise=noise)
 
-    every = predicted_by(values, answer.optimum.noise, (*HORIZONS, *trajectory_horizons(float(problem.flight.dt))))
+    horizons = (*HORIZONS, *trajectory_horizons(float(problem.flight.dt)))
+    every = predicted_by(answer.parameters, answer.optimum.noise, horizons)
     predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
     own, fixed = skill(predicted), [name in answer.fixed for name in names]
-    regressed = np.asarray(_regressed(with_room(answer.problem, data.capacity), as_float(values), np.asarray(fixed)))
+    padded_problem, fitted = with_capacity(answer.problem, data.capacity), as_float(answer.parameters)
+    regressed = np.asarray(_regressed(padded_problem, fitted, np.asarray(fixed)))
     compared = skill(predicted_by(regressed, None))
     tables = (own.skill, own.std, own.rmse, own.persistence, compared.skill)
     rates = {
@@ -161,7 +269,7 @@ def _disturbances(
     its prediction from the sample before. The model is evaluated at the measured rates.
     """
     samples = problem.flight.time.shape[0]
-    problem = with_room(problem, max(samples, data.capacity))
+    problem = with_capacity(problem, max(samples, data.capacity))
     flight, rates = problem.flight, np.asarray(problem.flight.states)[:, RATES]
     modelled = np.pad(modelled_acceleration(problem, as_float(parameters)), ((0, 1), (0, 0)))
     of_rates = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
@@ -177,8 +285,7 @@ def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tupl
     optimum, data = answer.optimum, answer.optimum.data
     other = data.held_out
     problem = answer.problem if other is None or other.recording is not None else _together(data, other)
-    values = np.asarray(answer.estimate.parameters)[: answer.problem.unknowns.count]
-    disturbance, innovation = _disturbances(data, problem, values, optimum.noise)
+    disturbance, innovation = _disturbances(data, problem, answer.parameters, optimum.noise)
     flight = answer.problem.flight
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
     position = position_of(np.asarray(problem.flight.states, float))
