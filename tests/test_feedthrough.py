@@ -77,7 +77,7 @@ def assert_same_directions(found, expected, *, atol):
 
 
 def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng):
-    """By the whole matrix of the regression, with means by their recursion. One stretch is too short for a row."""
+    """By the whole matrix of the regression. One stretch is too short for a row."""
     torque, rates = in_loop(rng, pilot=1.0)
     stretch = np.repeat([0, 1, 2], [250, 8, SAMPLES - 258])
     found, lags = of_axes(torque, rates, stretch), 10
@@ -85,14 +85,7 @@ def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng):
     assert not np.delete(found, rows, axis=0).any()
     for axis in range(3):
         samples = np.column_stack([torque[:, :, axis], rates[:, axis]])
-        both = np.column_stack([torque[:, :, axis].mean(axis=1), rates[:, axis]])
-        means = np.zeros((SAMPLES, 3, 2))
-        for k in range(SAMPLES):
-            before = means[k - 1] if k and stretch[k] == stretch[k - 1] else 0.0
-            kept = np.exp(-DT / np.array([[0.1], [0.3], [1.0]]))
-            means[k] = kept * before + (1 - kept) * (both[k] - both.mean(axis=0))
-        lagged_samples = [samples[rows - lag] for lag in range(1, lags + 1)]
-        past = np.column_stack([np.ones(len(rows)), *lagged_samples, means[rows - 1].reshape(len(rows), -1)])
+        past = np.column_stack([np.ones(len(rows)), *(samples[rows - lag] for lag in range(1, lags + 1))])
         now = torque[rows, :, axis]
         rest = now - past @ np.linalg.lstsq(past, now)[0]
         directions = np.sqrt(len(rows)) * np.linalg.svd(rest, full_matrices=False)[0][:, :FEEDTHROUGHS]

@@ -44,7 +44,7 @@ def to_earth(angles):
 
 @functools.cache
 def trajectory(dt):
-    """A recording, its velocity in the body, and the same after its slow part and its mean climb are forgotten."""
+    """A recording, its velocity in the body, and the same after the slow part of it is forgotten."""
     time = dt * np.arange(round(SECONDS / dt))
 
     def follow(t, state):
@@ -57,7 +57,6 @@ def trajectory(dt):
     states = np.full((time.size, 12), np.nan)
     states[:, ANGLES], states[:, RATES], states[:, VELOCITY] = angles, rates, exact[:, :3]
     turn = to_earth(angles)
-    exact[:, 5] -= exact[:, 5].mean()
     true, forgetful = (turn.apply(part, inverse=True) for part in (exact[:, :3], exact[:, 3:]))
     return Recording(time, np.full((time.size, 4), 100.0), states, force), true, forgetful
 

@@ -278,7 +278,7 @@ def _dead_reckoned(
 ) -> Float[np.ndarray, "samples 3"]:
     """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays."""
     push = force - GRAVITY * up
-    push -= _mean_along(push, up)  # an error of the accelerometer, rather than a lasting acceleration
+    push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
     kept, (vx, vy, vz), velocities = math.exp(-dt / forgets), (0.0, 0.0, 0.0), []
     for (p, q, r), (ax, ay, az) in zip(rates.tolist(), push.tolist(), strict=True):
         velocities.append((vx, vy, vz))
@@ -287,15 +287,7 @@ def _dead_reckoned(
             kept * (vy + dt * (ay - r * vx + p * vz)),
             kept * (vz + dt * (az - p * vy + q * vx)),
         )
-    found = np.array(velocities)
-    return found - _mean_along(found, up)  # a vehicle that stays in its room has no mean vertical velocity
-
-
-def _mean_along(
-    vectors: Float[np.ndarray, "samples 3"], up: Float[np.ndarray, "samples 3"]
-) -> Float[np.ndarray, "samples 3"]:
-    """The mean vertical part of `vectors`, along the axes of the body."""
-    return (vectors * up).sum(axis=1).mean() * up
+    return np.array(velocities)
 
 
 def _upright(

@@ -14,8 +14,6 @@ The past predicts the torque of a sample except for its *input innovation* v, wh
 See `docs/method/filter_error.md`.
 """
 
-import itertools
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -26,7 +24,6 @@ FEEDTHROUGHS = max(COUNTS)
 LAGGED_COUNTS = (3, 3, 3, 1)
 """The same if motors follow commands in short samples: the innovations of the sample and of samples before it. With
 fewer, rotor_lag and rotor_delay have several minima; with more, the response of the motors is lost."""
-MEANS = 0.1, 0.3, 1.0  # s; time constants of means of the past, which hold what a controller of attitude integrates
 # A smaller share of a signal may be due to rounding.
 _ROUNDING = 1e-6
 # Rows of one matrix product. More would not fit the cache, and BLAS would divide so small a product among threads.
@@ -44,25 +41,25 @@ def input_innovations(
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
-    The prediction is a linear regression on earlier samples of the input and of the measured motion, and on exponential
-    means of all that came before. The result is the `count` combinations of the parts of a sample with most of the
-    residual, with arbitrary signs; 0 at the beginning of a stretch.
+    The prediction is a linear regression on earlier samples of the input and of the measured motion. The result is the
+    `count` combinations of the parts of a sample with most of the residual, with arbitrary signs; 0 at the beginning of
+    a stretch.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN counts as the mean.
     - `stretch`: the number of the uninterrupted stretch of each sample.
-    - `dt`: sample time [s]. `memory`: how far back single samples count [s], at least three.
+    - `dt`: sample time [s]. `memory`: how far back the past reaches [s], at least three samples.
     """
     lags, (samples, parts) = max(round(memory / dt), 3), inputs.shape
     found, rows = np.zeros((samples, count)), np.arange(lags, samples)
     rows = rows[stretch[rows] == stretch[rows - lags]]
-    if len(rows) <= 1 + lags * (parts + 1) + 2 * len(MEANS):
+    if len(rows) <= 1 + lags * (parts + 1):
         return found
     series = np.ones((samples, parts + 2))
     series[:, :parts] = _standard(inputs)
     known = measured[np.isfinite(measured)]
     series[:, parts] = _standard(np.nan_to_num(measured - (known.mean() if known.size else 0.0)))
-    rest = _unexplained(series, _means(series, parts, stretch, dt), parts, rows, lags)
+    rest = _unexplained(series, parts, rows, lags)
     _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
     scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
@@ -87,30 +84,10 @@ def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarra
     return about / (about.std() or 1.0)
 
 
-def _means(
-    series: Float[np.ndarray, "samples series"], parts: int, stretch: Int[np.ndarray, " samples"], dt: float
-) -> Float[np.ndarray, "samples means"]:
-    """Exponential means of the input and of the motion up to each sample of a stretch, with time constants `MEANS`."""
-    from scipy.signal import lfilter  # slow to import
-
-    both = np.stack([series[:, :parts].mean(axis=1), series[:, parts]])
-    found = np.empty((len(MEANS), *both.shape))
-    edges = [0, *(np.flatnonzero(np.diff(stretch)) + 1), len(series)]
-    for place, time in enumerate(MEANS):
-        kept = np.exp(-dt / time)
-        for start, end in itertools.pairwise(edges):
-            found[place, :, start:end] = lfilter([1 - kept], [1, -kept], both[:, start:end])
-    return found.reshape(-1, len(series)).T
-
-
 def _unexplained(
-    series: Float[np.ndarray, "samples series"],
-    means: Float[np.ndarray, "samples means"],
-    targets: int,
-    rows: Int[np.ndarray, " rows"],
-    lags: int,
+    series: Float[np.ndarray, "samples series"], targets: int, rows: Int[np.ndarray, " rows"], lags: int
 ) -> Float[np.ndarray, "rows targets"]:
-    """The residual of the first `targets` series at these rows, after a regression on `lags` samples and on `means`.
+    """The residual of the first `targets` series at these rows, after a regression on `lags` samples of all series.
 
     It uses normal equations, because the matrix of the regression would not fit into memory. A ridge keeps them regular
     if series differ by rounding only. A second pass removes the errors of the first by ridge and rounding.
@@ -120,29 +97,18 @@ def _unexplained(
     rest = series[rows, :targets]
     starts = np.flatnonzero(np.diff(rows, prepend=-1) > 1)
     firsts = np.concatenate([np.arange(*ends, _BLOCK) for ends in zip(starts, [*starts[1:], len(rows)], strict=True)])
-    blocks, rows_of_blocks = (np.split(each, firsts[1:]) for each in (rest, rows))
-    windows = [series[each[0] - lags : each[-1] + 1] for each in rows_of_blocks]
-    means_of_blocks = [means[each[0] - 1 : each[-1]] for each in rows_of_blocks]
-    pasts = [
-        [*(window[lags - lag : -lag] for lag in range(1, lags + 1)), of_block]
-        for window, of_block in zip(windows, means_of_blocks, strict=True)
+    windows = [series[block[0] - lags : block[-1] + 1] for block in np.split(rows, firsts[1:])]
+    blocks = [
+        ([window[lags - lag : -lag] for lag in range(1, lags + 1)], block)
+        for window, block in zip(windows, np.split(rest, firsts[1:]), strict=True)
     ]
-
-    def past_times(columns: list[Float[np.ndarray, "_ columns"]]) -> Float[np.ndarray, "regressors columns"]:
-        both = [*zip(pasts, columns, strict=True)]
-        return np.concatenate([sum(past[place].T @ block for past, block in both) for place in range(lags + 1)])
-
-    edge = lags * series.shape[1]
-    products = np.zeros((edge + means.shape[1],) * 2)
-    products[:edge, :edge] = _lagged_products(windows, lags)
-    products[:, edge:] = past_times(means_of_blocks)
+    products = _lagged_products(windows, lags)
     products.flat[:: len(products) + 1] += _ROUNDING**2 * len(rows)
     factor = cho_factor(products)
     for _ in range(2):
-        coefficients = np.split(
-            cho_solve(factor, past_times(blocks)), range(series.shape[1], edge + 1, series.shape[1])
-        )
-        for past, block in zip(pasts, blocks, strict=True):
+        common = [sum(past[lag].T @ block for past, block in blocks) for lag in range(lags)]
+        coefficients = np.split(cho_solve(factor, np.concatenate(common)), lags)
+        for past, block in blocks:
             block -= sum(map(np.matmul, past, coefficients))
     return rest
 
