@@ -45,11 +45,10 @@ class Bracket(eqx.Module):
         with np.errstate(all="ignore"):  # infinite ends, as JAX has them
             return cls(middle - reach, middle + reach)
 
-    @staticmethod
-    @eqx.filter_jit  # one compiled program instead of one for each operation
-    def default(model: AbstractModel) -> "Bracket":
+    @classmethod
+    def default(cls, model: AbstractModel) -> "Bracket":
         """The bracket around `model.alpha`, with the model's half-widths."""
-        return Bracket.around(model.alpha, model.half_width)
+        return _default(model)
 
     @property
     def center(self) -> Parameters:
@@ -69,3 +68,8 @@ class Bracket(eqx.Module):
 def _numpy_if_known(a: Array, b: Array) -> tuple[Numeric, Numeric]:
     """Both arrays, as NumPy if their values are known: arithmetic then needs no compiled program."""
     return (a, b) if isinstance(a, Tracer) or isinstance(b, Tracer) else (np.asarray(a), np.asarray(b))
+
+
+@eqx.filter_jit  # one compiled program instead of one for each operation
+def _default(model: AbstractModel) -> Bracket:
+    return Bracket.around(model.alpha, model.half_width)

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
 def test_real_flight(shared_flights, tmp_path):
     report = result_of(
-        tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=8.0
+        tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
     )
     plot(tmp_path, "real_flight")
     (row,) = report["estimators"]["filter-error"]["flights"].values()

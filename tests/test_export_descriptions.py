@@ -3,6 +3,7 @@
 import json
 import xml.etree.ElementTree as ElementTree
 
+import msgspec
 import numpy as np
 import pytest
 from flight_csvs import write_log
@@ -11,6 +12,7 @@ from strange import parsed
 from synthetic_results import vehicle_result
 
 from jaxos4.export import TARGETS, export_vehicle, read_result
+from jaxos4.identification.verdict import Issue
 from jaxos4.recording import read_recording
 from jaxos4.recording.inspection import airframe_draft
 
@@ -104,7 +106,10 @@ def test_hostile_names_are_in_comments_alone(tmp_path):
     @given(name=NAMES)
     @settings(max_examples=200)
     def law(name):
-        hostile = found._replace(source=name, result="no_skill", doubts=(name,), notes=(name, f"Note: {name}"))
+        refused = msgspec.structs.replace(
+            found.identification, result="no_skill", issues=(Issue("no_skill", name, name),)
+        )
+        hostile = found._replace(source=name, identification=refused, notes=(name, f"Note: {name}"))
         for target in TARGETS:
             written = export_vehicle(hostile, target)
             assert parsed(written.text, target) == usual[target]

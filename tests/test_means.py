@@ -183,7 +183,7 @@ def answers(logged="speeds", **settings):
     references = jaxos4.random_references(duration=20.0, dt=dt, key=keys[0])
     flight = jaxos4.fly_closed_loop(loop, references, dt=dt, key=keys[1])
     terms = ("offset", "damping", "delay", "reaction", "accelerometer") + ("lag",) * (logged == "commands")
-    fits = jaxos4.VehicleSettings(terms=terms, sample_time=0.008, holdout=0.0)
+    fits = jaxos4.VehicleSettings(terms=terms, holdout=0.0)
     found = []
     for data in prepare_vehicle(as_recordings(flight), CINERAT, fits):
         if round(1e3 * float(data.problem.flight.dt)) in (8, 32):

@@ -115,7 +115,8 @@ def solve(
         first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
         before = chosen(from_start, first, best)
         stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
-        # Traced once, although a solver may call it twice.
+        # Traced once, although a solver may call it twice. `partial` makes another function of it: of an equal one, JAX
+        # would find the trace of another search.
         stage = stage._replace(local_model=jax.jit(functools.partial(stage.local_model), inline=True))
         # A start that was given may lie beyond the reach.
         before = before._replace(unknowns=jnp.clip(before.unknowns, *stage.limits(solver.reach)))

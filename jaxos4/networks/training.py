@@ -92,8 +92,7 @@ def train(
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
-    state = eqx.filter_jit(_optimiser(0.0).init)(eqx.filter(regressor, eqx.is_inexact_array))
-    rates = _rates(steps, settings.learning_rate)
+    state, rates = _first_state(regressor), _rates(steps, settings.learning_rate)
     flown = batch * CHECK // USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
     for number, first in enumerate(range(0, steps, CHECK)):
@@ -166,6 +165,11 @@ def _advance(
 
 def _joined(chunks: list[Flights]) -> Flights:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
+
+
+@eqx.filter_jit  # by name: a function that is made in each call would be compiled in each call
+def _first_state(regressor: Regressor) -> PyTree:
+    return _optimiser(0.0).init(eqx.filter(regressor, eqx.is_inexact_array))
 
 
 def _optimiser(rate: Scalar | float) -> Any:
