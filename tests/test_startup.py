@@ -109,6 +109,15 @@ import diffrax
     assert process.returncode == 0, process.stderr
 
 
+@pytest.mark.slow
+def test_the_import_of_a_study_starts_no_backend_of_jax():
+    """Workers of a cluster are forked from a process that has imported it, and the threads of a backend are lost."""
+    process = start(
+        code="import jaxos4.study.run, jax; jax.config.update('jax_num_cpu_devices', 2)"
+    )  # raises if one runs
+    assert process.returncode == 0, process.stderr
+
+
 def test_all_public_names_are_there():
     for package in ("jaxos4", "jaxos4.estimators", "jaxos4.report"):
         module = importlib.import_module(package)

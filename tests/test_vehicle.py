@@ -133,8 +133,8 @@ def test_inertias_lie_in_their_intervals_and_bisection_finds_what_newtons_method
 
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
-    small = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
-    monkeypatch.setattr(networks, "VEHICLE", small)
+    small = {"steps": 20, "batch": 16, "noise": (1.0, 1.0), "held_out": 1000}
+    monkeypatch.setattr(networks, "VEHICLE_SETTINGS", small)
     flight, airframe = (lane(part, 0) for part in flown())
     shorter = jax.tree.map(lambda leaf: leaf[:1001] if leaf.ndim else leaf, flight)
     settings = jaxos4.VehicleSettings(terms=("offset", "lag"), sample_time=0.016, holdout=0.0)

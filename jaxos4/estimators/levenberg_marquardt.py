@@ -13,11 +13,7 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Count, Scalar, integer, setting
 from ..estimate import REACH
 from ..linalg import joint_factor, movable, slopes_along
-from ..shooting import (
-    LocalModel,
-    Stage,
-    WindowUnknowns,
-)
+from ..shooting import LocalModel, Stage, WindowUnknowns
 from .solver import AbstractSolver, Found, chosen, cost_of
 
 _COARSE = 1e-3  # the smallest `step_tolerance` of all stages except the last

@@ -293,7 +293,7 @@ def _given_fixed(
 GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
 """A network, or its file."""
 SEED_STEPS = 2000  # of training a network that only gives a search its start
-VEHICLE = NetworkEstimator(steps=250, batch=64, noise=(1.0, 1.0), held_out=2000)
+VEHICLE_SETTINGS = {"steps": 250, "batch": 64, "noise": (1.0, 1.0), "held_out": 2000}
 MAX_WINDOWS = 24  # that the network of a vehicle sees, however long the flight is
 FLYABLE = 0.5  # share of a vehicle's bracket in which nearly all simulated flights can be flown
 
@@ -322,7 +322,7 @@ def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> Tr
     unknowns = problem.unknowns
     bracket = Bracket.around(unknowns.center, FLYABLE * unknowns.half_width)
     with named(name):
-        return VEHICLE.fit(problem, bracket, key=jax.random.key(seed))
+        return NetworkEstimator(**VEHICLE_SETTINGS).fit(problem, bracket, key=jax.random.key(seed))
 
 
 def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:
