@@ -8,9 +8,10 @@ import pytest
 import scipy.optimize
 from helpers import documented_class, noisy_states, random_starts, same, standard_flight, standard_problem
 from lanes import HALF, names
-from likelihoods import MINIMUM, SLOPES, quadratic, squares, two_minima, valley
+from likelihoods import MINIMUM, SLOPES, misfit, narrow, quadratic, squares, two_minima, valley
 
 import jaxos4
+from jaxos4.estimators import FilterError
 from jaxos4.estimators.levenberg_marquardt import LevenbergMarquardt
 
 IBSS = jaxos4.IBSS
@@ -50,6 +51,22 @@ def test_a_search_that_is_stopped_says_so(name):
     assert names(found) == "max_sweeps"
     assert int(found.sweeps) == next(iter(settings.values()))
     assert np.isfinite(found.parameters).all()
+
+
+def test_a_step_that_failed_shows_the_curvature_that_the_information_lacks():
+    """Damping alone shortens the steps of all unknowns, and needs four times as many."""
+    best = scipy.optimize.minimize(lambda x: np.square(misfit(x)).sum() / 2, np.zeros(2), tol=1e-12)
+    found = LevenbergMarquardt()(squares(misfit))
+    np.testing.assert_allclose(found.parameters, best.x, atol=1e-3)
+    assert int(found.sweeps) < 30
+
+
+@pytest.mark.parametrize("stride", [(0.1, np.inf), (np.inf, 0.1)])
+@pytest.mark.parametrize("solver", [LevenbergMarquardt(), FilterError().solver])
+def test_strides_end_no_search_before_the_minimum(solver, stride):
+    found = solver(squares(narrow, center=(-1.0, 1.1), half_width=5.0, stride=np.array(stride)))
+    assert names(found) == "successful"
+    assert (np.abs(found.parameters - MINIMUM) <= 0.05 * found.std).all()
 
 
 @every_solver

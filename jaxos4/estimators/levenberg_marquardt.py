@@ -1,6 +1,10 @@
-"""Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood.
+"""Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood, corrected by a secant where a step failed.
 
-Reference: Marquardt 1963, SIAM J. Appl. Math. 11(2).
+Gauss-Newton ignores the second derivatives of the residuals, so along some unknowns, such as a delay, its steps are too
+long. More damping would shorten them along all unknowns. But the gradient where a step failed shows the curvature that
+is missing.
+
+References: Marquardt 1963, SIAM J. Appl. Math. 11(2); Dennis, Gay and Welsch 1981, ACM Trans. Math. Softw. 7(3).
 """
 
 from typing import ClassVar, NamedTuple
@@ -20,6 +24,8 @@ _COARSE = 1e-3  # the smallest `step_tolerance` of all stages except the last
 _FACTOR = 10.0  # by which the damping falls after a step that succeeded, and rises after one that failed
 # Information in 1/stride^2 that is always added for unknowns with a stride, whose own information is inexact.
 _STRIDE_INFORMATION = 0.3
+# A secant is ignored if its curvature exceeds the information about the unknowns by more: that would be rounded away.
+_STEEPEST = 1e3
 
 
 class State(NamedTuple):
@@ -28,6 +34,7 @@ class State(NamedTuple):
     - `best`, `model`: the best unknowns so far, and the local model there.
     - `trial`: where the shot will be.
     - `damping`: of the last step, or of the first one.
+    - `corrected`: whether the trial uses a secant.
     - `shots`: the number of shots so far.
     - `done`: whether the stage ended by itself.
     """
@@ -36,12 +43,15 @@ class State(NamedTuple):
     model: LocalModel
     trial: WindowUnknowns
     damping: Scalar
+    corrected: Bool[Array, ""]
     shots: Count
     done: Bool[Array, ""]
 
 
 class LevenbergMarquardt(AbstractSolver[State]):
     """Gauss-Newton steps, which are damped more after a step that failed, and less after one that succeeded.
+
+    The step after a failure is also corrected by a secant.
 
     - `step_tolerance`: a stage ends with a step that moves no unknown by more than this fraction of its initial
       uncertainty. Cost and covariance are those before this step. 0: no step is short enough.
@@ -74,22 +84,27 @@ class LevenbergMarquardt(AbstractSolver[State]):
     def init(self, stage: Stage, before: Found) -> State:
         """The first trial is the start. Any cost is better than none."""
         damping = jnp.full((), _FACTOR * self.damping, dtype=float)
-        none, going = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        return State(before.unknowns, before.model, before.unknowns, damping, none, going)
+        none, no = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
+        return State(before.unknowns, before.model, before.unknowns, damping, no, none, no)
 
     def step(self, stage: Stage, state: State) -> State:
         """Shoot at the trial, keep the better, and propose the next trial."""
-        model, before = stage.local_model(state.trial), state.model
-        better = (state.shots == 0) | (cost_of(model) < cost_of(before))
-        best, model = chosen(better, (state.trial, model), (state.best, before))
-        damping = state.damping * jnp.where(better, 1 / _FACTOR, _FACTOR)
+        found, before = stage.local_model(state.trial), state.model
+        better = (state.shots == 0) | (cost_of(found) < cost_of(before))
+        best, model = chosen(better, (state.trial, found), (state.best, before))
+        secant = state.trial - state.best, found.gradient - before.gradient
+        corrected = ~better & found.feasible.all() & jnp.isfinite(found.gradient).all()
+        curvature = jnp.where(corrected, jax.vmap(_with_secant)(model.information, *secant), model.information)
+        eased = jnp.where(state.corrected, 1.0, 1 / _FACTOR)  # a corrected step says nothing about the damping
+        damping = state.damping * jnp.where(better, eased, _FACTOR)
         damping = jnp.maximum(damping, self.least_damping)
-        step = jnp.clip(self._step(stage, best, model, damping), -stage.stride, stage.stride)
-        trial = jnp.clip(best + step, *stage.limits(self.reach))
+        whole = self._step(stage, best, model.gradient, curvature, damping)
+        trial = jnp.clip(best + _within(stage.stride, whole), *stage.limits(self.reach))
         step = trial - best
-        small = self._is_small(stage, step, model, damping)
+        small = self._is_small(stage, step) | self._is_stalled(stage, whole, model, damping)
         done = small | ~jnp.isfinite(step).all()
-        return State(jnp.where(small, trial, best), model, trial, damping, state.shots + 1, done)
+        end = jnp.where(small & ~corrected, trial, best)  # a last step that no shot confirms, unless one just failed
+        return State(end, model, trial, damping, corrected, state.shots + 1, done)
 
     def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
         """Whether a step was small, or there were too many."""
@@ -102,24 +117,35 @@ class LevenbergMarquardt(AbstractSolver[State]):
         steps = jnp.maximum(state.shots - 1, 0)  # a search that is skipped makes no shot
         return Found(state.best, state.model, before.spread, steps, state.shots * (1 + tangents), state.done)
 
-    def _is_small(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Bool[Array, ""]:
-        """Whether a step ends the stage."""
+    def _is_small(self, stage: Stage, step: WindowUnknowns) -> Bool[Array, ""]:
+        """Whether a step is so short that it ends the stage."""
         tolerance = jnp.where(stage.last, self.step_tolerance, jnp.maximum(self.step_tolerance, _COARSE))
-        unit, least = self._unit(stage, model.information), self._least(stage)
-        # The expected reduction of the cost, as if the step were hardly damped.
-        eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
-        left = -(eased * model.gradient * step).sum()
-        stalled = (left < self.gain_tolerance) | ((damping > 1) & (left < self.flat))
-        return (jnp.abs(step) <= tolerance * stage.off).all() | stalled
+        return (jnp.abs(step) <= tolerance * stage.off).all()
 
-    def _step(self, stage: Stage, best: WindowUnknowns, model: LocalModel, damping: Scalar) -> WindowUnknowns:
-        """The damped Gauss-Newton step of each window's unknowns; 0 for those that are fixed or at their limit."""
+    def _is_stalled(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Bool[Array, ""]:
+        """Whether a step, before it is limited, promises so little that it ends the stage."""
+        unit, least = self._unit(stage, model.information), self._least(stage)
+        # The expected reduction of the cost: by this step, or as if it were hardly damped.
+        eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
+        promised = -model.gradient * step
+        left = jnp.maximum(promised.sum(), (eased * promised).sum())
+        return (left < self.gain_tolerance) | ((damping > 1) & (left < self.flat))
+
+    def _step(
+        self,
+        stage: Stage,
+        best: WindowUnknowns,
+        gradient: WindowUnknowns,
+        curvature: Float[Array, "windows n n"],
+        damping: Scalar,
+    ) -> WindowUnknowns:
+        """The damped step of each window's unknowns; 0 for those that are fixed or at their limit."""
         count = stage.unknowns.count
-        moves = movable(best, model.gradient, stage.limits(self.reach), count) & stage.searched
-        information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
-        added = damping * self._unit(stage, information) + self._least(stage)
-        basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
-        slopes = slopes_along(basis, jnp.where(moves, model.gradient, 0.0), count)
+        moves = movable(best, gradient, stage.limits(self.reach), count) & stage.searched
+        curvature = jnp.where(moves[:, :, None] & moves[:, None, :], curvature, 0.0)
+        added = damping * self._unit(stage, curvature) + self._least(stage)
+        basis = joint_factor(curvature + jax.vmap(jnp.diag)(added), count).basis
+        slopes = slopes_along(basis, jnp.where(moves, gradient, 0.0), count)
         return -(basis * slopes[:, None, :]).sum(axis=-1)
 
     def _least(self, stage: Stage) -> WindowUnknowns:
@@ -132,3 +158,27 @@ class LevenbergMarquardt(AbstractSolver[State]):
             diagonal = jnp.diagonal(information, axis1=1, axis2=2)
             return jnp.where(diagonal > 0, diagonal, 1.0)
         return 1 / jnp.square(stage.off).at[:, : stage.unknowns.count].multiply(stage.off.shape[0])
+
+
+def _within(stride: WindowUnknowns, step: WindowUnknowns) -> WindowUnknowns:
+    """The step, shortened until no unknown moves by more than its stride. Its direction stays one of descent."""
+    finite = jnp.isfinite(stride)
+    longest = jnp.where(finite, stride, 1.0)
+    return step * jnp.where(finite, longest / jnp.maximum(jnp.abs(step), longest), 1.0).min()
+
+
+def _with_secant(
+    information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
+) -> Float[Array, "n n"]:
+    """The information, corrected so that it predicts the `change` of the gradient over a step.
+
+    This is the update of Broyden, Fletcher, Goldfarb and Shanno, which stays positive definite. It has no effect where
+    the cost is less curved than by the information, because longer steps would be a risk.
+    """
+    predicted, diagonal = information @ step, jnp.diagonal(information)
+    seen, expected = change @ step, predicted @ step
+    steepness = (jnp.square(change) / jnp.where(diagonal > 0, diagonal, 1.0)).sum()
+    applies = (expected > 0) & (seen > expected) & (steepness < _STEEPEST * seen)
+    new = jnp.outer(change, change) / jnp.where(applies, seen, 1.0)
+    old = jnp.outer(predicted, predicted) / jnp.where(applies, expected, 1.0)
+    return information + jnp.where(applies, new - old, 0.0)

@@ -25,6 +25,16 @@ def valley(x):
     return 10 * jnp.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]])
 
 
+def narrow(x):
+    """A valley along which both unknowns move together. The minimum is (0.4, -0.3)."""
+    return jnp.stack([30 * (x[0] + x[1] - 0.1), 5 * (x[0] - x[1] - 0.7)])
+
+
+def misfit(x):
+    """Residuals that remain, so that Gauss-Newton steps in x are four times too long. y is known less well."""
+    return jnp.stack([5 * (x[0] - 0.4), 10 + 4 * (x[0] - 0.3) ** 2, 0.3 * (x[1] + 0.3), 0.2 * x[0] * x[1]])
+
+
 def two_minima(x):
     """Near y = -1 and y = 1; the second is the lower one."""
     return jnp.stack([5 * x[0], 5 * (x[1] ** 2 - 1), x[1] - 1])
