@@ -112,9 +112,8 @@ import diffrax
 @pytest.mark.slow
 def test_the_import_of_a_study_starts_no_backend_of_jax():
     """Workers of a cluster are forked from a process that has imported it, and the threads of a backend are lost."""
-    process = start(
-        code="import jaxos4.study.run, jax; jax.config.update('jax_num_cpu_devices', 2)"
-    )  # raises if one runs
+    set_devices = "jax.config.update('jax_num_cpu_devices', 2)"  # raises if one runs
+    process = start(code=f"import jaxos4.study.run, jax; {set_devices}")
     assert process.returncode == 0, process.stderr
 
 

@@ -181,8 +181,7 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
     assert {"alpha1", "alpha4", "alpha7"} <= set(answer.fixed)
     # In a hover, the controller's answers to the noise of the gyro show these.
     assert {"alpha3", "alpha6", "rotor_lag"}.isdisjoint(answer.fixed)
-    off = np.asarray(answer.estimate.parameters)[[2, 5]] - 1 / np.asarray(CRAZYFLIE.inertia)[:2]
-    assert (np.abs(off) < 3 * std[[2, 5]]).all()
+    assert (np.abs(of_inertias([answer.estimate.parameters]) - 1) < 3 * of_inertias([std])).all()
     assert (std >= answer.bound * (1 - 1e-9)).all()
     assert set(answer.disturbances) == {"p", "q", "r"}
 

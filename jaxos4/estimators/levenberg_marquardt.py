@@ -34,7 +34,7 @@ class State(NamedTuple):
     - `best`, `model`: the best unknowns so far, and the local model there.
     - `trial`: where the shot will be.
     - `damping`: of the last step, or of the first one.
-    - `corrected`: whether the trial uses a secant.
+    - `corrected`: whether the trial follows a step that failed, whose secant corrects it.
     - `shots`: the number of shots so far.
     - `done`: whether the stage ended by itself.
     """
@@ -95,11 +95,13 @@ class LevenbergMarquardt(AbstractSolver[State]):
         secant = state.trial - state.best, found.gradient - before.gradient
         corrected = ~better & found.feasible.all() & jnp.isfinite(found.gradient).all()
         curvature = jnp.where(corrected, jax.vmap(_with_secant)(model.information, *secant), model.information)
+        curved = model._replace(information=curvature)
         eased = jnp.where(state.corrected, 1.0, 1 / _FACTOR)  # a corrected step says nothing about the damping
         damping = state.damping * jnp.where(better, eased, _FACTOR)
         damping = jnp.maximum(damping, self.least_damping)
-        whole = self._step(stage, best, model.gradient, curvature, damping)
-        trial = jnp.clip(best + _within(stage.stride, whole), *stage.limits(self.reach))
+        whole = self._step(stage, best, curved, damping)
+        strides = jnp.maximum(jnp.abs(whole) / stage.stride, 1.0).max()  # shorter in all unknowns: still a descent
+        trial = jnp.clip(best + whole / strides, *stage.limits(self.reach))
         step = trial - best
         small = self._is_small(stage, step) | self._is_stalled(stage, whole, model, damping)
         done = small | ~jnp.isfinite(step).all()
@@ -131,21 +133,14 @@ class LevenbergMarquardt(AbstractSolver[State]):
         left = jnp.maximum(promised.sum(), (eased * promised).sum())
         return (left < self.gain_tolerance) | ((damping > 1) & (left < self.flat))
 
-    def _step(
-        self,
-        stage: Stage,
-        best: WindowUnknowns,
-        gradient: WindowUnknowns,
-        curvature: Float[Array, "windows n n"],
-        damping: Scalar,
-    ) -> WindowUnknowns:
+    def _step(self, stage: Stage, best: WindowUnknowns, model: LocalModel, damping: Scalar) -> WindowUnknowns:
         """The damped step of each window's unknowns; 0 for those that are fixed or at their limit."""
         count = stage.unknowns.count
-        moves = movable(best, gradient, stage.limits(self.reach), count) & stage.searched
-        curvature = jnp.where(moves[:, :, None] & moves[:, None, :], curvature, 0.0)
-        added = damping * self._unit(stage, curvature) + self._least(stage)
-        basis = joint_factor(curvature + jax.vmap(jnp.diag)(added), count).basis
-        slopes = slopes_along(basis, jnp.where(moves, gradient, 0.0), count)
+        moves = movable(best, model.gradient, stage.limits(self.reach), count) & stage.searched
+        information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
+        added = damping * self._unit(stage, information) + self._least(stage)
+        basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
+        slopes = slopes_along(basis, jnp.where(moves, model.gradient, 0.0), count)
         return -(basis * slopes[:, None, :]).sum(axis=-1)
 
     def _least(self, stage: Stage) -> WindowUnknowns:
@@ -158,13 +153,6 @@ class LevenbergMarquardt(AbstractSolver[State]):
             diagonal = jnp.diagonal(information, axis1=1, axis2=2)
             return jnp.where(diagonal > 0, diagonal, 1.0)
         return 1 / jnp.square(stage.off).at[:, : stage.unknowns.count].multiply(stage.off.shape[0])
-
-
-def _within(stride: WindowUnknowns, step: WindowUnknowns) -> WindowUnknowns:
-    """The step, shortened until no unknown moves by more than its stride. Its direction stays one of descent."""
-    finite = jnp.isfinite(stride)
-    longest = jnp.where(finite, stride, 1.0)
-    return step * jnp.where(finite, longest / jnp.maximum(jnp.abs(step), longest), 1.0).min()
 
 
 def _with_secant(
