@@ -117,7 +117,7 @@ def test_the_commands_of_pages_run(story, run, tmp_path, request):
         mine.write_text(*complete)
         vehicle = airframe_table(CINERAT)
     every = dict.fromkeys(line for page in STORIES[story] for line in in_blocks(page))
-    here = [re.sub(SHORTER, "15", line) for line in every if not any(re.match(each, line) for each in ELSEWHERE)]
+    here = [re.sub(SHORTER, "20", line) for line in every if not any(re.match(each, line) for each in ELSEWHERE)]
     said = ""
     # A page shows what comes of a simulated flight before it says how to simulate one.
     for line in sorted(merged(here), key=lambda line: "simulate --closed-loop" not in line):

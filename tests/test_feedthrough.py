@@ -14,7 +14,7 @@ from jaxos4.closed_loop import fly_standard
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.logs import as_recordings
 from jaxos4.shooting import InnovationsProblem
-from jaxos4.shooting.feedthrough import FEEDTHROUGHS, input_innovations, lagged
+from jaxos4.shooting.feedthrough import FEEDTHROUGHS, MEANS, input_innovations, lagged
 from jaxos4.shooting.gains import LogNoise
 
 DT, SAMPLES = 0.01, 600
@@ -27,22 +27,32 @@ def rng():
     return np.random.default_rng(0)
 
 
-def in_loop(rng, *, pilot):
+def in_loop(rng, *, pilot, integral=0.0):
     """Torque in four parts of each sample, and the rates: a controller that answers the two samples before.
 
-    `pilot`: the standard deviation of what the controller adds of its own.
+    `pilot`: the standard deviation of what the controller adds of its own. `integral`: the gain on a leaky integral of
+    the rates, with a time constant of 0.3 s.
     """
     rates = np.cumsum(rng.normal(size=(SAMPLES, 3)), axis=0) / 10
-    torque = np.zeros((SAMPLES, 4, 3))
+    torque, slow = np.zeros((SAMPLES, 4, 3)), means_of(rates, np.zeros(SAMPLES, int), 0.3)
     for k in range(2, SAMPLES):
-        answer = -2 * rates[k - 1] + rates[k - 2] + 0.5 * torque[k - 1, 3]
+        answer = -2 * rates[k - 1] + rates[k - 2] + 0.5 * torque[k - 1, 3] - integral * slow[k - 1]
         torque[k] = answer + pilot * rng.normal(size=(4, 3))
     return torque, rates
 
 
-def of_axes(torque, rates, stretch, dt=DT, count=FEEDTHROUGHS):
+def means_of(series, stretch, time):
+    """Exponential means up to each sample, by their recursion."""
+    found, kept = np.zeros_like(series), np.exp(-DT / time)
+    for k in range(len(series)):
+        before = found[k - 1] if k and stretch[k] == stretch[k - 1] else 0.0
+        found[k] = kept * before + (1 - kept) * series[k]
+    return found
+
+
+def of_axes(torque, rates, stretch, dt=DT, count=FEEDTHROUGHS, **settings):
     """The input innovations about the three axes."""
-    each = (input_innovations(torque[:, :, i], rates[:, i], stretch, dt, count) for i in range(3))
+    each = (input_innovations(torque[:, :, i], rates[:, i], stretch, dt, count, **settings) for i in range(3))
     return np.stack([*each], axis=-1)
 
 
@@ -76,20 +86,32 @@ def assert_same_directions(found, expected, *, atol):
     np.testing.assert_allclose(found * np.sign(np.sum(found * expected, axis=0)), expected, atol=atol)
 
 
-def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng):
-    """By the whole matrix of the regression. One stretch is too short for a row."""
-    torque, rates = in_loop(rng, pilot=1.0)
-    stretch = np.repeat([0, 1, 2], [250, 8, SAMPLES - 258])
-    found, lags = of_axes(torque, rates, stretch), 10
-    rows = np.concatenate([np.arange(lags, 250), np.arange(258 + lags, SAMPLES)])
+@pytest.mark.parametrize(("lags", "times"), [(10, ()), (3, MEANS)])
+def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lags, times):
+    """By the whole matrix of the regression. One stretch is too short for a row. The controller integrates."""
+    torque, rates = in_loop(rng, pilot=1.0, integral=1.0)
+    stretch = np.repeat([0, 1, 2], [250, lags - 2, SAMPLES - 248 - lags])
+    found = of_axes(torque, rates, stretch, memory=lags * DT, means=times)
+    rows = np.concatenate([np.arange(lags, 250), np.arange(248 + 2 * lags, SAMPLES)])
     assert not np.delete(found, rows, axis=0).any()
     for axis in range(3):
         samples = np.column_stack([torque[:, :, axis], rates[:, axis]])
-        past = np.column_stack([np.ones(len(rows)), *(samples[rows - lag] for lag in range(1, lags + 1))])
+        both = np.column_stack([torque[:, :, axis].mean(axis=1), rates[:, axis]])
+        means = (means_of(both - both.mean(axis=0), stretch, time)[rows - 1] for time in times)
+        past = np.column_stack([np.ones(len(rows)), *(samples[rows - lag] for lag in range(1, lags + 1)), *means])
         now = torque[rows, :, axis]
         rest = now - past @ np.linalg.lstsq(past, now)[0]
         directions = np.sqrt(len(rows)) * np.linalg.svd(rest, full_matrices=False)[0][:, :FEEDTHROUGHS]
         assert_same_directions(found[rows, :, axis], directions, atol=1e-9)
+
+
+def test_means_count_where_they_explain_more_than_chance_does(rng):
+    """Regressors without effect would cost information about the parameters."""
+    stretch = np.zeros(SAMPLES, int)
+    without, integrates = in_loop(rng, pilot=1.0), in_loop(rng, pilot=1.0, integral=1.0)
+    np.testing.assert_array_equal(of_axes(*without, stretch, means=MEANS), of_axes(*without, stretch))
+    found, short = (of_axes(*integrates, stretch, memory=3 * DT, means=times) for times in (MEANS, ()))
+    assert (found != short).any(axis=(0, 1)).all()
 
 
 @pytest.mark.parametrize("parts", [[0, 0, 1, 1], [0, 1, 2, 2]])
@@ -217,6 +239,16 @@ def test_without_answers_within_a_sample_feedthroughs_are_fixed_and_gains_are_fr
         assert free["p_feedthrough_1"] == is_free
         assert free["p_rate_gain_1"]
         assert free["r_disturbance_gain_1"]
+
+
+@pytest.mark.parametrize("is_lagged", [False, True])
+def test_only_the_first_of_lagged_innovations_has_a_gain_on_the_disturbance(rng, is_lagged):
+    """A disturbance one sample later acts like a rate, so a second gain would be a direction without information."""
+    problem = standard(rng, passed=3)
+    each = InnovationsProblem(problem.problem, input_innovations=problem.input_innovations, lagged=is_lagged)
+    free = dict(zip(each.unknowns.names, np.asarray(each.unknowns.free), strict=True))
+    assert all(free[f"q_rate_gain_{i}"] for i in (1, 2, 3))
+    assert [bool(free[f"q_disturbance_gain_{i}"]) for i in (1, 2, 3)] == [True, not is_lagged, not is_lagged]
 
 
 def test_gains_of_no_input_innovation_are_fixed(rng):

@@ -19,7 +19,7 @@ from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLT
 from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.sensor_errors import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_capacity
-from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, input_innovations, lagged
+from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, MEANS, input_innovations, lagged
 from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions
 from .prepare_os4 import Intervals, bracket_of
 
@@ -154,18 +154,20 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     capacity = capacity_of(finest.fitted.time.shape[0])
     flight, commanded = shooting.flight, COMMANDS in prepared.available
     # Torque before a measured instant cannot answer it, and motors take longer to answer than a short sample lasts.
-    is_late = float(flight.averaging_time) == 0.0 or commanded
+    is_short, is_late = float(flight.dt) <= UNANSWERED, float(flight.averaging_time) == 0.0 or commanded
+    is_lagged = commanded and is_short
     return InnovationsProblem(
         with_capacity(shooting, capacity),
         segments=segments,
         least_noise=least_noise,
-        input_innovations=_input_innovations(shooting, capacity, commanded=commanded),
-        answers_within=not (is_late and float(flight.dt) <= UNANSWERED),
+        input_innovations=_input_innovations(shooting, capacity, commanded=commanded, is_lagged=is_lagged),
+        answers_within=not (is_late and is_short),
+        lagged=is_lagged,
     )
 
 
 def _input_innovations(
-    shooting: ShootingProblem, capacity: int, *, commanded: bool
+    shooting: ShootingProblem, capacity: int, *, commanded: bool, is_lagged: bool
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
     """Input innovations of body rates and vertical force, padded to `capacity`; `None` without `Flight.within`."""
     flight, columns = shooting.flight, shooting.columns
@@ -174,15 +176,17 @@ def _input_innovations(
     dt, (samples,), mixer = float(flight.dt), flight.time.shape, np.asarray(shooting.model.airframe.mixer)
     inputs = np.square(np.asarray(flight.within)) @ mixer.T
     stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
-    is_lagged = commanded and dt <= UNANSWERED
     counts = LAGGED_COUNTS if is_lagged else COUNTS
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
         if axis is not None:
             torque, count = inputs[:, :, axis], counts[axis]
-            own = input_innovations(torque, measured, stretch, dt, 1 if is_lagged else count)
-            found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
+            if is_lagged:
+                (own,) = input_innovations(torque, measured, stretch, dt, 1, means=MEANS).T
+                found[:samples, :count, channel] = lagged(own, stretch, count)
+            else:
+                found[:samples, :count, channel] = input_innovations(torque, measured, stretch, dt, count)
     return found
 
 

@@ -14,6 +14,8 @@ The past predicts the torque of a sample except for its *input innovation* v, wh
 See `docs/method/filter_error.md`.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -24,6 +26,8 @@ FEEDTHROUGHS = max(COUNTS)
 LAGGED_COUNTS = (3, 3, 3, 1)
 """The same if motors follow commands in short samples: the innovations of the sample and of samples before it. With
 fewer, rotor_lag and rotor_delay have several minima; with more, the response of the motors is lost."""
+MEANS = 0.1, 0.3, 1.0
+"""Time constants [s] of means that hold what a controller of attitude integrates; for commands in short samples."""
 # A smaller share of a signal may be due to rounding.
 _ROUNDING = 1e-6
 # Rows of one matrix product. More would not fit the cache, and BLAS would divide so small a product among threads.
@@ -38,28 +42,39 @@ def input_innovations(
     count: int,
     *,
     memory: float = 0.1,
+    means: Sequence[float] = (),
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
-    The prediction is a linear regression on earlier samples of the input and of the measured motion. The result is the
-    `count` combinations of the parts of a sample with most of the residual, with arbitrary signs; 0 at the beginning of
-    a stretch.
+    The prediction is a linear regression on earlier samples of the input and of the measured motion, and on exponential
+    means of both where these explain more than chance does, by Schwarz's criterion. The result is the `count`
+    combinations of the parts of a sample with most of the residual, with arbitrary signs; 0 at the beginning of a
+    stretch.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN counts as the mean.
     - `stretch`: the number of the uninterrupted stretch of each sample.
-    - `dt`: sample time [s]. `memory`: how far back the past reaches [s], at least three samples.
+    - `dt`: sample time [s]. `memory`: how far back single samples count [s], at least three.
+    - `means`: time constants of the means [s].
+
+    Reference: Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978).
     """
     lags, (samples, parts) = max(round(memory / dt), 3), inputs.shape
     found, rows = np.zeros((samples, count)), np.arange(lags, samples)
     rows = rows[stretch[rows] == stretch[rows - lags]]
-    if len(rows) <= 1 + lags * (parts + 1):
+    if len(rows) <= 1 + lags * (parts + 1) + 2 * len(means):
         return found
     series = np.ones((samples, parts + 2))
     series[:, :parts] = _standard(inputs)
     known = measured[np.isfinite(measured)]
     series[:, parts] = _standard(np.nan_to_num(measured - (known.mean() if known.size else 0.0)))
     rest = _unexplained(series, parts, rows, lags)
+    if means:
+        both = np.stack([series[:, :parts].mean(axis=1), series[:, parts]], axis=1)
+        less = _unexplained(series, parts, rows, lags, _exponential_means(both, stretch, dt, means))
+        power, remaining = (np.square(each.mean(axis=1)).mean() for each in (rest, less))
+        if remaining < power * len(rows) ** (-2 * len(means) / len(rows)):
+            rest = less
     _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
     scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
@@ -84,33 +99,67 @@ def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarra
     return about / (about.std() or 1.0)
 
 
-def _unexplained(
-    series: Float[np.ndarray, "samples series"], targets: int, rows: Int[np.ndarray, " rows"], lags: int
-) -> Float[np.ndarray, "rows targets"]:
-    """The residual of the first `targets` series at these rows, after a regression on `lags` samples of all series.
+def _exponential_means(
+    series: Float[np.ndarray, "samples series"],
+    stretch: Int[np.ndarray, " samples"],
+    dt: float,
+    times: Sequence[float],
+) -> Float[np.ndarray, "samples means"]:
+    """The exponential means of the series up to each sample of a stretch, with these time constants [s]."""
+    from scipy.linalg import solve_banded  # slow to import
 
-    It uses normal equations, because the matrix of the regression would not fit into memory. A ridge keeps them regular
-    if series differ by rounding only. A second pass removes the errors of the first by ridge and rounding.
+    found = []
+    for kept in np.exp(-dt / np.asarray(times)):
+        # The recursion m[k] - kept m[k - 1] = (1 - kept) x[k], as a system of equations.
+        bands = np.ones((2, len(series)))
+        bands[1, :-1] = np.where(stretch[1:] == stretch[:-1], -kept, 0.0)
+        found.append(solve_banded((1, 0), bands, (1 - kept) * series))
+    return np.concatenate(found, axis=1)
+
+
+def _unexplained(
+    series: Float[np.ndarray, "samples series"],
+    targets: int,
+    rows: Int[np.ndarray, " rows"],
+    lags: int,
+    means: Float[np.ndarray, "samples means"] | None = None,
+) -> Float[np.ndarray, "rows targets"]:
+    """The residual of the first `targets` series at these rows, after a regression on what came before.
+
+    Regressors are `lags` samples of all series, and `means` of the sample before. It uses normal equations, because the
+    matrix of the regression would not fit into memory. A ridge keeps them regular if series differ by rounding only. A
+    second pass removes the errors of the first by ridge and rounding.
     """
     from scipy.linalg import cho_factor, cho_solve  # slow to import
 
     rest = series[rows, :targets]
     starts = np.flatnonzero(np.diff(rows, prepend=-1) > 1)
     firsts = np.concatenate([np.arange(*ends, _BLOCK) for ends in zip(starts, [*starts[1:], len(rows)], strict=True)])
-    windows = [series[block[0] - lags : block[-1] + 1] for block in np.split(rows, firsts[1:])]
-    blocks = [
-        ([window[lags - lag : -lag] for lag in range(1, lags + 1)], block)
-        for window, block in zip(windows, np.split(rest, firsts[1:]), strict=True)
-    ]
-    products = _lagged_products(windows, lags)
+    blocks, rows_of_blocks = (np.split(each, firsts[1:]) for each in (rest, rows))
+    windows = [series[block[0] - lags : block[-1] + 1] for block in rows_of_blocks]
+    pasts = [[window[lags - lag : -lag] for lag in range(1, lags + 1)] for window in windows]
+    products, sizes = _lagged_products(windows, lags), [series.shape[1]] * lags
+    if means is not None:
+        slow = [means[block[0] - 1 : block[-1]] for block in rows_of_blocks]
+        pasts = [[*past, own] for past, own in zip(pasts, slow, strict=True)]
+        products = np.pad(products, (0, means.shape[1]))
+        products[:, -means.shape[1] :] = _products(pasts, slow)
+        sizes.append(means.shape[1])
     products.flat[:: len(products) + 1] += _ROUNDING**2 * len(rows)
     factor = cho_factor(products)
     for _ in range(2):
-        common = [sum(past[lag].T @ block for past, block in blocks) for lag in range(lags)]
-        coefficients = np.split(cho_solve(factor, np.concatenate(common)), lags)
-        for past, block in blocks:
+        coefficients = np.split(cho_solve(factor, _products(pasts, blocks)), np.cumsum(sizes)[:-1])
+        for past, block in zip(pasts, blocks, strict=True):
             block -= sum(map(np.matmul, past, coefficients))
     return rest
+
+
+def _products(
+    pasts: list[list[Float[np.ndarray, "_ _"]]], blocks: list[Float[np.ndarray, "_ columns"]]
+) -> Float[np.ndarray, "regressors columns"]:
+    """The products of all regressors with the columns, summed over the rows of all blocks."""
+    every = [[part.T @ block for part in past] for past, block in zip(pasts, blocks, strict=True)]
+    return np.concatenate([sum(own) for own in zip(*every, strict=True)])
 
 
 def _lagged_products(windows: list[Float[np.ndarray, "_ series"]], lags: int) -> Float[np.ndarray, "columns columns"]:

@@ -58,6 +58,8 @@ class InnovationsProblem(AbstractProblem):
     - `input_innovations`: for each channel, the part of torque or thrust within a sample that the past does not
       predict, see `jaxos4.shooting.feedthrough`. By default none: the controller knows no more than the log.
     - `answers_within`: whether the controller answers a rate within its sample; otherwise feedthroughs are 0.
+    - `lagged`: whether input innovations after the first are those of samples before, see `feedthrough.lagged`. They
+      have no gain on the disturbance, which could not be told from their gains on the rate.
     - `noise_feedthrough`: feedthroughs that are treated as known: the innovations that they explain count as noise. NaN
       (default): unknown. A search then has two stages: the first finds them, the second counts what they explain.
     - `start`: where searches start. NaN (default): the center of the bracket, with each of several time constants.
@@ -69,6 +71,7 @@ class InnovationsProblem(AbstractProblem):
     input_innovations: Float[Array, "samples feedthroughs channels"] = eqx.field(converter=as_float)
     noise_feedthrough: Float[Array, "channels feedthroughs"] = eqx.field(converter=as_float)
     answers_within: Bool[Array, ""]
+    lagged: Bool[Array, ""]
     segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
 
@@ -83,6 +86,7 @@ class InnovationsProblem(AbstractProblem):
         input_innovations: Float[ArrayLike, "samples feedthroughs channels"] | None = None,
         noise_feedthrough: Float[ArrayLike, "channels feedthroughs"] | None = None,
         answers_within: Bool[ArrayLike, ""] = True,
+        lagged: Bool[ArrayLike, ""] = False,
     ):
         if segments is None:
             segments = max(round((problem.flight.time.shape[-1] - settling) / (3 * SETTLING)), 1)
@@ -104,7 +108,7 @@ class InnovationsProblem(AbstractProblem):
             )
         unknown = np.full((channels, self.input_innovations.shape[1]), np.nan)
         self.noise_feedthrough = as_float(unknown if noise_feedthrough is None else noise_feedthrough)
-        self.answers_within = jnp.asarray(answers_within, dtype=bool)
+        self.answers_within, self.lagged = (jnp.asarray(x, dtype=bool) for x in (answers_within, lagged))
         unknowns = problem.unknowns.count + len(self._own) * channels
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
         self.least_noise = as_float(np.zeros(channels) if least_noise is None else least_noise)
@@ -162,9 +166,8 @@ class InnovationsProblem(AbstractProblem):
         """The parameters, then the logarithms of the noise levels, in brackets from differences of measurements."""
         data = self.problem.measured(), self.flight.dt, self.least_noise
         has_input = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
-        return with_noise(
-            self.problem.unknowns, self.channels, *data, has_input=has_input, answers_within=self.answers_within
-        )
+        is_answer = {"answers_within": self.answers_within, "lagged": self.lagged}
+        return with_noise(self.problem.unknowns, self.channels, *data, has_input=has_input, **is_answer)
 
     @property
     def initial_guess(self) -> InitialGuess:

@@ -55,11 +55,12 @@ def with_noise(
     *,
     has_input: Bool[Array, "channels feedthroughs"],
     answers_within: Bool[Array, ""],
+    lagged: Bool[Array, ""],
 ) -> Unknowns:
     """The parameters, then noise, gains and feedthroughs of each channel, in brackets from the measurements.
 
     The unknowns are the logarithms of noise levels, see `LogNoise`. `has_input`: which input innovations a channel has.
-    `answers_within`: see `InnovationsProblem`.
+    `answers_within`, `lagged`: see `InnovationsProblem`.
     """
     first = jnp.stack(first_noise(measured, dt, TIMES[0])[:3], axis=1)
     count, rate, shortest = levels(first.shape[0]), is_rate(first), jnp.log(_SHORTEST * dt)
@@ -78,8 +79,10 @@ def with_noise(
         jnp.pad(x, ((0, 0), (0, more)), constant_values=value)
         for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf))
     )
-    # An input innovation that is always 0 has no gain to estimate.
-    free = jnp.concatenate([free, has_input, has_input, has_input & rate & answers_within], axis=1)
+    # An input innovation that is always 0 has no gain to estimate. A disturbance one sample later acts like a rate: of
+    # lagged innovations, only the first has a gain on it.
+    of_disturbance = has_input & ~(lagged & (np.arange(has_input.shape[1]) > 0))
+    free = jnp.concatenate([free, has_input, of_disturbance, has_input & rate & answers_within], axis=1)
     names = tuple(each.format(name) for name in channels for each in own_names(count, has_input.shape[1]))
     precision = jnp.full(first.size, PRECISION)
     return Unknowns(
