@@ -10,7 +10,7 @@ from .models.abstract import AbstractModel
 
 # The largest standard deviation of an identifiable parameter, in half-widths of a bracket that is used as ...
 NO_PRIOR = 1.0  # a region to search: the flight must contain more information than the bracket
-GAUSSIAN_PRIOR = 0.5**0.5  # a prior with a standard deviation of 1: the flight must contain no less than the prior
+GAUSSIAN_PRIOR = 0.5**0.5  # a prior with a standard deviation of 1: the flight must tell at least as much
 UNIFORM_PRIOR = 0.5  # a prior with a standard deviation of 0.577
 PROPER_PRIOR = float("inf")  # a prior of the likelihood itself, which has an answer for every parameter
 

@@ -173,13 +173,13 @@ class AbstractEstimator(eqx.Module):
 
     Class variables say what an estimator can do:
 
-    - `looks_at`: the most channels that it compares: `"rates"`, `"attitude"` or `"all"`.
-    - `shoots`: whether it minimises the cost of a simulation. If so, it can use windows, and its covariance follows
-      from the noise.
+    - `looks_at`: the largest choice of a state's channels that it compares: `"rates"`, `"attitude"` or `"all"`.
+    - `shoots`: whether it minimises the cost of a simulation of a `ShootingProblem`. If so, it can use windows, and
+      `identify` replaces its covariance by the one that follows from the noise.
     - `prior`: how it uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
     - `needs_network`: whether it needs a trained network, in a field `network`.
     - `in_closed_loop`: whether it searches a likelihood of innovations too, and so serves a vehicle that a controller
-      flies.
+      flies. Its `Estimate` then has `parts`.
     - `in_comparison`: whether `jaxos4 compare` runs it; false if it takes longer than all others together.
     """
 

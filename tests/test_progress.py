@@ -7,7 +7,7 @@ import time
 import pytest
 
 from jaxos4.cli import estimate
-from jaxos4.cli._shared import stages
+from jaxos4.cli._shared import showing_stages
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def often(monkeypatch):
 
 
 def test_a_redirected_wait_tells_from_time_to_time_what_and_how_far(often, capsys):
-    with stages("compiling", 40) as progress:
+    with showing_stages("compiling", 40) as progress:
         time.sleep(0.1)
         progress("cells of IBSS", 3)
         time.sleep(0.1)
@@ -30,14 +30,14 @@ def test_a_redirected_wait_tells_from_time_to_time_what_and_how_far(often, capsy
 
 
 def test_a_short_wait_is_silent(capsys):
-    with stages("reading"):
+    with showing_stages("reading"):
         pass
     assert capsys.readouterr() == ("", "")
 
 
 def test_no_stderr_is_no_fault(often, monkeypatch):
     monkeypatch.setattr("sys.stderr", None)
-    with stages("reading"):
+    with showing_stages("reading"):
         time.sleep(0.1)
 
 
@@ -52,7 +52,7 @@ def test_a_command_shows_its_stages_in_a_file(run, often, tmp_path):
 
 def test_logs_are_counted_while_they_are_read(run, monkeypatch):
     told = []
-    monkeypatch.setattr(estimate, "stages", lambda first: contextlib.nullcontext(told.append))
+    monkeypatch.setattr(estimate, "showing_stages", lambda first: contextlib.nullcontext(told.append))
     code, _, err = run("simulate", "--duration", "2", "--out", "a.csv")
     assert code == 0, err
     code, _, err = run("estimate", "a.csv", "b.csv", "c.csv")

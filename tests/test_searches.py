@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 from helpers import documented_class, noisy_states, random_starts, same, standard_flight, standard_problem
 from lanes import HALF, names
-from likelihoods import MINIMUM, SLOPES, misfit, narrow, quadratic, squares, two_minima, valley
+from likelihoods import MINIMUM, SLOPES, late, misfit, narrow, quadratic, squares, two_minima, valley, wall
 
 import jaxos4
 from jaxos4.estimators import FilterError
@@ -58,7 +58,23 @@ def test_a_step_that_failed_shows_the_curvature_that_the_information_lacks():
     best = scipy.optimize.minimize(lambda x: np.square(misfit(x)).sum() / 2, np.zeros(2), tol=1e-12)
     found = LevenbergMarquardt()(squares(misfit))
     np.testing.assert_allclose(found.parameters, best.x, atol=1e-3)
+    assert names(found) != "max_sweeps"
     assert int(found.sweeps) < 30
+
+
+@pytest.mark.parametrize("solver", [LevenbergMarquardt(), FilterError().solver])
+def test_a_steep_secant_ends_no_search(solver):
+    """It shortens the next step so much that this step promises little."""
+    best = scipy.optimize.minimize(lambda x: np.square(wall(x)).sum() / 2, np.zeros(2), method="Nelder-Mead", tol=1e-12)
+    found = solver(squares(wall, half_width=10.0))
+    assert float(found.cost) < best.fun + 0.002
+
+
+def test_an_unknown_at_its_limit_does_not_stop_the_others():
+    """Its step is much longer than its stride, and nearly nothing is left of it at the limit."""
+    stride, start = np.array([1e-3, np.inf]), jnp.array([4 - 5e-6, 0.4])
+    found = FilterError().solver(squares(late, stride=stride), start=start)
+    np.testing.assert_allclose(found.parameters, [4.0, -0.5], atol=0.1)
 
 
 @pytest.mark.parametrize("stride", [(0.1, np.inf), (np.inf, 0.1)])

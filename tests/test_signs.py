@@ -80,7 +80,7 @@ def test_inspect_questions_the_spins(run, tmp_path):
     assert "answer" not in run("inspect", "flight.csv", "--airframe", "good.toml")[1]
     code, out, err = run("inspect", "flight.csv", "--airframe", "bad.toml")
     assert (code, err) == (0, "")
-    assert "note: yaw answers the rotors with the opposite sign" in " ".join(out.split())
+    assert "contradicts Iz: yaw answers the rotors with the opposite sign" in " ".join(out.split())
     assert "cannot identify" not in out
 
 

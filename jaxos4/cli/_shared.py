@@ -37,7 +37,7 @@ def console() -> Any:
 PERIOD = 10.0  # s; between lines of progress
 
 
-def stages(first: str, total: int | None = None) -> contextlib.AbstractContextManager[Callable[..., None]]:
+def showing_stages(first: str, total: int | None = None) -> contextlib.AbstractContextManager[Callable[..., None]]:
     """Shows a stage, the time, and how much of a `total` is done. Yields a function that changes them.
 
     A terminal has one status, which moves; another stderr gets a line from time to time.

@@ -11,7 +11,7 @@ import jaxos4
 from .._files import read_toml
 from ..errors import InputError, named, printable
 from . import options
-from ._shared import check_outputs, command, console, end, stages, write_json
+from ._shared import check_outputs, command, console, end, showing_stages, write_json
 
 _OS4, _PUBLISHED = "os4", "published"
 # The defaults of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
@@ -47,7 +47,7 @@ def estimate(
     listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
     asked = {"channels": channels, "initial_state": initial_state, "window": window}
     asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         from msgspec.structs import replace
 
         from ..identification import settings_for
@@ -99,7 +99,7 @@ def _publish(found: "jaxos4.Identification", out: Path | None, report: Path | No
     if out is not None:
         write_json(found.to_dict(), out)
     if report is not None:
-        with stages("drawing"):
+        with showing_stages("drawing"):
             jaxos4.report.write_flight_page(report, found)
     shown = console()
     jaxos4.report.print_identification(shown, found, verbose=verbose)
@@ -128,7 +128,7 @@ def train(
 
     The network then identifies any flight with these inputs.
     """
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         from ..identification.prepare_os4 import train_network
         from ..models import MODELS
         from ..recording import read_recording

@@ -14,7 +14,7 @@ import jaxos4
 from .._files import check_writable, read_json, write_file
 from ..errors import InputError
 from . import options
-from ._shared import check_outputs, command, console, end, json_text, stages, write_json
+from ._shared import check_outputs, command, console, end, json_text, showing_stages, write_json
 
 _MANIFEST = "manifest.json"
 
@@ -39,7 +39,7 @@ def export(
     check_outputs(result, out=out if folder is None else None)
     if folder is not None:
         _check_folder(folder)
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         from ..export import TARGETS, export_vehicle, read_result
 
         target = TARGETS[to]
@@ -131,7 +131,7 @@ def predict(
     Compares the errors with those of constant rates and of a regression.
     """
     check_outputs(result, flight, columns, out=out, json=json, figure=figure, report=report)
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         from ..recording import read_recording
 
         if out is not None:

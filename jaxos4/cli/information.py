@@ -5,7 +5,7 @@ import jaxos4
 from .._files import read_toml, write_file
 from ..errors import InputError
 from . import options
-from ._shared import check_outputs, command, console, stages, write_json
+from ._shared import check_outputs, command, console, showing_stages, write_json
 
 
 def inspect(
@@ -25,7 +25,7 @@ def inspect(
         raise InputError(f"{airframe_out}: exists, and may hold what you measured; give another name.")
     if airframe is not None and airframe_out is not None:
         raise InputError("--airframe-out: begins an airframe from the log alone; leave out --airframe.")
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         from ..recording import read_recording
         from ..recording.inspection import airframe_draft, inspect_log
 
@@ -40,7 +40,7 @@ def inspect(
     if airframe_out is not None:
         write_file(airframe_out, text)
     if report is not None:
-        with stages("drawing"):
+        with showing_stages("drawing"):
             jaxos4.report.write_log_page(report, recording, vehicle, found=found, command=command())
     shown = console()
     jaxos4.report.print_inspection(shown, found, recording.facts.format.label if recording.facts.format else "")
@@ -66,7 +66,7 @@ def identifiability(
     Says for each of the others (alpha_1..8) why not.
     """
     check_outputs(flight, airframe, bracket, out=out)
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         from ..models import MODELS
         from ..recording import read_recording
 

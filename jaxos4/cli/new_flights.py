@@ -12,7 +12,7 @@ import jaxos4
 from .._files import read_toml
 from ..errors import InputError, named
 from . import options
-from ._shared import check_outputs, console, end, stages
+from ._shared import check_outputs, console, end, showing_stages
 
 # The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
 _OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": None, "noise": 0.0, "method": "euler"}
@@ -64,7 +64,7 @@ def simulate(
     if asked["dt"] > 0 and asked["duration"] / asked["dt"] > most:
         many = f"more than {most} samples of {asked['dt']:g} s; ask for fewer."
         raise InputError(f"--duration {asked['duration']:g}: {many}")
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         progress("compiling and simulating")
         flight, how = (_closed_loop if closed_loop else _open_loop)(asked)
         end(str(jaxos4.result_names(flight.result)))
@@ -145,12 +145,12 @@ def design(
         asked["gust"] = gust  # by default the result's
     check_outputs(result, None if result else airframe, bracket, out=out, figure=figure)
     begin = time.perf_counter()
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         found = _find(asked, progress)
         progress("writing")
         found.task.write(found.designed, out)
     if figure is not None:
-        with stages("drawing"):
+        with showing_stages("drawing"):
             jaxos4.report.write_design_figure(figure, found, asked["accuracy"] / 100)
     jaxos4.report.print_design(console(), found, asked["accuracy"] / 100)
     samples = f"{found.designed.inputs.shape[0]} samples of {asked['dt']:g} s"

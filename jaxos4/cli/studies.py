@@ -14,7 +14,7 @@ from .._xla import add_flags
 from ..errors import InputError, in_words
 from ..estimators import ESTIMATORS
 from . import options
-from ._shared import check_outputs, command, console, stages
+from ._shared import check_outputs, command, console, showing_stages
 
 
 def study(
@@ -27,7 +27,7 @@ def study(
 
     Finished cells are kept.
     """
-    with stages("loading the library"):
+    with showing_stages("loading the library"):
         wanted = jaxos4.study.load_study(specification)
     if dry_run:
         _print_plan(wanted, out)
@@ -44,7 +44,7 @@ def study(
 def run_with_bar(wanted: "jaxos4.study.Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
     """The Dataset of `jaxos4.study.run_study`, with a progress bar. `device`: by default those of this process."""
     try:
-        with stages("compiling", wanted.count) as progress:
+        with showing_stages("compiling", wanted.count) as progress:
             return jaxos4.study.run_study(wanted, out, device or jaxos4.study.device_name(), progress=progress, **how)
     except KeyboardInterrupt:
         typer.echo(f"jaxos4: {out}: interrupted; run the same command again to continue.", err=True)
@@ -88,7 +88,7 @@ def report(
     if source.is_dir():
         if out is not None:
             raise InputError(f"--out: {source} is a folder, in which its report is written; leave it out.")
-        with stages("loading the library") as progress:
+        with showing_stages("loading the library") as progress:
             progress("reading")
             dataset = jaxos4.study.read_results(source)
             progress("drawing")
@@ -104,7 +104,7 @@ def report(
             raise InputError(f"--pdf: {source} is a result, which has a page alone; leave it out.")
         page, figures = source.with_suffix(".html") if out is None else out, []
         check_outputs(source, out=page)
-        with stages("loading the library") as progress:
+        with showing_stages("loading the library") as progress:
             progress("reading")
             found = jaxos4.read_result(source)
             progress("drawing")
@@ -139,7 +139,7 @@ def compare(
 def _compare_results(results: list[Path], page: Path | None) -> None:
     """Exit code 1 if the results differ."""
     check_outputs(*results, report=page)
-    with stages("loading the library") as progress:
+    with showing_stages("loading the library") as progress:
         progress("reading")
         found = jaxos4.compare_results(results)
         if page is not None:
@@ -156,12 +156,12 @@ def _compare_results(results: list[Path], page: Path | None) -> None:
 def _compare_estimators(out: Path | None, *, quick: bool) -> None:
     begin = time.perf_counter()
     add_flags(brief=quick)
-    with stages("loading the library"):
+    with showing_stages("loading the library"):
         from ..report.text import print_whole
 
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
     dataset = run_with_bar(comparison(quick=quick), directory)
-    with stages("drawing"):
+    with showing_stages("drawing"):
         page, *_ = jaxos4.report.write_report(dataset, directory)
     print_whole(console(), jaxos4.report.error_table(dataset))
     typer.echo(f"{jaxos4.report.count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")

@@ -74,12 +74,12 @@ class Directions(NamedTuple):
         return jnp.abs(self.predicted).max()
 
 
-class Brackets(NamedTuple):
+class SearchIntervals(NamedTuple):
     """The bracket along each direction, as steps from where the sweep began.
 
     - `predicted`: the predicted step to the minimum.
     - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: the ends of the part that no
-      slope has excluded. If the minimum lies beyond an opened end, both are at that end.
+      slope has excluded. If every slope points beyond the bracket, both are at that end.
     - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope at `last`, and how fast it
       changes.
     """
@@ -96,13 +96,13 @@ class Brackets(NamedTuple):
 
     @classmethod
     def around(cls, predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection):
-        """Brackets around predicted steps. First trials are in the middle; rates are 1, like the information."""
+        """Intervals around predicted steps. First trials are in the middle; rates are 1, like the information."""
         predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
         lowest, highest = jnp.maximum(predicted - half_width, -below), jnp.minimum(predicted + half_width, above)
         middle, zero = (lowest + highest) / 2, jnp.zeros_like(lowest)
         return cls(predicted, lowest, highest, lowest, highest, middle, middle, zero, jnp.ones_like(lowest))
 
-    def narrowed(self, slope: PerDirection) -> "Brackets":
+    def narrowed(self, slope: PerDirection) -> "SearchIntervals":
         """The brackets after a shot at their trials: **the sign of the slope decides**, the secant proposes.
 
         The next trial is where a line through the last two slopes is zero. If this point lies outside of the bracket,

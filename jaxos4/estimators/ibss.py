@@ -1,4 +1,7 @@
-"""Iterative Bi-Section Shooting (IBSS): brackets are narrowed by the slope of the cost. The steps are our choice."""
+"""Iterative Bi-Section Shooting (IBSS): brackets are narrowed by the slope of the cost.
+
+The paper gives the idea only; the steps in this file are our choice.
+"""
 
 import functools
 from typing import ClassVar, NamedTuple
@@ -12,7 +15,7 @@ from .._custom_types import Count, Scalar, integer, setting
 from ..estimate import REACH
 from ..linalg import gram
 from ..shooting import LocalModel, Stage, WindowUnknowns
-from .bisection import Brackets, Directions, Flag, PerDirection
+from .bisection import Directions, Flag, PerDirection, SearchIntervals
 from .solver import AbstractSolver, Found, before_shots, chosen
 
 # All lengths are in standard deviations of the estimate, which grow with the misfit, see `tolerance`.
@@ -20,7 +23,7 @@ _COARSE = 0.5  # a stage other than the last ends once the minimum is this close
 _OPENING = 4.0  # the longest step of a stage's first sweep, in standard deviations of the stage's start
 _NARROW = 0.05  # half-width of a stage's first brackets, relative to that longest step
 _SAFETY = 2.0  # half-width of later brackets, relative to the error of the last prediction
-_MIN_WIDTH = 0.01  # smallest half-width of later brackets, relative to the longest predicted step, which is the largest
+_MIN_WIDTH = 0.01  # smallest half-width of later brackets, as a share of the longest predicted step, the largest one
 _WIDENING, _MAX_WIDENING = 4.0, 256.0  # growth of a bracket each time its last shot was at an end, and in total
 _KEPT_RISE = 1.0  # a sweep that raises the cost by more is undone
 _RETREAT, _ADVANCE = 0.25, 1.4  # growth of the longest step after a sweep that was undone, and after any other
@@ -31,7 +34,7 @@ _DAMPING = 0.1  # information that is added for unknowns with a stride, in 1/str
 
 # The shots of a sweep: the brackets after them, unknowns and local model of the last one, their number, and whether the
 # minimum is near.
-Shots = tuple[Brackets, WindowUnknowns, LocalModel, Count, Flag]
+Sweep = tuple[SearchIntervals, WindowUnknowns, LocalModel, Count, Flag]
 
 
 class State(NamedTuple):
@@ -42,7 +45,7 @@ class State(NamedTuple):
     - `directions`, `brackets`: of the next sweep.
     - `spread`: the covariance of the unknowns before the stage.
     - `growth`: the factor by which each direction's bracket is widened.
-    - `trust`: the share of the longest predicted step that a sweep may go; 1: no limit.
+    - `trust`: a sweep may go at most this share of the longest predicted step; 1: no limit.
     - `sweeps`, `shots`: their number in this stage. The first shot is at the start, before any sweep.
     - `done`: whether the stage ended by itself.
     """
@@ -50,7 +53,7 @@ class State(NamedTuple):
     unknowns: WindowUnknowns
     model: LocalModel
     directions: Directions
-    brackets: Brackets
+    brackets: SearchIntervals
     spread: Float[Array, "windows unknowns unknowns"]
     growth: PerDirection
     trust: Scalar
@@ -154,14 +157,17 @@ class IBSS(AbstractSolver[State]):
         return Found(state.unknowns, state.model, spread, state.sweeps, rollouts, state.done)
 
     def _look_around(self, stage: Stage, unknowns: WindowUnknowns, model: LocalModel) -> Directions:
-        """The directions along which the cost is nearly separable, and predicted steps. The bracket is information."""
+        """The directions along which the cost is nearly separable, and predicted steps.
+
+        The parameters' bracket counts as weak prior information, so that no direction is without any.
+        """
         of_bracket, (windows, _) = 1 / jnp.square(stage.off / 2), unknowns.shape
         shared = of_bracket[:, : stage.unknowns.count] / windows
         has_prior, of_stride = stage.unknowns.precision > 0, _DAMPING / jnp.square(stage.unknowns.stride)
         added = of_bracket.at[:, : stage.unknowns.count].set(jnp.where(has_prior, of_stride, shared))
         return Directions.at(unknowns, model, stage.limits(self.reach), added, stage.unknowns.count)
 
-    def _shoot(self, stage: Stage, state: State, before: Shots) -> Shots:
+    def _shoot(self, stage: Stage, state: State, before: Sweep) -> Sweep:
         """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes."""
         brackets, _, _, shots, _ = before
         step = jnp.einsum("wud,wd->wu", state.directions.basis, brackets.trial)
@@ -191,7 +197,7 @@ class IBSS(AbstractSolver[State]):
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
         return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
-    def _next_widths(self, stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:
+    def _next_widths(self, stage: Stage, state: State, brackets: SearchIntervals) -> tuple[Scalar, PerDirection]:
         """The half-width of the next brackets as a share of the longest step, from its error; and `State.growth`."""
         steps = brackets.last
         error = jnp.abs(steps - brackets.predicted).max()
@@ -201,10 +207,10 @@ class IBSS(AbstractSolver[State]):
         return jnp.clip(_SAFETY * error / longest, _MIN_WIDTH, 1.0), jnp.where(was_open, growth, state.growth)
 
 
-def _open(directions: Directions, half_width: PerDirection, furthest: PerDirection | Scalar) -> Brackets:
+def _open(directions: Directions, half_width: PerDirection, furthest: PerDirection | Scalar) -> SearchIntervals:
     """A bracket around the predicted step in each direction, which does not reach further than `furthest`."""
     below, above = jnp.minimum(directions.below, furthest), jnp.minimum(directions.above, furthest)
-    return Brackets.around(directions.predicted, half_width, below, above)
+    return SearchIntervals.around(directions.predicted, half_width, below, above)
 
 
 def _finite(unknowns: WindowUnknowns, model: LocalModel) -> Flag:

@@ -1,10 +1,11 @@
 """Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood, corrected by a secant where a step failed.
 
-Gauss-Newton ignores the second derivatives of the residuals, so along some unknowns, such as a delay, its steps are too
-long. More damping would shorten them along all unknowns. But the gradient where a step failed shows the curvature that
-is missing.
+Gauss-Newton ignores the second derivatives of the residuals, so its steps are too long along some unknowns, such as a
+delay. Damping shortens them along all unknowns. The gradient where a step failed shows the curvature that is missing
+along this step alone.
 
-References: Marquardt 1963, SIAM J. Appl. Math. 11(2); Dennis, Gay and Welsch 1981, ACM Trans. Math. Softw. 7(3).
+References: Marquardt 1963, SIAM J. Appl. Math. 11(2); compare Dennis, Gay and Welsch 1981, ACM Trans. Math.
+Softw. 7(3).
 """
 
 from typing import ClassVar, NamedTuple
@@ -24,17 +25,18 @@ _COARSE = 1e-3  # the smallest `step_tolerance` of all stages except the last
 _FACTOR = 10.0  # by which the damping falls after a step that succeeded, and rises after one that failed
 # Information in 1/stride^2 that is always added for unknowns with a stride, whose own information is inexact.
 _STRIDE_INFORMATION = 0.3
-# A secant is ignored if its curvature exceeds the information about the unknowns by more: that would be rounded away.
+# A secant with more than this many times the curvature of the information is ignored: rounding would hide the rest.
 _STEEPEST = 1e3
 
 
 class State(NamedTuple):
     """The search of a stage before a shot.
 
-    - `best`, `model`: the best unknowns so far, and the local model there.
+    - `best`, `model`: the best unknowns so far, and the local model there. If a small step ends the stage, `best` is
+      after it, and `model` before it.
     - `trial`: where the shot will be.
-    - `damping`: of the last step, or of the first one.
-    - `corrected`: whether the trial follows a step that failed, whose secant corrects it.
+    - `damping`: of the last step; before the first shot, `_FACTOR` times that of the first step.
+    - `after_failure`: whether the step before the trial failed, so that its secant may have corrected the trial.
     - `shots`: the number of shots so far.
     - `done`: whether the stage ended by itself.
     """
@@ -43,18 +45,20 @@ class State(NamedTuple):
     model: LocalModel
     trial: WindowUnknowns
     damping: Scalar
-    corrected: Bool[Array, ""]
+    after_failure: Bool[Array, ""]
     shots: Count
     done: Bool[Array, ""]
 
 
 class LevenbergMarquardt(AbstractSolver[State]):
-    """Gauss-Newton steps, which are damped more after a step that failed, and less after one that succeeded.
+    """The solver of output error and filter error.
 
-    The step after a failure is also corrected by a secant.
+    Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded. After a failure, a
+    secant also corrects the next step.
 
     - `step_tolerance`: a stage ends with a step that moves no unknown by more than this fraction of its initial
-      uncertainty. Cost and covariance are those before this step. 0: no step is short enough.
+      uncertainty. Cost and covariance are those before this step. After a step that failed, it is not taken. 0: no
+      step is short enough.
     - `gain_tolerance`: a stage ends if steps with little damping promise to lower the cost by less. An error of one
       standard deviation costs 0.5.
     - `flat`: a stage also ends if steps with a damping above 1 promise to lower the cost by less.
@@ -82,7 +86,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
     reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
 
     def init(self, stage: Stage, before: Found) -> State:
-        """The first trial is the start. Any cost is better than none."""
+        """The first trial is the start, and its shot counts as better than none."""
         damping = jnp.full((), _FACTOR * self.damping, dtype=float)
         none, no = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
         return State(before.unknowns, before.model, before.unknowns, damping, no, none, no)
@@ -93,20 +97,23 @@ class LevenbergMarquardt(AbstractSolver[State]):
         better = (state.shots == 0) | (cost_of(found) < cost_of(before))
         best, model = chosen(better, (state.trial, found), (state.best, before))
         secant = state.trial - state.best, found.gradient - before.gradient
-        corrected = ~better & found.feasible.all() & jnp.isfinite(found.gradient).all()
-        curvature = jnp.where(corrected, jax.vmap(_with_secant)(model.information, *secant), model.information)
-        curved = model._replace(information=curvature)
-        eased = jnp.where(state.corrected, 1.0, 1 / _FACTOR)  # a corrected step says nothing about the damping
+        shows = ~better & found.feasible.all() & jnp.isfinite(found.gradient).all()
+        curvature = jnp.where(shows, jax.vmap(_with_secant)(model.information, *secant), model.information)
+        # The step after a failure may succeed by its secant, or by its damping: keep the damping.
+        eased = jnp.where(state.after_failure, 1.0, 1 / _FACTOR)
         damping = state.damping * jnp.where(better, eased, _FACTOR)
         damping = jnp.maximum(damping, self.least_damping)
-        whole = self._step(stage, best, curved, damping)
-        strides = jnp.maximum(jnp.abs(whole) / stage.stride, 1.0).max()  # shorter in all unknowns: still a descent
-        trial = jnp.clip(best + whole / strides, *stage.limits(self.reach))
-        step = trial - best
-        small = self._is_small(stage, step) | self._is_stalled(stage, whole, model, damping)
-        done = small | ~jnp.isfinite(step).all()
-        end = jnp.where(small & ~corrected, trial, best)  # a last step that no shot confirms, unless one just failed
-        return State(end, model, trial, damping, corrected, state.shots + 1, done)
+        whole = self._step(stage, best, model._replace(information=curvature), damping)
+        excess = jnp.maximum(jnp.abs(whole) / stage.stride, 1.0).max()
+        limits = stage.limits(self.reach)
+        trial = jnp.clip(best + whole / excess, *limits)  # all unknowns are shortened alike, so it still descends
+        # Neither a secant nor a stride makes a step the last one.
+        plain = self._step(stage, best, model, damping)
+        small = self._is_small(stage, jnp.clip(best + plain, *limits) - best)
+        small |= self._is_stalled(stage, plain, model, damping)
+        done = small | ~jnp.isfinite(trial).all()
+        end = jnp.where(small & better, trial, best)  # no shot confirms a last step: after a failure, it is not taken
+        return State(end, model, trial, damping, shows, state.shots + 1, done)
 
     def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
         """Whether a step was small, or there were too many."""
@@ -125,9 +132,9 @@ class LevenbergMarquardt(AbstractSolver[State]):
         return (jnp.abs(step) <= tolerance * stage.off).all()
 
     def _is_stalled(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Bool[Array, ""]:
-        """Whether a step, before it is limited, promises so little that it ends the stage."""
+        """Whether a step, before strides and limits shorten it, promises so little that it ends the stage."""
         unit, least = self._unit(stage, model.information), self._least(stage)
-        # The expected reduction of the cost: by this step, or as if it were hardly damped.
+        # The expected reduction of the cost: the larger of this step's and that of a step with hardly any damping.
         eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
         promised = -model.gradient * step
         left = jnp.maximum(promised.sum(), (eased * promised).sum())
@@ -158,10 +165,10 @@ class LevenbergMarquardt(AbstractSolver[State]):
 def _with_secant(
     information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
 ) -> Float[Array, "n n"]:
-    """The information, corrected so that it predicts the `change` of the gradient over a step.
+    """The information, changed so that it predicts the `change` of the gradient over a step.
 
-    This is the update of Broyden, Fletcher, Goldfarb and Shanno, which stays positive definite. It has no effect where
-    the cost is less curved than by the information, because longer steps would be a risk.
+    This is the update of Broyden, Fletcher, Goldfarb and Shanno, which keeps a matrix positive definite. Where the cost
+    curves less than the information says, nothing changes, because longer steps would be a risk.
     """
     predicted, diagonal = information @ step, jnp.diagonal(information)
     seen, expected = change @ step, predicted @ step

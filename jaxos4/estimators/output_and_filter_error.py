@@ -48,7 +48,7 @@ class OutputError(AbstractEstimator):
 
 
 class FilterError(AbstractEstimator):
-    """Maximum likelihood of the innovations of Kalman filters, by Gauss-Newton steps from the bracket's center.
+    """Maximum likelihood of the innovations of Kalman filters, by damped Gauss-Newton steps from the bracket's center.
 
     It compares the body rates, and specific force if the model predicts it. The disturbance and the sensor noise of
     each channel are estimated too, see `InnovationsProblem`. The bracket is a Gaussian prior, whose standard deviation

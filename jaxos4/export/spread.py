@@ -126,7 +126,7 @@ def _reservations(file: VehicleIdentification, quantity: str, *, spared: bool = 
 
     `spared`: whether one issue that refuses it does not count.
     """
-    left = [(issue.status_left(quantity), issue.moves.get(quantity)) for issue in file.issues]
+    left = [(issue.status_allowed(quantity), issue.moves.get(quantity)) for issue in file.issues]
     # A reservation that does not say how far it moves the quantity is taken to move it as far as a reservation may.
     moves = [MAX_SHARE if move is None else move.share for status, move in left if status == RESERVED]
     refusing = sum(status not in (IDENTIFIED, RESERVED) for status, _ in left)

@@ -117,7 +117,7 @@ def contradicted(
 ) -> Iterator[tuple[Parameter, Issue]]:
     """The parameters whose values physics or the airframe forbid. `motor_step`: see `issues_of_values`.
 
-    The issue moves the other quantities as far as they would move if the parameter had its expected value.
+    Its moves are how far each other quantity would shift if the parameter had its expected value.
     """
     owner = {name: quantity for quantity, names in model.quantities.items() for name in names}
     for parameter, usual in zip(model.parameters, np.asarray(model.alpha).tolist(), strict=True):

@@ -78,7 +78,7 @@ def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
     """The remedies of the causes that keep a quantity of these results from being identified."""
     for found in results:
         verdict = found.verdicts[name]
-        issues = [each for each in found.issues if each.status_left(name) != IDENTIFIED]
+        issues = [each for each in found.issues if each.status_allowed(name) != IDENTIFIED]
         # A verdict holds only the reasons for its status.
         yield from (each.remedy for each in issues if any(each.cause in said for said in verdict.reasons))
         for said in verdict.reasons:

@@ -238,8 +238,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Why the estimate cannot be trusted, or only with care, and what to do; one line each."""
-        said = "use with care: " if self.successful else "not to be trusted because "
-        return tuple(f"{said}{issue}" for issue in self.issues)
+        return tuple(issue.warning for issue in self.issues)
 
     @property
     def motor_clock(self) -> str:

@@ -28,7 +28,7 @@ ADVICE = {
 
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 RESERVATION, CONTRADICTION = "successful", "implausible"
-"""Severities of an issue: the result code that an estimate gets by it. A reservation refuses nothing."""
+"""Severities of an issue: the result code that an estimate gets by it. A reservation leaves the result successful."""
 
 
 # An issue that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. If
@@ -88,11 +88,19 @@ class Issue(msgspec.Struct, frozen=True):
         """The status of a quantity with this issue, if it is unknown how far the quantity would move."""
         return {RESERVATION: RESERVED, CONTRADICTION: CONTRADICTED}.get(self.severity, MISSING)
 
+    @property
+    def warning(self) -> str:
+        """Whether the estimate can be used in spite of the issue, and the issue; one line."""
+        refused = [name for name in self.moves if self.status_allowed(name) not in _TRUSTED]
+        if refused or self.severity != RESERVATION and not self.moves:
+            return f"{', '.join(refused)}{': ' * bool(refused)}not to be trusted because {self}"
+        return f"use with care: {self}"
+
     def share_of(self, name: str) -> float:
         """The share by which the quantity of this name would move; 0 if unknown."""
         return 0.0 if (move := self.moves.get(name)) is None else move.share
 
-    def status_left(self, name: str) -> str:
+    def status_allowed(self, name: str) -> str:
         """The status of the quantity of this name if this were the only issue."""
         if name not in self.moves:
             return IDENTIFIED
@@ -107,7 +115,8 @@ class Verdict(msgspec.Struct, frozen=True):
     """Whether a quantity can be trusted.
 
     - `status`: `identified`, `identified with a reservation`, `not identified` or `contradicted`.
-    - `value`: the quantity's value, 95 % interval and conditions, in words; empty if the parameters show them.
+    - `value`: the quantity's value, 95 % interval and conditions, in words; empty for quantities
+      that consist of parameters, whose table shows them.
     - `reasons`: the reservations, or the causes with their remedies. Empty if the quantity is `identified`.
     """
 
@@ -144,7 +153,7 @@ def verdicts_of(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> 
     verdicts = {}
     for name, quantity in quantities.items():
         causes: dict[str, list[str]] = {status: [] for status in STATUSES}
-        for issue, status in zip(issues, _statuses_left(issues, name), strict=True):
+        for issue, status in zip(issues, _statuses_allowed(issues, name), strict=True):
             causes[status].append(_reason(issue, name))
         causes[RESERVED] += quantity.reservations
         if quantity.missing and not causes[MISSING]:
@@ -154,7 +163,7 @@ def verdicts_of(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> 
             causes[MISSING].append(known)
         elif quantity.spread > UNCERTAIN:
             causes[RESERVED].append(known)
-        status = next((each for each in STATUSES[:0:-1] if causes[each]), IDENTIFIED)
+        status = next((each for each in reversed(STATUSES[1:]) if causes[each]), IDENTIFIED)
         verdicts[name] = Verdict(status, quantity.value, tuple(causes[status]) if status != IDENTIFIED else ())
     for name, quantity in quantities.items():
         lacking = [each for each in quantity.requires if each in verdicts and not verdicts[each].trusted]
@@ -173,24 +182,24 @@ def result_of(verdicts: Mapping[str, Verdict], issues: Sequence[Issue], search: 
     refused = [name for name in required if not verdicts[name].trusted]
     if not refused:
         return "successful"
-    left = {name: _statuses_left(issues, name) for name in refused}
+    left = {name: _statuses_allowed(issues, name) for name in refused}
     for place, issue in enumerate(issues):
         for name in (each for each in refused if left[each][place] not in _TRUSTED):
             if issue.severity != RESERVATION:
                 return issue.severity
             # A reservation that contradicts only together with another issue does not decide the code.
-            if issue.status_left(name) not in _TRUSTED:
+            if issue.status_allowed(name) not in _TRUSTED:
                 return CONTRADICTION
     return search if search != "successful" else "unidentifiable"
 
 
-def _statuses_left(issues: Sequence[Issue], name: str) -> list[str]:
+def _statuses_allowed(issues: Sequence[Issue], name: str) -> list[str]:
     """The status that each issue leaves to the quantity of this name.
 
     Reservations of known size add up. If one of them is due to an impossible parameter, and their sum exceeds both
     limits, they contradict the quantity: the parameter shows that the model is wrong, the other issues by how much.
     """
-    alone = [issue.status_left(name) for issue in issues]
+    alone = [issue.status_allowed(name) for issue in issues]
     reserved = (i for i, status in enumerate(alone) if status == RESERVED)
     sized = {i: move for i in reserved if (move := issues[i].moves[name]) is not None}
     total = Move(sum(move.share for move in sized.values()), sum(move.deviations for move in sized.values()))
@@ -235,7 +244,7 @@ def reason_lines(verdicts: dict[str, Verdict], issues: Sequence[Issue]) -> list[
         for name, verdict in verdicts.items():
             for reason in verdict.reasons if verdict.status == status else ():
                 concerned.setdefault(reason, []).append(name)
-    notes = [issue for issue in issues if all(issue.status_left(name) == IDENTIFIED for name in verdicts)]
+    notes = [issue for issue in issues if all(issue.status_allowed(name) == IDENTIFIED for name in verdicts)]
     predicted = verdicts.get(PREDICTIONS)
     return [
         *([f"{PREDICTIONS}: {predicted.value}."] if predicted is not None and predicted.trusted else []),

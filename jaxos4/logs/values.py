@@ -21,9 +21,9 @@ class ColumnLimits(NamedTuple):
     """The unit of a column, and the numbers that it can hold.
 
     - `unit`: the unit of the column. `others`: units in which a log may have it, and their factors to `unit`.
-    - `least`, `largest`: what lies beyond is impossible: out of reach of any quadrotor, but not of a wrong unit.
+    - `least`, `largest`: values beyond are impossible for any quadrotor; only a wrong unit gives them.
     - `advice`: on larger values, and, without `below`, on smaller ones too.
-    - `zero`: whether 0 is a measurement, and negative numbers are. If not, they count as not measured.
+    - `zero`: whether 0 and negative numbers are measurements. If not, they count as not measured.
     """
 
     unit: str

@@ -31,9 +31,10 @@ class Parameter(NamedTuple):
     - `half_width`, `center`: of the default bracket of a term's parameter.
     - `each_recording`: whether each recording has a separate value. If not, the vehicle has one value.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
-    - `in_forcing`: whether the forcing depends on it; set by the model. If not, the rate equations are linear in it.
+    - `in_forcing`: whether the forcing depends on it; set by the model. Rate equations are linear in every
+      other parameter.
     - `nonnegative`: whether physics forbids a negative value.
-    - `scales_torque`: whether torque exceeds the airframe's by this factor.
+    - `scales_torque`: whether the true torque is the airframe's times this parameter.
     - `nominal`: the usual value, at which the parameter is fixed unless the flights clearly contradict it.
     - `contradiction`: a function of a value and its error. It returns cause and remedy if physics or the airframe
       forbids the value, otherwise `None`.

@@ -90,8 +90,8 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         channels=_channels(recording),
         refusals=refusals,
-        findings=findings(evidence),
-        notes=recording.notes if yaw is None else (*recording.notes, str(yaw)),
+        findings=findings(evidence) if yaw is None else (*findings(evidence), yaw),
+        notes=recording.notes,
         stretches=tuple(stretches),
     )
 

@@ -29,7 +29,7 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
             return flight._replace(within=within(flight.time, flight.dt))
         time, omega, means = average(dt)
         signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within(time, dt)}
-        # The instants of a mean have the same variance in time as a continuous mean over this time.
+        # A mean of n instants has the same variance in time as a continuous mean over this shorter time.
         averaging_time = dt * math.sqrt(1 - (flight.dt / dt) ** 2)
         return flight._replace(**signals, time=time, held=True, averaging_time=averaging_time)
 
@@ -98,7 +98,7 @@ def hold_out(
     - `seconds`: about how long a batch is [s]: short enough for all phases of a flight to have batches of both kinds.
 
     **Returns:** two recordings of the same samples: in each, the measurements of the other are NaN. The second keeps
-    the specific force, because a model may use it as an input. `None`: nothing is held out.
+    all signals besides the states, because a model may use them as inputs. `None`: nothing is held out.
     """
     if not share:
         return recording, None

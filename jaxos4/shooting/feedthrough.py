@@ -27,7 +27,7 @@ LAGGED_COUNTS = (3, 3, 3, 1)
 """The same if motors follow commands in short samples: the innovations of the sample and of samples before it. With
 fewer, rotor_lag and rotor_delay have several minima; with more, the response of the motors is lost."""
 MEANS = 0.1, 0.3, 1.0
-"""Time constants [s] of means that hold what a controller of attitude integrates; for commands in short samples."""
+"""Time constants [s] of the means in which a controller's integral of attitude shows; for commands in short samples."""
 # A smaller share of a signal may be due to rounding.
 _ROUNDING = 1e-6
 # Rows of one matrix product. More would not fit the cache, and BLAS would divide so small a product among threads.
@@ -46,38 +46,40 @@ def input_innovations(
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
-    The prediction is a linear regression on earlier samples of the input and of the measured motion, and on exponential
-    means of both where these explain more than chance does, by Schwarz's criterion. The result is the `count`
+    The prediction is a linear regression on earlier samples of the input and of the measured motion, and, where they
+    explain more than chance does by Schwarz's criterion, on exponential means of both. The result is the `count`
     combinations of the parts of a sample with most of the residual, with arbitrary signs; 0 at the beginning of a
     stretch.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN counts as the mean.
     - `stretch`: the number of the uninterrupted stretch of each sample.
-    - `dt`: sample time [s]. `memory`: how far back single samples count [s], at least three.
+    - `dt`: sample time [s]. `memory`: how far back single samples count [s]; at least three samples.
     - `means`: time constants of the means [s].
 
     Reference: Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978).
     """
     lags, (samples, parts) = max(round(memory / dt), 3), inputs.shape
-    found, rows = np.zeros((samples, count)), np.arange(lags, samples)
+    rows = np.arange(lags, samples)
     rows = rows[stretch[rows] == stretch[rows - lags]]
-    if len(rows) <= 1 + lags * (parts + 1) + 2 * len(means):
-        return found
+    spare = len(rows) - 1 - lags * (parts + 1)  # degrees of freedom
+    if spare <= 0:
+        return np.zeros((samples, count))
     series = np.ones((samples, parts + 2))
     series[:, :parts] = _standard(inputs)
-    known = measured[np.isfinite(measured)]
-    series[:, parts] = _standard(np.nan_to_num(measured - (known.mean() if known.size else 0.0)))
+    known = np.isfinite(measured)
+    series[:, parts] = _standard(np.where(known, measured, measured[known].mean() if known.any() else 0.0))
     rest = _unexplained(series, parts, rows, lags)
-    if means:
-        both = np.stack([series[:, :parts].mean(axis=1), series[:, parts]], axis=1)
-        less = _unexplained(series, parts, rows, lags, _exponential_means(both, stretch, dt, means))
-        power, remaining = (np.square(each.mean(axis=1)).mean() for each in (rest, less))
-        if remaining < power * len(rows) ** (-2 * len(means) / len(rows)):
-            rest = less
+    if spare > 2 * len(means) > 0:
+        with_means = _unexplained(series, parts, rows, lags, _exponential_means(series, parts, stretch, dt, means))
+        power, power_with_means = (np.square(each.mean(axis=1)).mean() for each in (rest, with_means))
+        if power_with_means < power * spare ** (-2 * len(means) / spare):
+            rest = with_means
+        del with_means
     _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
     scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
+    found = np.zeros((samples, count))
     found[rows] = np.sqrt(len(rows)) * rest @ scaled[:, :count]
     return found
 
@@ -101,20 +103,25 @@ def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarra
 
 def _exponential_means(
     series: Float[np.ndarray, "samples series"],
+    parts: int,
     stretch: Int[np.ndarray, " samples"],
     dt: float,
     times: Sequence[float],
 ) -> Float[np.ndarray, "samples means"]:
-    """The exponential means of the series up to each sample of a stretch, with these time constants [s]."""
+    """Exponential means, up to each sample, of input and motion, with these time constants [s]; 0 before a stretch.
+
+    `series`: the input in `parts`, then the motion, with mean 0.
+    """
     from scipy.linalg import solve_banded  # slow to import
 
-    found = []
-    for kept in np.exp(-dt / np.asarray(times)):
-        # The recursion m[k] - kept m[k - 1] = (1 - kept) x[k], as a system of equations.
-        bands = np.ones((2, len(series)))
-        bands[1, :-1] = np.where(stretch[1:] == stretch[:-1], -kept, 0.0)
-        found.append(solve_banded((1, 0), bands, (1 - kept) * series))
-    return np.concatenate(found, axis=1)
+    found = np.empty((len(series), 2, len(times)))
+    for place, kept in enumerate(np.exp(-dt / np.asarray(times))):
+        for which, signal in enumerate((series[:, :parts].mean(axis=1), series[:, parts])):
+            # The recursion m[k] - kept m[k - 1] = (1 - kept) x[k], as a system of equations.
+            bands = np.array([[0.0], [1.0], [0.0]]) + np.zeros(len(series))
+            bands[2, :-1] = np.where(stretch[1:] == stretch[:-1], -kept, 0.0)
+            found[:, which, place] = solve_banded((1, 1), bands, (1 - kept) * signal, overwrite_ab=True)
+    return found.reshape(len(series), -1)
 
 
 def _unexplained(

@@ -20,6 +20,7 @@ from ..batching import computed_once, with_batch
 from ..models.state import Forcing, Rates, State
 from .gains import (
     RATE_COUNT,
+    AveragingWindow,
     Channels,
     Covariance,
     Feedback,
@@ -28,7 +29,6 @@ from .gains import (
     Observed,
     PerSegment,
     Step,
-    Window,
     basis,
     by_inputs,
     feedback_slopes,
@@ -65,7 +65,8 @@ class _Row(NamedTuple):
 class _Known(NamedTuple):
     """The estimates of the filters at the beginning of a sample, by channel.
 
-    - `driven`: the rates, then the specific forces besides the model's. `disturbance`: their disturbances.
+    - `driven`: the rates, then the part of each specific force that the model does not predict.
+    - `disturbance`: their disturbances.
     """
 
     driven: tuple[PerSegment, ...]
@@ -143,7 +144,7 @@ class Segmented(NamedTuple):
     forcing_tangents: Forcing | None
     rows: Count | int
     dt: Scalar
-    window: Window
+    window: AveragingWindow
 
 
 class Point(NamedTuple):
@@ -164,7 +165,7 @@ class Point(NamedTuple):
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """Filter all segments. The likelihood of the innovations has derivatives in the parameters and in the noise.
 
-    The derivatives neglect that one channel's noise affects another channel's innovations.
+    In the derivatives, the noise of a channel affects its own innovations only.
 
     - `functions`: three functions of a state, the forcing and the parameters. They return the state one sample later,
       its mean over the window of a measurement, and the outputs of the sensors.
@@ -225,8 +226,8 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     """See `innovate`. `functions` act on all segments. Arrays in `at` may have segments as last axis."""
     observed, inputs, forcing, forcing_tangents, rows, dt, window = flight
     count, (time, channels, segments) = at.parameters.shape[0], observed.measured.shape
-    levels = len(jax.tree.leaves((at.noise, at.input_gains)))
-    unknowns = count + levels + len(at.feedthrough)
+    driving = count + len(jax.tree.leaves((at.noise, at.input_gains)))  # the unknowns that change the estimates
+    unknowns = driving + len(at.feedthrough)
     step, push = jax.linearize(lambda noise: step_of(noise, dt, window), at.noise)
     steps = step, jax.vmap(push)(basis(at.noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
@@ -241,7 +242,7 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         information=jnp.zeros((channels, unknowns, unknowns, segments), dtype=float),
         products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
     )
-    no_slopes = jax.tree.map(lambda _: jnp.zeros((count + levels, segments), dtype=float), known)
+    no_slopes = jax.tree.map(lambda _: jnp.zeros((driving, segments), dtype=float), known)
     carry = _Carry(
         (covariance, jax.vmap(push)(steps[1])),
         (known, no_slopes),
@@ -284,8 +285,8 @@ def _filter_rows(
     """
     parameters, (count, *_), segments = point.parameters, point.parameters.shape, counts.shape[1]
     scalars, own = tuple(parameters), parameters.shape[1:]
-    unknowns = jax.tree.leaves(carry.known[1])[0].shape[0]
-    units = tuple(np.eye(count, unknowns, dtype=parameters.dtype))
+    driving = jax.tree.leaves(carry.known[1])[0].shape[0]
+    units = tuple(np.eye(count, driving, dtype=parameters.dtype))
 
     def body(carry, rows):
         (covariance, by_noise), (known, slopes), feasible = carry
@@ -308,7 +309,7 @@ def _filter_rows(
 
         at, directions = (known, feedback, scalars), (slopes, by_unknowns, units)
         if tangents is not None:
-            wide = jax.tree.map(lambda t: jnp.zeros((unknowns, segments), dtype=float).at[positions].set(t), tangents)
+            wide = jax.tree.map(lambda t: jnp.zeros((driving, segments), dtype=float).at[positions].set(t), tangents)
             at, directions = (*at, forcing), (*directions, wide)
         (known, errors), push = jax.linearize(filtered, *at)
         slopes, by_errors = jax.vmap(pushed)(*directions)  # pyright: ignore[reportArgumentType]

@@ -4,9 +4,10 @@ A disturbance d acts in each channel. It is an Ornstein-Uhlenbeck process, d' = 
 it acts as an angular acceleration [rad/s^2], x' = d. On a specific force it acts through a low-pass filter, because
 gusts and rotors answer smoothly: the force per mass [m/s^2] is x, with x' = (d - x) / smoothing.
 
-A measurement is the mean over a window of its sample (`Window`). A filter estimates x and d at the beginning of a
-sample. With the noise within the sample, they determine x and d at its end, and the measurement. The joint covariance
-of these three is exact, so innovations of the right model are white at every sample time.
+A measurement is the mean over a part of its sample (`AveragingWindow`). A filter estimates x and d at the beginning of
+a sample. With the noise within the sample, they determine x and d at its end, and the measurement. The joint covariance
+of these three is exact, so innovations of the right model are white at every sample time. In names, `driven` stands for
+x, and `disturbance` for d.
 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
@@ -37,8 +38,8 @@ _NO_FILTER = 1e-9
 
 
 # The part of a sample over which a measurement is averaged: beginning and length [s]; a length of 0: an instant.
-Window = tuple[Scalar | float, Scalar | float]
-INSTANT: Window = (0.0, 0.0)
+AveragingWindow = tuple[Scalar | float, Scalar | float]
+INSTANT: AveragingWindow = (0.0, 0.0)
 """A measurement at the beginning of its sample."""
 
 
@@ -76,7 +77,7 @@ class Observed(NamedTuple):
 class Gains(NamedTuple):
     """The effect of a unit of innovation, and the variance of the innovation.
 
-    - `driven`, `disturbance`: the effect at the beginning of the sample.
+    - `driven`, `disturbance`: the gain on x and on d at the beginning of the sample.
     - `driven_later`: the additional effect on x at the end. `disturbance_later`: the effect on d at the end.
     """
 
@@ -117,7 +118,7 @@ class Step(NamedTuple):
 
     - `transition`: propagates the disturbance over one sample, without noise.
     - `driven_seen`, `seen`: the change of the measurement for a unit of x and of d.
-    - `since_seen`: x at the end of the sample, for each unit of x in the measurement.
+    - `since_seen`: x at the end of the sample over its contribution to the measurement.
     - `added`: the covariance that its noise adds at the end of the sample.
     - `noise`: the variance that its noise adds to the measurement; `with_driven`, `with_disturbance`: the covariance
       with x and d at the end.
@@ -175,7 +176,7 @@ class _Response(NamedTuple):
         return jnp.where(is_rate(tau), tau * (time - slow), tau * (slow - quick) / (tau - fast))
 
 
-def step_of(noise: LogNoise, dt: Float[Array, "..."], window: Window = INSTANT) -> Step:
+def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = INSTANT) -> Step:
     """The step over one sample of this length. Measurements are means over `window`."""
     noise = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1), noise)
     response, variance = _Response.of(noise), jnp.exp(2 * noise.strength)

@@ -27,7 +27,7 @@ from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
 from .filters import Point, Segmented, innovate
-from .gains import INSTANT, LogNoise, Observed, Window
+from .gains import INSTANT, AveragingWindow, LogNoise, Observed
 from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, levels, own_names, with_noise
 from .problem import ShootingProblem
@@ -59,9 +59,9 @@ class InnovationsProblem(AbstractProblem):
       predict, see `jaxos4.shooting.feedthrough`. By default none: the controller knows no more than the log.
     - `answers_within`: whether the controller answers a rate within its sample; otherwise feedthroughs are 0.
     - `lagged`: whether input innovations after the first are those of samples before, see `feedthrough.lagged`. They
-      have no gain on the disturbance, which could not be told from their gains on the rate.
-    - `noise_feedthrough`: feedthroughs that are treated as known: the innovations that they explain count as noise. NaN
-      (default): unknown. A search then has two stages: the first finds them, the second counts what they explain.
+      get no gain on the disturbance of a rate: one sample later, it is the same disturbance less a step of the rate.
+    - `noise_feedthrough`: feedthroughs that were found before. What they explain still counts as noise. NaN (default):
+      unknown. A search then has two stages: the first finds them, the second counts what they explain.
     - `start`: where searches start. NaN (default): the center of the bracket, with each of several time constants.
     """
 
@@ -133,7 +133,7 @@ class InnovationsProblem(AbstractProblem):
         return tuple(CHANNEL_NAMES[column] for column in self.problem.columns)
 
     @property
-    def window(self) -> Window:
+    def averaging_window(self) -> AveragingWindow:
         """The part of a sample over which measurements are means, see `Flight.within`."""
         if self.flight.within is None:
             return INSTANT
@@ -166,8 +166,14 @@ class InnovationsProblem(AbstractProblem):
         """The parameters, then the logarithms of the noise levels, in brackets from differences of measurements."""
         data = self.problem.measured(), self.flight.dt, self.least_noise
         has_input = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
-        is_answer = {"answers_within": self.answers_within, "lagged": self.lagged}
-        return with_noise(self.problem.unknowns, self.channels, *data, has_input=has_input, **is_answer)
+        return with_noise(
+            self.problem.unknowns,
+            self.channels,
+            *data,
+            has_input=has_input,
+            answers_within=self.answers_within,
+            lagged=self.lagged,
+        )
 
     @property
     def initial_guess(self) -> InitialGuess:
@@ -238,7 +244,7 @@ class InnovationsProblem(AbstractProblem):
             )
 
         first = is_known.astype(int) if number == 2 else 0
-        return Stages(number, first, first, at)
+        return Stages(number, first, first, at)  # all stages fit the whole flight
 
     def _local_model(self) -> Callable[[Float[Array, "channels feedthroughs"], WindowUnknowns], LocalModel]:
         """`local_model` as a function of `noise_feedthrough` and of the unknowns."""
@@ -267,7 +273,7 @@ class InnovationsProblem(AbstractProblem):
 
     @property
     def _place(self) -> Int[Array, "segments time"]:
-        """The samples of each segment. Indices beyond the flight are those of its last sample."""
+        """The samples of each segment. An index beyond the flight is replaced by that of its last sample."""
         return jnp.minimum(jnp.asarray(self.segmentation.place), self.flight.time.shape[0] - 1)
 
     def observed(self) -> Observed:
@@ -298,7 +304,7 @@ class InnovationsProblem(AbstractProblem):
             places = jnp.asarray(each.places)[self.segmentation.recording].T
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
-        fixed = self.segmentation.rows, self.flight.dt, self.window
+        fixed = self.segmentation.rows, self.flight.dt, self.averaging_window
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
         def at(parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array) -> Innovations:

@@ -69,7 +69,8 @@ class Segments(NamedTuple):
     begins with its recording. Segments are equally long, except for the last one of each recording.
 
     - `place`: the samples of each segment, in a multiple of `BLOCK` rows. Indices beyond the flight are padding.
-    - `owned`: whether a sample belongs to a segment. Each sample belongs to one; in another it settles the filter.
+    - `owned`: whether a sample belongs to a segment. Each sample belongs to one segment. It may also settle
+      the filter of the next.
     - `rows`: the number of rows that are used; the others are padding.
     - `recording`: the number of the recording of each segment.
     """

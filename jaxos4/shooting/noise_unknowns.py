@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Scalar
 from ..bracket import PROPER_PRIOR
+from ..flight import FORCE_NAMES
 from .abstract import Unknowns
 from .gains import RATE_COUNT, LogNoise, is_rate
 
@@ -79,8 +80,8 @@ def with_noise(
         jnp.pad(x, ((0, 0), (0, more)), constant_values=value)
         for x, value in ((first, 0.0), (lowest, -np.inf), (highest, np.inf))
     )
-    # An input innovation that is always 0 has no gain to estimate. A disturbance one sample later acts like a rate: of
-    # lagged innovations, only the first has a gain on it.
+    # An input innovation that is always 0 has no gain to estimate. Of lagged innovations, only the first has a gain on
+    # the disturbance: one sample later, it is the same disturbance less a step of the rate.
     of_disturbance = has_input & ~(lagged & (np.arange(has_input.shape[1]) > 0))
     free = jnp.concatenate([free, has_input, of_disturbance, has_input & rate & answers_within], axis=1)
     names = tuple(each.format(name) for name in channels for each in own_names(count, has_input.shape[1]))
@@ -110,6 +111,6 @@ def own_names(count: int, feedthroughs: int) -> tuple[str, ...]:
 def _unit(name: str) -> str:
     if name.startswith("log"):
         return "1"
-    if name.startswith("a"):
+    if name.startswith(FORCE_NAMES):
         return "m/s^2"
     return "rad/s^2" if "disturbance" in name else "rad/s"

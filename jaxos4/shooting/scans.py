@@ -128,7 +128,10 @@ def shot_with_derivatives(
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
 ) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
-    """`shoot` with gradient and information in the parameters and a free initial state. A batch runs in lanes."""
+    """What `shoot` computes, with gradient and information in the parameters and a free initial state.
+
+    It has a loop of its own, `_linearised_shot`. A batch runs in lanes.
+    """
     how = {"forcing_parameters": forcing_parameters, "initial_state_is_free": initial_state_is_free}
     alone = functools.partial(_linearised_shot, **how)
 

@@ -19,7 +19,7 @@ LAGS = 8
 class Innovations(NamedTuple):
     """The innovations of each segment and their negative log-likelihood.
 
-    The unknowns of a channel are the parameters, then the channel's `LogNoise` and feedthroughs.
+    The unknowns of a channel are the parameters, then its `LogNoise`, gains of input innovations, and feedthroughs.
 
     - `feasible`: whether the rates stay below `FASTEST`.
     - `information`: the Fisher information.

@@ -35,6 +35,16 @@ def misfit(x):
     return jnp.stack([5 * (x[0] - 0.4), 10 + 4 * (x[0] - 0.3) ** 2, 0.3 * (x[1] + 0.3), 0.2 * x[0] * x[1]])
 
 
+def wall(x):
+    """A slope that ends at a wall, so that the first steps are much too long, and secants much steeper than before."""
+    return jnp.stack([0.1 * x[0] - 1, 3 * jnp.maximum(x[0] - 1, 0.0), x[1]])
+
+
+def late(x):
+    """One unknown that would go far beyond its limit, and one that hardly matters: y = -0.5 at the minimum."""
+    return jnp.stack([1e4 * (x[0] - 400), 0.1 * (x[1] + 0.5)])
+
+
 def two_minima(x):
     """Near y = -1 and y = 1; the second is the lower one."""
     return jnp.stack([5 * x[0], 5 * (x[1] ** 2 - 1), x[1] - 1])

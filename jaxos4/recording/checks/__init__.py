@@ -45,7 +45,10 @@ CHECKS: tuple[Check, ...] = (
     short_flight,
     wrong_thrust,
 )
-"""Each check looks for one fault. A new check is one function, and one line here."""
+"""Each check looks for one fault in one log. A new check is one function, and one line here.
+
+`opposite_yaw` and `different_thrust` need more than the evidence of one log, and are called where a fit is prepared.
+"""
 
 KINEMATIC: tuple[Check, ...] = (wrong_scale, wrong_axes)
 """The checks that also hold for a flight without a controller, which may turn far and drift away."""

@@ -32,7 +32,7 @@ class Finding(msgspec.Struct, frozen=True):
     - `size`: the figure behind it, with its unit.
     - `remedy`: what to do.
     - `quantities`: the quantities that the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
-    - `contradicted`: whether the log contradicts these quantities. Otherwise the finding is only noted.
+    - `contradicted`: whether the log contradicts these quantities. Otherwise they get a reservation.
     """
 
     name: str
