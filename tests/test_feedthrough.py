@@ -283,6 +283,17 @@ def test_a_search_counts_as_noise_what_the_feedthroughs_that_it_found_explain(rn
     assert search(problem.with_noise_feedthrough(nothing)).cost < found.cost
 
 
+@pytest.mark.parametrize("logged", ["commands", "speeds"])
+def test_commands_in_short_samples_have_innovations_of_earlier_samples(logged):
+    loop = jaxos4.ClosedLoop(CINERAT, gust=2.0, rotor_lag=0.04, logged=logged)
+    every = prepare_vehicle(as_recordings(fly_standard(loop, duration=16.0, seed=0)), CINERAT, jaxos4.VehicleSettings())
+    for data in every:
+        is_short = logged == "commands" and data.provenance.sample_time <= 0.005
+        first, second = np.asarray(data.likelihood.input_innovations)[: data.clock.time.size, :2, 0].T
+        assert first.any()
+        assert bool(data.likelihood.lagged) == is_short == (second[1:] == first[:-1]).all()
+
+
 def test_no_torque_before_an_instant_answers_what_is_measured_at_it():
     """Means, and slower logs, hold such answers."""
     flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0), duration=16.0, seed=0)
