@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ._custom_types import Numeric, Parameters, as_float
 from .models.abstract import AbstractModel
 
-# The largest standard deviation of an identifiable parameter, in half-widths of a bracket that is used as ...
+# How a bracket is used. Each number is the largest standard deviation of an identifiable parameter, in half-widths.
 NO_PRIOR = 1.0  # a region to search: the flight must contain more information than the bracket
 GAUSSIAN_PRIOR = 0.5**0.5  # a prior with a standard deviation of 1: the flight must tell at least as much
 UNIFORM_PRIOR = 0.5  # a prior with a standard deviation of 0.577

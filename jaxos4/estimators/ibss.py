@@ -74,7 +74,7 @@ class IBSS(AbstractSolver[State]):
     separable along them, so a sweep bisects all directions in parallel. Parameters are bisected on the sum of all
     windows' slopes, initial states on the slope of their window.
 
-    - `halvings`: the shots of a sweep that narrow the brackets.
+    - `halvings`: the shots of a sweep that narrow the brackets. One more shot is at the trials that these found.
     - `max_sweeps`: the most sweeps of a stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
       direction. The `misfit` of the residuals scales them, so noise-free data are fitted to rounding errors.
@@ -110,9 +110,13 @@ class IBSS(AbstractSolver[State]):
         )
 
     def step(self, stage: Stage, state: State) -> State:
-        """The shot at the start, or one sweep: bisect, judge, look around, open. See docs/method/ibss.md."""
+        """The shot at the start, or one sweep, see docs/method/ibss.md.
+
+        A sweep bisects, keeps its last point if the cost is lower, looks for directions and slopes there, and opens new
+        brackets around the steps that they predict.
+        """
         is_start = state.shots == 0
-        # One shot is enough if all brackets are closed. The last one is at the trials that the others found.
+        # One shot is enough if all brackets are closed.
         most = jnp.where((state.brackets.highest > state.brackets.lowest).any(), self.halvings + 1, 1)
         brackets, unknowns, model, shots, _ = jax.lax.while_loop(
             lambda carry: (carry[3] < most) & ~carry[4],

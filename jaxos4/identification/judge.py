@@ -62,6 +62,8 @@ from .verdict import CONTRADICTED, result_of, verdicts_of
 _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
 REGRESSION = EquationError(memory=0.9)
 """The regression with which predictions are compared. This memory is the best on real flights."""
+REQUIRED = ROLL.inertia, PITCH.inertia
+"""The quantities that decide the result code of a vehicle. Iz is none of them, because it also needs the rotors' drag."""
 
 
 def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name: str) -> OS4Identification:
@@ -203,7 +205,7 @@ def judge_vehicle(
     quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
     issues = issues_of_vehicle(answer, found, response, sample_times=sample_times, quantities=quantities, still=still)
     verdicts = verdicts_of(quantities, issues)
-    result = result_of(verdicts, issues, search, (ROLL.inertia, PITCH.inertia))
+    result = result_of(verdicts, issues, search, REQUIRED)
     return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
 
 

@@ -47,7 +47,8 @@ _VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
 _FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
 _VOLTAGE = "the battery's voltage is in volts: if these are mV, divide by 1000"
 _PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
-_OF_UNIT = {  # of the signals of a flight
+# Limits of the signals of a flight. A signal with a new unit needs a line here.
+_OF_UNIT = {
     each.unit: each
     for each in (
         ColumnLimits("m", -1e6, 1e6, _POSITION, others={"cm": 0.01, "mm": 1e-3}),

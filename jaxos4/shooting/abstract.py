@@ -198,7 +198,7 @@ class Stage(NamedTuple):
 
     - `unknowns`: of the likelihood. `off`: of its `InitialGuess`.
     - `local_model`: of the stage's cost, with derivatives of 0 in unknowns that are not searched.
-    - `searched`: the unknowns that it searches.
+    - `searched`: the unknowns that it searches: the free ones, and initial states that are unknowns.
     - `measurements`: the number of measurements that its cost compares; 0 if the noise is an unknown.
     - `smallest_step`: the step in standard deviations below which rounding decides the sign of a slope.
     - `last`: whether it is the last one.

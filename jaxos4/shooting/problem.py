@@ -149,6 +149,7 @@ class ShootingProblem(AbstractProblem):
 
         def local_model(length: Length, searched: Bool[Numeric, " unknowns"], unknowns: WindowUnknowns) -> LocalModel:
             rows, own = forced(unknowns[0, :count]), unknowns[:, count:] if self.free_size else first
+            # The states of fewer channels, then the specific force.
             rows = rows._replace(measured=rows.measured[: fewer.size] + rows.measured[self.size :])
             window = shot_with_derivatives(
                 fewer.advance,
