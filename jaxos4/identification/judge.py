@@ -63,7 +63,7 @@ _MOST_STARTS, _MOST_TRAJECTORIES = 1200, 40
 REGRESSION = EquationError(memory=0.9)
 """The regression with which predictions are compared. This memory is the best on real flights."""
 REQUIRED = ROLL.inertia, PITCH.inertia
-"""The quantities that decide the result code of a vehicle. Iz is none of them, because it also needs the rotors' drag."""
+"""The quantities that decide the result code of a vehicle. Iz is not: it also needs the rotors' drag."""
 
 
 def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name: str) -> OS4Identification:
