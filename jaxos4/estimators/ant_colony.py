@@ -61,8 +61,6 @@ class AntColony(AbstractSolver[Colony]):
     have the same random numbers.
     """
 
-    shoots: ClassVar[bool] = True
-    in_closed_loop: ClassVar[bool] = True
     in_comparison: ClassVar[bool] = False  # `experiments/comparison` includes it
     is_local: ClassVar[bool] = False
 

@@ -4,7 +4,7 @@ The paper gives the idea only; the steps in this file are our choice.
 """
 
 import functools
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from ..shooting import LocalModel, Stage, WindowUnknowns
 from .bisection import Directions, Flag, PerDirection, SearchIntervals
 from .solver import AbstractSolver, Found, before_shots, chosen
 
-# All lengths are in standard deviations of the estimate, which grow with the misfit, see `tolerance`.
+# All lengths are in standard deviations at the given noise. Only the test for the end scales them by the misfit.
 _COARSE = 0.5  # a stage other than the last ends once the minimum is this close
 _OPENING = 4.0  # the longest step of a stage's first sweep, in standard deviations of the stage's start
 _NARROW = 0.05  # half-width of a stage's first brackets, relative to that longest step
@@ -82,9 +82,6 @@ class IBSS(AbstractSolver[State]):
     - `shares`: before the fit of all data, the body rates are fitted to these shares of the flight, because errors grow
       with time and give the cost of a long flight other minima.
     """
-
-    shoots: ClassVar[bool] = True
-    in_closed_loop: ClassVar[bool] = True
 
     halvings: int = eqx.field(static=True, converter=integer("halvings", 2, static=True), default=2)
     max_sweeps: Count = eqx.field(converter=integer("max_sweeps", 1), default=60)

@@ -8,7 +8,7 @@ References: Marquardt 1963, SIAM J. Appl. Math. 11(2); compare Dennis, Gay and W
 Softw. 7(3).
 """
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -61,7 +61,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
       step is short enough.
     - `gain_tolerance`: a stage ends if steps with little damping promise to lower the cost by less. An error of one
       standard deviation costs 0.5.
-    - `flat`: a stage also ends if steps with a damping above 1 promise to lower the cost by less.
+    - `flat`: while the damping is above 1, a stage also ends if a step with hardly any damping would promise less.
     - `max_steps`: the most steps of a stage.
     - `is_relative`: whether damping is relative to the information about each unknown (Marquardt). Otherwise it is
       relative to the knowledge before the flight (Levenberg), and hardly changes the steps of a flight with much
@@ -71,9 +71,6 @@ class LevenbergMarquardt(AbstractSolver[State]):
       channels from a wide bracket can end in another minimum.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     """
-
-    shoots: ClassVar[bool] = True
-    in_closed_loop: ClassVar[bool] = True
 
     step_tolerance: Scalar = eqx.field(converter=setting("step_tolerance"), default=1e-5)
     gain_tolerance: Scalar = eqx.field(converter=setting("gain_tolerance"), default=0.0)
@@ -135,6 +132,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
         """Whether a step, before strides and limits shorten it, promises so little that it ends the stage."""
         unit, least = self._unit(stage, model.information), self._least(stage)
         # The expected reduction of the cost: the larger of this step's and that of a step with hardly any damping.
+        # Without damping it is half of this, so that a search ends later than it says.
         eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
         promised = -model.gradient * step
         left = jnp.maximum(promised.sum(), (eased * promised).sum())

@@ -43,6 +43,8 @@ class AbstractSolver(AbstractEstimator, Generic[State]):
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     """
 
+    shoots: ClassVar[bool] = True
+    in_closed_loop: ClassVar[bool] = True
     is_local: ClassVar[bool] = True
     shares: eqx.AbstractVar[tuple[float, ...]]
     reach: eqx.AbstractVar[Scalar]

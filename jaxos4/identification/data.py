@@ -88,7 +88,8 @@ class Data(Generic[L]):
     - `clock`: log and time of each sample for a vehicle; empty for an OS4.
     - `provenance`: data, settings and versions. `seconds`: duration of a vehicle's fitted measurements [s].
     - `held_out`: the measurements that are not fitted, if any.
-    - `findings`: faults in the logs that concern moments of inertia. `log_step`: the longest sample of the logs [s].
+    - `findings`: faults of the logs that concern moments of inertia, or contradict another quantity.
+    - `log_step`: the longest sample of the logs [s].
     - `motor_step`: the longest time between new values of the motors in the logs [s].
     - `vibrates`: the body rates that vibrate, each with its frequency [Hz].
     - `follows_commands`: whether rotor speeds are computed from commands.

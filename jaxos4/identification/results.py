@@ -217,7 +217,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def successful(self) -> bool:
-        """Whether the requested quantities can be trusted: Ix and Iy of a vehicle; all identified ones of an OS4."""
+        """Whether what was asked for can be trusted: Ix and Iy of a vehicle; of an OS4, no alpha is contradicted."""
         return self.result == "successful"
 
     @property

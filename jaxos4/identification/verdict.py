@@ -117,7 +117,8 @@ class Verdict(msgspec.Struct, frozen=True):
     - `status`: `identified`, `identified with a reservation`, `not identified` or `contradicted`.
     - `value`: the quantity's value, 95 % interval and conditions, in words; empty for quantities
       that consist of parameters, whose table shows them.
-    - `reasons`: the reservations, or the causes with their remedies. Empty if the quantity is `identified`.
+    - `reasons`: the reservations, or the causes with their remedies; without a remedy if the size of the move is known,
+      because `next_flight` gives it. Empty if the quantity is `identified`.
     """
 
     status: str
@@ -196,8 +197,9 @@ def result_of(verdicts: Mapping[str, Verdict], issues: Sequence[Issue], search: 
 def _statuses_allowed(issues: Sequence[Issue], name: str) -> list[str]:
     """The status that each issue leaves to the quantity of this name.
 
-    Reservations of known size add up. If one of them is due to an impossible parameter, and their sum exceeds both
-    limits, they contradict the quantity: the parameter shows that the model is wrong, the other issues by how much.
+    Issues of known size add up. If one of them is more severe than a reservation, such as an impossible parameter, and
+    their sum exceeds both limits, they contradict the quantity: that one shows that the model is wrong, the others show
+    by how much.
     """
     alone = [issue.status_allowed(name) for issue in issues]
     reserved = (i for i, status in enumerate(alone) if status == RESERVED)

@@ -36,7 +36,10 @@ from .ulog import ULOG
 from .values import without_impossible
 
 FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
-"""The formats in the order in which they are tried. A new format is one line here, before the last."""
+"""The formats in the order in which they are tried. A new format is one line here, before the last.
+
+Only formats of other packages are asked about files that are a zip or tar.
+"""
 _OTHERS: Registry[LogFormat] = Registry("jaxos4.log_formats", {})
 
 # Files that no reader takes, by their first bytes: their kind, and how to make a log of them that is read.

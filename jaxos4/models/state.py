@@ -1,7 +1,9 @@
 """The state of a quadrotor as a cascade, and the forcing: rotors -> torque -> rates -> attitude -> translation.
 
-Parameters enter the forcing and the rates alone, and no level feeds back. So a `State` may stop at any level; a level
-that is `None` is not simulated. States are scalars, because a batch of scalars vectorises.
+In the OS4, parameters enter the forcing and the rates alone, and no level feeds back. So a `State` may stop at any
+level; a level that is `None` is not simulated. (Terms of a vehicle may act on the translation, and use its velocity:
+`shooting.scans.panels_of` finds out which unknowns act where.) States are scalars, because a batch of scalars
+vectorises.
 """
 
 from typing import NamedTuple

@@ -28,7 +28,11 @@ _LONGEST = 60  # parts in the table at most, the longest
 _USUAL = 0.9  # of the time the rotors turn at speeds in the band of the spectra
 _COMMANDS = "of full scale (commands)"
 _TOGETHER = ["p q r", "phi theta psi", "x y z", "vx vy vz"]
-_TOGETHER += [" ".join(signal.columns) for name, signal in SIGNALS.items() if signal.columns and name != "states"]
+_TOGETHER += [
+    " ".join(signal.columns)
+    for name, signal in SIGNALS.items()
+    if signal.columns and name != "states" and not signal.is_input
+]
 # The unit of channels that are shown together.
 _UNITS = {names: UNITS[names.split()[0]] for names in _TOGETHER} | {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 

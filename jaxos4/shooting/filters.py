@@ -118,7 +118,7 @@ class _Carry(NamedTuple):
     """The state of the filters between blocks of rows, each part with its derivatives, and the sums so far.
 
     - `covariance`: with its derivatives in the noise, on the first axis.
-    - `known`: with its derivatives in the parameters, and then in the noise, on the first axis.
+    - `known`: with its derivatives in the parameters, the noise, and the gains of input innovations, on the first axis.
     - `last`: the last `LAGS` standardised innovations.
     """
 
@@ -163,7 +163,7 @@ class Point(NamedTuple):
 
 
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
-    """Filter all segments. The likelihood of the innovations has derivatives in the parameters and in the noise.
+    """Filter all segments. The likelihood of the innovations has derivatives in all unknowns.
 
     In the derivatives, the noise of a channel affects its own innovations only.
 

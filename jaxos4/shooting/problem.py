@@ -271,8 +271,8 @@ class ShootingProblem(AbstractProblem):
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The body rates of a short part of the flight first, then more; the last stage fits the whole flight.
 
-        Rates do not depend on attitude and position, so they are fitted first. Errors grow with time, which gives the
-        cost of a long flight other minima, so the first stages are short.
+        Rates hardly depend on attitude and translation, so they are fitted first. Errors grow with time, which gives
+        the cost of a long flight other minima, so the first stages are short.
 
         `shares`: the body rates are first fitted to these shares of the flight. If there are several windows, only a
         share of 1 counts, because windows are short enough. All stages compare specific force.

@@ -32,7 +32,8 @@ class Finding(msgspec.Struct, frozen=True):
     - `size`: the figure behind it, with its unit.
     - `remedy`: what to do.
     - `quantities`: the quantities that the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
-    - `contradicted`: whether the log contradicts these quantities. Otherwise they get a reservation.
+    - `contradicted`: whether the log contradicts these quantities. Otherwise they get a reservation if a
+      moment of inertia is among them, and else a note.
     """
 
     name: str
