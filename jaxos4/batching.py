@@ -29,9 +29,9 @@ _CHUNK = 4 * _BLOCK
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *first: Any) -> Callable:
     """`function` with its `first` arguments, as a function of the others: arrays. `of_batch` computes it in `jax.vmap`.
 
-    `of_batch` takes the number of lanes, all arguments that differ between lanes, with the lanes first, and those that
-    they share, each `None` in the place of the other. It returns the results with the lanes first. Derivatives are
-    those of `function`, of a batch too.
+    `of_batch` takes the number of lanes and two trees of all arguments. The first holds those that differ between
+    lanes, with the lanes first; the second holds those that all lanes share. In each, the others are `None`. It returns
+    the results with the lanes first. Derivatives are those of `function`, of a batch too.
     """
     arrays, settings = eqx.partition(first, eqx.is_array)
 

@@ -35,7 +35,7 @@ class Signal(NamedTuple):
 
     - `shape`: the shape of a row; `None`: any.
     - `columns`: its columns in a log, by name, with their units; none if it follows from other signals.
-    - `is_input`: models need its value in all samples. Otherwise NaN marks what was not measured.
+    - `is_input`: whether models read it in all samples, so that it has no NaN. In other signals, NaN is not measured.
     """
 
     shape: tuple[int, ...] | None

@@ -32,8 +32,8 @@ _STEEPEST = 1e3
 class State(NamedTuple):
     """The search of a stage before a shot.
 
-    - `best`, `model`: the best unknowns so far, and the local model there. If a small step ends the stage, `best` is
-      after it, and `model` before it.
+    - `best`, `model`: the best unknowns so far, and the local model there. If a small step ends the stage, `best`
+      includes this step, and `model` is that of the point before it.
     - `trial`: where the shot will be.
     - `damping`: of the last step; before the first shot, `_FACTOR` times that of the first step.
     - `after_failure`: whether the step before the trial failed, so that its secant may have corrected the trial.

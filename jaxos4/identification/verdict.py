@@ -28,7 +28,7 @@ ADVICE = {
 
 PREDICTIONS, RIGID_BODY = "predictions", "rigid body"
 RESERVATION, CONTRADICTION = "successful", "implausible"
-"""Severities of an issue: the result code that an estimate gets by it. A reservation leaves the result successful."""
+"""Severities of an issue: the result code that an estimate gets by it. A reservation refuses nothing: `successful`."""
 
 
 # An issue that moves a quantity by more than this share *and* by more than these standard deviations contradicts it. If

@@ -115,7 +115,10 @@ class Messages:
     def fastest(
         self, columns: Sequence[str], sources: Iterable[MessageSource], *, faster: float = 1.1
     ) -> Series | None:
-        """The source that was logged most often in our units and frame; a later one must be `faster` by this factor."""
+        """The source that was logged most often, in our units and frame.
+
+        A later source replaces an earlier one only if its rate is `faster` times as high.
+        """
         best, found = 0.0, None
         for kind, fields, factor in sources:
             for instance in self.fields.get(kind, ()):

@@ -164,9 +164,10 @@ def prepare(
 def _cleaned(
     evidence: Evidence, airframe: Airframe, begin: float | None, end: float | None, *, predicted: bool
 ) -> tuple[list[Recording], list[str], list[Finding]]:
-    """The plausible stretches of one recording to fit, notes, and the findings that concern a moment of inertia.
+    """The plausible stretches of one recording to fit, notes, and findings.
 
-    Findings that contradict another quantity are among the latter too. Raises `InputError` if it cannot be used.
+    The findings are those that concern a moment of inertia, or contradict another quantity. All others become notes,
+    and so do those about the attitude alone. Raises `InputError` if it cannot be used.
     """
     recording = evidence.logged
     name, facts = recording.name, recording.facts

@@ -107,8 +107,8 @@ class Segments(NamedTuple):
 def observe_in_segments(problem: "ShootingProblem", segments: Segments, settling: int) -> Observed:
     """The measurements in segments, where filters restart, and which innovations count.
 
-    A filter restarts in a gap, and where a stretch begins. Until it has settled, its innovations do not count, except
-    at the beginning of a flight without stretches: a simulation begins at rest.
+    A filter restarts in a gap, and where a stretch begins. Its innovations do not count until it has settled. Only a
+    flight without stretches counts from its first sample, because a simulation begins at rest.
     """
     flight, index, samples = problem.flight, jnp.asarray(segments.place), problem.flight.time.shape[0]
     exists, place = ((index >= 0) & (index < samples)).T, jnp.minimum(index, samples - 1)
