@@ -93,19 +93,23 @@ class LevenbergMarquardt(AbstractSolver[State]):
         found, before = stage.local_model(state.trial), state.model
         better = (state.shots == 0) | (cost_of(found) < cost_of(before))
         best, model = chosen(better, (state.trial, found), (state.best, before))
-        secant = state.trial - state.best, found.gradient - before.gradient
         shows = ~better & found.feasible.all() & jnp.isfinite(found.gradient).all()
-        curvature = jnp.where(shows, jax.vmap(_with_secant)(model.information, *secant), model.information)
         # The step after a failure may succeed by its secant, or by its damping: keep the damping.
         eased = jnp.where(state.after_failure, 1.0, 1 / _FACTOR)
         damping = state.damping * jnp.where(better, eased, _FACTOR)
         damping = jnp.maximum(damping, self.least_damping)
-        whole = self._step(stage, best, model._replace(information=curvature), damping)
+
+        def corrected() -> WindowUnknowns:
+            secant = state.trial - state.best, found.gradient - before.gradient
+            information = jax.vmap(_with_secant)(model.information, *secant)
+            return self._step(stage, best, model._replace(information=information), damping)
+
+        plain = self._step(stage, best, model, damping)
+        whole = jax.lax.cond(shows, corrected, lambda: plain)  # a single flight factorises once unless a step failed
         excess = jnp.maximum(jnp.abs(whole) / stage.stride, 1.0).max()
         limits = stage.limits(self.reach)
         trial = jnp.clip(best + whole / excess, *limits)  # all unknowns are shortened alike, so it still descends
         # Neither a secant nor a stride makes a step the last one.
-        plain = self._step(stage, best, model, damping)
         small = self._is_small(stage, jnp.clip(best + plain, *limits) - best)
         small |= self._is_stalled(stage, plain, model, damping)
         done = small | ~jnp.isfinite(trial).all()

@@ -92,9 +92,11 @@ class Issue(msgspec.Struct, frozen=True):
     def warning(self) -> str:
         """Whether the estimate can be used in spite of the issue, and the issue; one line."""
         refused = [name for name in self.moves if self.status_allowed(name) not in _TRUSTED]
-        if refused or self.severity != RESERVATION and not self.moves:
-            return f"{', '.join(refused)}{': ' * bool(refused)}not to be trusted because {self}"
-        return f"use with care: {self}"
+        if refused:
+            return f"{', '.join(refused)}: not to be trusted because {self}"
+        if self.moves or self.severity == RESERVATION:
+            return f"use with care: {self}"
+        return f"not to be trusted because {self}"
 
     def share_of(self, name: str) -> float:
         """The share by which the quantity of this name would move; 0 if unknown."""

@@ -90,7 +90,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         channels=_channels(recording),
         refusals=refusals,
-        findings=findings(evidence) if yaw is None else (*findings(evidence), yaw),
+        findings=(*findings(evidence), *filter(None, (yaw,))),
         notes=recording.notes,
         stretches=tuple(stretches),
     )

@@ -118,8 +118,8 @@ def _exponential_means(
     for place, kept in enumerate(np.exp(-dt / np.asarray(times))):
         for which, signal in enumerate((series[:, :parts].mean(axis=1), series[:, parts])):
             # The recursion m[k] - kept m[k - 1] = (1 - kept) x[k], as a system of equations.
-            bands = np.array([[0.0], [1.0], [0.0]]) + np.zeros(len(series))
-            bands[2, :-1] = np.where(stretch[1:] == stretch[:-1], -kept, 0.0)
+            bands = np.zeros((3, len(series)))
+            bands[1], bands[2, :-1] = 1.0, np.where(stretch[1:] == stretch[:-1], -kept, 0.0)
             found[:, which, place] = solve_banded((1, 1), bands, (1 - kept) * signal, overwrite_ab=True)
     return found.reshape(len(series), -1)
 
