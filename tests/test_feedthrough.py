@@ -105,6 +105,28 @@ def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lag
         assert_same_directions(found[rows, :, axis], directions, atol=1e-9)
 
 
+def test_innovations_need_a_measured_past(rng):
+    """Where measurements are held out, the flight counts as two stretches, and nothing replaces what is missing."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    held_out, missing = np.s_[200:300], rates.copy()
+    missing[held_out] = np.nan
+    found = of_axes(torque, missing, np.zeros(SAMPLES, int))
+    kept = np.delete(np.arange(SAMPLES), np.arange(201, 300))
+    alone = of_axes(torque[kept], rates[kept], np.repeat([0, 1], [201, SAMPLES - 300]))
+    assert not found[201:310].any()
+    for axis in range(3):
+        assert_same_directions(found[kept, :, axis], alone[:, :, axis], atol=1e-9)
+
+
+def test_the_past_holds_a_measurement_before_the_torque(rng):
+    torque, rates = in_loop(rng, pilot=1.0)
+    torque[1:] += rates[1:, None]
+    for measured_first in (False, True):
+        found = of_axes(torque, rates, np.zeros(SAMPLES, int), measured_first=measured_first)[10:, 0]
+        correlations = np.abs(np.mean(found * rates[10:], axis=0))
+        assert (correlations < 1e-9).all() == measured_first
+
+
 def test_means_count_where_they_explain_more_than_chance_does(rng):
     """Regressors without effect would cost information about the parameters."""
     stretch = np.zeros(SAMPLES, int)

@@ -1,6 +1,7 @@
 """From a vehicle's recordings to its data at several sample times, with the likelihood of innovations."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -154,20 +155,23 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     capacity = capacity_of(finest.fitted.time.shape[0])
     flight, commanded = shooting.flight, COMMANDS in prepared.available
     # Torque before a measured instant cannot answer it, and motors take longer to answer than a short sample lasts.
-    is_short, is_late = float(flight.dt) <= UNANSWERED, float(flight.averaging_time) == 0.0 or commanded
-    is_lagged = commanded and is_short
+    is_short, is_instant = float(flight.dt) <= UNANSWERED, float(flight.averaging_time) == 0.0
+    is_lagged, measured_first = is_short and commanded, is_short and is_instant and not commanded
+    innovations = _input_innovations(
+        shooting, capacity, commanded=commanded, is_lagged=is_lagged, measured_first=measured_first
+    )
     return InnovationsProblem(
         with_capacity(shooting, capacity),
         segments=segments,
         least_noise=least_noise,
-        input_innovations=_input_innovations(shooting, capacity, commanded=commanded, is_lagged=is_lagged),
-        answers_within=not (is_late and is_short),
+        input_innovations=innovations,
+        answers_within=not (is_lagged or measured_first),
         lagged=is_lagged,
     )
 
 
 def _input_innovations(
-    shooting: ShootingProblem, capacity: int, *, commanded: bool, is_lagged: bool
+    shooting: ShootingProblem, capacity: int, *, commanded: bool, is_lagged: bool, measured_first: bool
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
     """Input innovations of body rates and vertical force, padded to `capacity`; `None` without `Flight.within`."""
     flight, columns = shooting.flight, shooting.columns
@@ -181,12 +185,11 @@ def _input_innovations(
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
         if axis is not None:
-            torque, count = inputs[:, :, axis], counts[axis]
-            if is_lagged:
-                (own,) = input_innovations(torque, measured, stretch, dt, 1, means=MEANS).T
-                found[:samples, :count, channel] = lagged(own, stretch, count)
-            else:
-                found[:samples, :count, channel] = input_innovations(torque, measured, stretch, dt, count)
+            regression = functools.partial(
+                input_innovations, inputs[:, :, axis], measured, stretch, dt, means=MEANS, measured_first=measured_first
+            )
+            own = lagged(regression(1)[:, 0], stretch, counts[axis]) if is_lagged else regression(counts[axis])
+            found[:samples, : counts[axis], channel] = own
     return found
 
 

@@ -91,7 +91,7 @@ def measured_speeds(omega: Commands, batch: Batch) -> Speeds:
     speed = near(0)
     if not batch.grid.are_parts:
         return Speeds(speed, speed, near(1) - speed)
-    return Speeds(speed, speed, (8 * (near(1) - near(-1)) - (near(2) - near(-2))) / 12)
+    return Speeds(speed, speed, (11 * speed - 18 * near(-1) + 9 * near(-2) - 2 * near(-3)) / 6)
 
 
 def squared(speeds: Speeds, batch: Batch) -> tuple[RotorSpeeds, RotorSpeeds]:
@@ -115,18 +115,21 @@ def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
     count, samples = grid.first.shape[0], delay / grid.dt
     floor = jnp.floor(jax.lax.stop_gradient(samples))
     f = samples - floor
+    g = 1 - f
+    # Of the values at the later and the earlier node, and of the slopes there.
+    later, earlier, slope, slope_before = g * g * (3 - 2 * g), f * f * (3 - 2 * f), -g * g * f, f * f * g
     weights = jnp.stack(
         [
-            f * (-0.5 + f - f * f / 2),
-            1 + f * f * (1.5 * f - 2.5),
-            f * (0.5 + 2 * f - 1.5 * f * f),
-            f * f * (f - 1) / 2,
+            later + 1.5 * slope,
+            earlier - 2 * slope + 1.5 * slope_before,
+            slope / 2 - 2 * slope_before,
+            slope_before / 2,
         ]
     )
     shift = jnp.clip(floor, -count, count).astype(int)
 
     def at(rows: Int[Array, "*rows"]) -> Float[Array, "*rows 4"]:
-        near = rows - shift + np.array([1, 0, -1, -2])[:, None]
+        near = rows - shift - np.arange(4)[:, None]
         return jnp.tensordot(weights, omega(jnp.clip(near, grid.first[rows], grid.last[rows])), 1)
 
     return at

@@ -27,7 +27,7 @@ LAGGED_COUNTS = (3, 3, 3, 1)
 """The same if motors follow commands in short samples: the innovations of the sample and of samples before it. With
 fewer, rotor_lag and rotor_delay have several minima; with more, the response of the motors is lost."""
 MEANS = 0.1, 0.3, 1.0
-"""Time constants [s] of the means in which a controller's integral of attitude shows; for commands in short samples."""
+"""Time constants [s] of the means in which a controller's integral of attitude shows."""
 # A smaller share of a signal may be due to rounding.
 _ROUNDING = 1e-6
 # Rows of one matrix product. More would not fit the cache, and BLAS would divide so small a product among threads.
@@ -43,31 +43,37 @@ def input_innovations(
     *,
     memory: float = 0.1,
     means: Sequence[float] = (),
+    measured_first: bool = False,
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
     The prediction is a linear regression on earlier samples of the input and of the measured motion, and, where they
     explain more than chance does by Schwarz's criterion, on exponential means of both. The result is the `count`
     combinations of the parts of a sample with most of the residual, with arbitrary signs; 0 at the beginning of a
-    stretch.
+    stretch, and where a measurement within the memory is unknown: a regression that replaced it would be a wrong one.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
-    - `measured`: the rate or specific force; NaN counts as the mean.
+    - `measured`: the rate or specific force; NaN: unknown.
     - `stretch`: the number of the uninterrupted stretch of each sample.
     - `dt`: sample time [s]. `memory`: how far back single samples count [s]; at least three samples.
-    - `means`: time constants of the means [s].
+    - `means`: time constants of the means [s], in which an unknown measurement counts as the mean of the known ones.
+    - `measured_first`: whether a sample is measured before the torque that can answer it. The past then includes the
+      measurement of the sample itself.
 
     Reference: Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978).
     """
     lags, (samples, parts) = max(round(memory / dt), 3), inputs.shape
     rows = np.arange(lags, samples)
-    rows = rows[stretch[rows] == stretch[rows - lags]]
+    if measured_first:
+        measured = np.append(measured[1:], measured[-1])
+    known = np.isfinite(measured)
+    unknown = np.append(0, np.cumsum(~known))  # how many before each sample
+    rows = rows[(stretch[rows] == stretch[rows - lags]) & (unknown[rows] == unknown[rows - lags])]
     spare = len(rows) - 1 - lags * (parts + 1)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
     series = np.ones((samples, parts + 2))
     series[:, :parts] = _standard(inputs)
-    known = np.isfinite(measured)
     series[:, parts] = _standard(np.where(known, measured, measured[known].mean() if known.any() else 0.0))
     rest = _unexplained(series, parts, rows, lags)
     if spare > 2 * len(means) > 0:
