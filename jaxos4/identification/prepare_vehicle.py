@@ -1,7 +1,6 @@
 """From a vehicle's recordings to its data at several sample times, with the likelihood of innovations."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -157,9 +156,8 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     # Torque before a measured instant cannot answer it, and motors take longer to answer than a short sample lasts.
     is_short, is_instant = float(flight.dt) <= UNANSWERED, float(flight.averaging_time) == 0.0
     is_lagged, measured_first = is_short and commanded, is_short and is_instant and not commanded
-    innovations = _input_innovations(
-        shooting, capacity, commanded=commanded, is_lagged=is_lagged, measured_first=measured_first
-    )
+    regression = {"means": MEANS if is_short else (), "measured_first": measured_first}
+    innovations = _input_innovations(shooting, capacity, commanded=commanded, is_lagged=is_lagged, **regression)
     return InnovationsProblem(
         with_capacity(shooting, capacity),
         segments=segments,
@@ -171,7 +169,7 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
 
 
 def _input_innovations(
-    shooting: ShootingProblem, capacity: int, *, commanded: bool, is_lagged: bool, measured_first: bool
+    shooting: ShootingProblem, capacity: int, *, commanded: bool, is_lagged: bool, **regression: Any
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
     """Input innovations of body rates and vertical force, padded to `capacity`; `None` without `Flight.within`."""
     flight, columns = shooting.flight, shooting.columns
@@ -185,11 +183,9 @@ def _input_innovations(
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
         if axis is not None:
-            regression = functools.partial(
-                input_innovations, inputs[:, :, axis], measured, stretch, dt, means=MEANS, measured_first=measured_first
-            )
-            own = lagged(regression(1)[:, 0], stretch, counts[axis]) if is_lagged else regression(counts[axis])
-            found[:samples, : counts[axis], channel] = own
+            count = counts[axis]
+            own = input_innovations(inputs[:, :, axis], measured, stretch, dt, 1 if is_lagged else count, **regression)
+            found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
     return found
 
 
