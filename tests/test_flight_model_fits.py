@@ -81,6 +81,26 @@ def test_parabolas_are_delayed_exactly(delay):
     np.testing.assert_allclose(delayed(speeds(t), delay)[8:-8], expected[8:-8], rtol=1e-10, atol=1e-9)
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.0004])
+def test_later_speeds_have_no_influence(delay):
+    """They hold what the controller answers to a measurement, which a prediction must not know; nor may its slopes."""
+    speeds, known = np.random.default_rng(0).uniform(100, 400, (10, 4, 4)), 6
+    other = np.concatenate([speeds[:known], speeds[known:] + 50])
+    model = jaxos4.FlightModel(terms=("delay", "reaction"))
+
+    @jax.jit
+    def forced(within):
+        inputs = Inputs(within.mean(axis=1), jnp.asarray(0.004), within=within)
+        at = model.alpha.at[8].set(delay)
+        return jax.jvp(lambda parameters: model.mean_forcing(inputs, parameters), (at,), (jnp.eye(at.size)[8],))
+
+    changed = 0
+    for one, another in zip(*(jax.tree.leaves(forced(jnp.asarray(each))) for each in (speeds, other)), strict=True):
+        np.testing.assert_array_equal(one[:known], another[:known])
+        changed += bool((one[known:] != another[known:]).any())
+    assert changed > 10
+
+
 @pytest.mark.slow
 def test_the_delay_has_a_continuous_derivative():
     omega = np.random.default_rng(0).uniform(100, 400, (40, 4))
