@@ -80,9 +80,9 @@ class Speeds(NamedTuple):
 def measured_speeds(omega: Commands, batch: Batch) -> Speeds:
     """Speeds that are constant over each sample. After the last row of a stretch they do not change.
 
-    If the samples are parts, `change` is the difference between the edges of a part. A parabola through the means of the
-    three parts before an edge gives the speed there. Later parts would tell what the controller answers to a measurement
-    at the edge.
+    If the samples are parts, `change` is the difference between the edges of a part. A parabola through the means of
+    the three parts before an edge gives the speed there. Later parts would tell what the controller answers to a
+    measurement at the edge.
     """
     first, last = batch.grid.first[batch.rows], batch.grid.last[batch.rows]
 
@@ -110,8 +110,8 @@ def squared(speeds: Speeds, batch: Batch) -> tuple[RotorSpeeds, RotorSpeeds]:
 def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
     """Commands that act `delay` [s] later. Before a stretch, its first command acts, and after it, its last command.
 
-    Cubics interpolate between samples: a delay of whole samples is exact, and the derivative in the delay has no jumps at
-    which a search could end. Their slopes are those of parabolas through the three samples up to each node, because
+    Cubics interpolate between samples: a delay of whole samples is exact, and the derivative in the delay has no jumps
+    at which a search could end. Their slopes are those of parabolas through the three samples up to each node, because
     later samples would tell what the controller answers to a measurement.
     """
     count, samples = grid.first.shape[0], delay / grid.dt
