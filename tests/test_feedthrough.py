@@ -106,7 +106,7 @@ def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lag
 
 
 def test_innovations_need_a_measured_past(rng):
-    """Where measurements are held out, the flight counts as two stretches, and nothing replaces what is missing."""
+    """Where measurements are held out, the flight counts as two stretches."""
     torque, rates = in_loop(rng, pilot=1.0)
     held_out, missing = np.s_[200:300], rates.copy()
     missing[held_out] = np.nan
@@ -116,6 +116,19 @@ def test_innovations_need_a_measured_past(rng):
     assert not found[201:310].any()
     for axis in range(3):
         assert_same_directions(found[kept, :, axis], alone[:, :, axis], atol=1e-9)
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_a_slower_sensor_is_interpolated(rng, every):
+    """Gaps that are shorter than the memory cost no innovations."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    slower = np.full_like(rates, np.nan)
+    slower[::every] = rates[::every]
+    found, whole = (of_axes(torque, each, np.zeros(SAMPLES, int)) for each in (slower, rates))
+    assert (found[10:].any(axis=1)).all()
+    for axis in range(3):
+        overlap = np.linalg.svd(found[:, :, axis].T @ whole[:, :, axis] / (SAMPLES - 10), compute_uv=False)
+        assert (overlap > 0.8).all()
 
 
 def test_the_past_holds_a_measurement_before_the_torque(rng):

@@ -156,8 +156,10 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     # Torque before a measured instant cannot answer it, and motors take longer to answer than a short sample lasts.
     is_short, is_instant = float(flight.dt) <= UNANSWERED, float(flight.averaging_time) == 0.0
     is_lagged, measured_first = is_short and commanded, is_short and is_instant and not commanded
-    regression = {"means": MEANS if is_short else (), "measured_first": measured_first}
-    innovations = _input_innovations(shooting, capacity, commanded=commanded, is_lagged=is_lagged, **regression)
+    means = MEANS if is_short else ()
+    innovations = _input_innovations(
+        shooting, capacity, commanded, is_lagged, means=means, measured_first=measured_first
+    )
     return InnovationsProblem(
         with_capacity(shooting, capacity),
         segments=segments,
@@ -169,7 +171,13 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
 
 
 def _input_innovations(
-    shooting: ShootingProblem, capacity: int, *, commanded: bool, is_lagged: bool, **regression: Any
+    shooting: ShootingProblem,
+    capacity: int,
+    commanded: bool,
+    is_lagged: bool,
+    *,
+    means: Sequence[float],
+    measured_first: bool,
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
     """Input innovations of body rates and vertical force, padded to `capacity`; `None` without `Flight.within`."""
     flight, columns = shooting.flight, shooting.columns
@@ -183,8 +191,9 @@ def _input_innovations(
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
         if axis is not None:
-            count = counts[axis]
-            own = input_innovations(inputs[:, :, axis], measured, stretch, dt, 1 if is_lagged else count, **regression)
+            torque, count = inputs[:, :, axis], counts[axis]
+            some = 1 if is_lagged else count
+            own = input_innovations(torque, measured, stretch, dt, some, means=means, measured_first=measured_first)
             found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
     return found
 

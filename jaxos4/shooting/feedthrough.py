@@ -17,7 +17,7 @@ See `docs/method/filter_error.md`.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 COUNTS = (2, 2, 1, 1)
 """The numbers of input innovations of roll, pitch, yaw and thrust. A second one of yaw would hide the reaction of the
@@ -49,16 +49,18 @@ def input_innovations(
 
     The prediction is a linear regression on earlier samples of the input and of the measured motion, and, where they
     explain more than chance does by Schwarz's criterion, on exponential means of both. The result is the `count`
-    combinations of the parts of a sample with most of the residual, with arbitrary signs; 0 at the beginning of a
-    stretch, and where a measurement within the memory is unknown: a regression that replaced it would be a wrong one.
+    combinations of the parts of a sample with most of the residual, with arbitrary signs. It is 0 in the first `memory`
+    of a stretch, and where measurements in the memory are missing for as long as the memory, as held-out ones are:
+    values in their place would distort the regression.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
-    - `measured`: the rate or specific force; NaN: unknown.
+    - `measured`: the rate or specific force; NaN: missing. Shorter gaps than the memory are interpolated.
     - `stretch`: the number of the uninterrupted stretch of each sample.
     - `dt`: sample time [s]. `memory`: how far back single samples count [s]; at least three samples.
-    - `means`: time constants of the means [s], in which an unknown measurement counts as the mean of the known ones.
-    - `measured_first`: whether a sample is measured before the torque that can answer it. The past then includes the
-      measurement of the sample itself.
+    - `means`: time constants of the means [s]. In longer gaps, the mean of all measurements takes the place of a
+      missing one.
+    - `measured_first`: whether no torque before a sample's measurement can answer it. The measurement of the sample
+      itself then counts as past, although half of the sample's torque is earlier.
 
     Reference: Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978).
     """
@@ -66,15 +68,15 @@ def input_innovations(
     rows = np.arange(lags, samples)
     if measured_first:
         measured = np.append(measured[1:], measured[-1])
-    known = np.isfinite(measured)
-    unknown = np.append(0, np.cumsum(~known))  # how many before each sample
-    rows = rows[(stretch[rows] == stretch[rows - lags]) & (unknown[rows] == unknown[rows - lags])]
+    measured, missing = _without_gaps(measured, lags)
+    earlier = np.append(0, np.cumsum(missing))  # how many were missing before each sample
+    rows = rows[(stretch[rows] == stretch[rows - lags]) & (earlier[rows] == earlier[rows - lags])]
     spare = len(rows) - 1 - lags * (parts + 1)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
     series = np.ones((samples, parts + 2))
     series[:, :parts] = _standard(inputs)
-    series[:, parts] = _standard(np.where(known, measured, measured[known].mean() if known.any() else 0.0))
+    series[:, parts] = _standard(measured)
     rest = _unexplained(series, parts, rows, lags)
     if spare > 2 * len(means) > 0:
         with_means = _unexplained(series, parts, rows, lags, _exponential_means(series, parts, stretch, dt, means))
@@ -99,6 +101,23 @@ def lagged(
         rows = np.arange(lag, len(innovation))
         found[rows, lag] = np.where(stretch[rows] == stretch[rows - lag], innovation[rows - lag], 0.0)
     return found
+
+
+def _without_gaps(
+    measured: Float[np.ndarray, " samples"], longest: int
+) -> tuple[Float[np.ndarray, " samples"], Bool[np.ndarray, " samples"]]:
+    """Interpolates gaps of less than `longest` samples. In longer ones, the second result, all values are the mean."""
+    known = np.isfinite(measured)
+    if known.all():
+        return measured, ~known
+    if not known.any():
+        return np.zeros(len(measured)), ~known
+    place = np.arange(len(measured))
+    before = np.maximum.accumulate(np.where(known, place, -1))
+    after = np.minimum.accumulate(np.where(known, place, len(measured))[::-1])[::-1]
+    missing = after - before > longest
+    filled = np.interp(place, place[known], measured[known])
+    return np.where(missing, measured[known].mean(), filled), missing
 
 
 def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
