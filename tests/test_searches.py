@@ -13,6 +13,7 @@ from likelihoods import MINIMUM, SLOPES, late, misfit, narrow, quadratic, square
 import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.estimators.levenberg_marquardt import LevenbergMarquardt
+from jaxos4.linalg import joint_factor, limited, slopes_along
 
 IBSS = jaxos4.IBSS
 
@@ -75,6 +76,47 @@ def test_an_unknown_at_its_limit_does_not_stop_the_others():
     stride, start = np.array([1e-3, np.inf]), jnp.array([4 - 5e-6, 0.4])
     found = FilterError().solver(squares(late, stride=stride), start=start)
     np.testing.assert_allclose(found.parameters, [4.0, -0.5], atol=0.1)
+
+
+@pytest.mark.parametrize("windows", [1, 3])
+def test_a_limited_step_is_the_lowest_of_all_that_share_its_limits(windows):
+    """Each window has two unknowns of its own behind the shared ones, which have no limit."""
+    count, random = 4, np.random.default_rng(5)
+    width, at_limits = count + 2, 0
+    shared = np.eye(count, count + 2 * windows)
+    columns = [np.vstack([shared, np.eye(2, count + 2 * windows, count + 2 * w)]) for w in range(windows)]
+    for _ in range(20):
+        roots, gradient = random.normal(size=(windows, width, width)), random.normal(size=(windows, width))
+        basis = joint_factor(jnp.asarray(roots @ roots.swapaxes(1, 2)), count).basis
+        free = -(basis * slopes_along(basis, jnp.asarray(gradient), count)[:, None, :]).sum(axis=-1)
+        low, high = -random.uniform(0, 0.5, width), random.uniform(0, 0.5, width)
+        room = (jnp.tile(jnp.asarray(limit), (windows, 1)) for limit in (low, high))
+        found = np.asarray(limited(free, basis, tuple(room), count))
+        whole = sum(c.T @ r @ r.T @ c for c, r in zip(columns, roots, strict=True))
+        slope = sum(c.T @ g for c, g in zip(columns, gradient, strict=True))
+        joint = np.concatenate([found[0, :count], found[:, count:].ravel()])
+        inside = np.ones(joint.size, dtype=bool)
+        inside[:count] = (joint[:count] > low[:count]) & (joint[:count] < high[:count])
+        assert (found[:, :count] == found[0, :count]).all()
+        assert ((joint[:count] >= low[:count]) & (joint[:count] <= high[:count])).all()
+        np.testing.assert_allclose((whole @ joint + slope)[inside], 0.0, atol=1e-6)
+        at_limits += (~inside).sum()
+        if inside.all():
+            np.testing.assert_allclose(found, free)
+    assert at_limits > 20
+
+
+def test_two_unknowns_at_their_limits_do_not_stop_the_others():
+    """The minimum without limits lies far outside, so that a step shortened as a whole would hardly move the third."""
+    information = np.array([[2.0, 0.9, 0.3], [0.9, 1.0, 0.1], [0.3, 0.1, 1.0]])
+    basis = joint_factor(jnp.asarray(information)[None], 3).basis
+    minimum = np.array([80.0, -70.0, 0.5])
+    room = jnp.array([[-0.1, -0.2, -90.0]]), jnp.array([[0.1, 0.0, 90.0]])
+    (found,) = np.asarray(limited(jnp.asarray(minimum)[None], basis, room, 3))
+    assert found[0] == 0.1
+    assert found[1] in (-0.2, 0.0)
+    slope = information @ (found - minimum)
+    assert slope[2] == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("stride", [(0.1, np.inf), (np.inf, 0.1)])

@@ -16,6 +16,7 @@ import jaxos4
 from jaxos4.flight import STATE_NAMES
 from jaxos4.identification import answers, intervals, prepare_vehicle as preparation
 from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.data import silent
 from jaxos4.identification.fit import chosen_place, moved, sample_time_of, search_sample_times
 from jaxos4.identification.intervals import corrected
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
@@ -199,10 +200,20 @@ def test_the_noise_of_an_accelerometer_is_at_least_its_count_and_half_of_its_sec
 
 
 @pytest.mark.parametrize(
-    ("delay", "cost", "chosen", "searches"), [(0.012, 1.0, 1, 2), (0.012, 3.0, 0, 2), (0.003, 1.0, 0, 0)]
+    ("delay", "started", "cost", "chosen", "searches"),
+    [
+        (0.012, None, 1.0, 1, 2),
+        (0.012, None, 3.0, 0, 2),
+        (0.003, None, 1.0, 0, 0),
+        (0.012, 0.011, 1.0, 0, 0),
+        (0.012, 0.006, 1.0, 1, 2),
+    ],
 )
-def test_the_search_begins_again_near_the_usual_delay(delay, cost, chosen, searches):
-    """The cost has a minimum in the delay for each row of a log: 17 ms instead of 0 made Ix 12 % too large."""
+def test_the_search_begins_again_near_the_usual_delay(delay, started, cost, chosen, searches):
+    """The cost has a minimum in the delay for each row of a log: 17 ms instead of 0 made Ix 12 % too large.
+
+    A delay near that of the answer for longer samples, where the search `started`, was compared there.
+    """
     likelihood, starts = dataclasses.replace(problem_of(flown()), answers_within=jnp.array(False)), []
     names = likelihood.problem.unknowns.names
 
@@ -219,7 +230,9 @@ def test_the_search_begins_again_near_the_usual_delay(delay, cost, chosen, searc
         return estimate(USUAL_DELAY_OF_COMMANDS, cost)
 
     first = estimate(delay, 2.0)
-    found, rollouts = _lowest_in_delay(estimator, likelihood, first, USUAL_DELAY_OF_COMMANDS)
+    start = None if started is None else np.asarray(estimate(started, 2.0).parameters)
+    usual = USUAL_DELAY_OF_COMMANDS
+    found, rollouts = _lowest_in_delay(estimator, likelihood, first, usual, start=start, progress=silent)
     assert (found is not first, rollouts, len(starts)) == (bool(chosen), 5 * searches, searches)
     if starts:
         assert [free for free, _ in starts] == [False, True]

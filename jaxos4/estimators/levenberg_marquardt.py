@@ -1,8 +1,8 @@
-"""Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood, corrected by a secant where a step failed.
+"""Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood, corrected by secants.
 
-Gauss-Newton ignores the second derivatives of the residuals, so its steps are too long along some unknowns, such as a
-delay. Damping shortens them along all unknowns. The gradient where a step failed shows the curvature that is missing
-along this step alone.
+Gauss-Newton ignores the second derivatives of the residuals. So its steps are too long along some unknowns, such as a
+delay, and damping shortens them along all unknowns. A secant, which is the change of the gradient over the last step,
+shows how the curvature differs from the information along this step alone.
 
 References: Marquardt 1963, SIAM J. Appl. Math. 11(2); compare Dennis, Gay and Welsch 1981, ACM Trans. Math.
 Softw. 7(3).
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar, integer, setting
 from ..estimate import REACH
-from ..linalg import joint_factor, movable, slopes_along
+from ..linalg import joint_factor, limited, movable, slopes_along
 from ..shooting import LocalModel, Stage, WindowUnknowns
 from .solver import AbstractSolver, Found, chosen, cost_of
 
@@ -27,6 +27,10 @@ _FACTOR = 10.0  # by which the damping falls after a step that succeeded, and ri
 _STRIDE_INFORMATION = 0.3
 # A secant with more than this many times the curvature of the information is ignored: rounding would hide the rest.
 _STEEPEST = 1e3
+_FLATTEST = 0.1  # a secant with less than this part of the curvature of the information is ignored
+_HOPELESS = 1e3  # a damping with which no step fails unless the gradient, which may be approximate, misleads
+_NEAR = 1.0  # near a minimum, less is left to gain
+_SLOW = 0.05  # if convergence is slow, more than this part of what was left before is left after a step
 
 
 class State(NamedTuple):
@@ -36,7 +40,9 @@ class State(NamedTuple):
       includes this step, and `model` is that of the point before it.
     - `trial`: where the shot will be.
     - `damping`: of the last step; before the first shot, `_FACTOR` times that of the first step.
-    - `after_failure`: whether the step before the trial failed, so that its secant may have corrected the trial.
+    - `failed`: whether the step before the trial failed. `is_steep`: whether its secant showed more curvature than the
+      information, and corrected the trial.
+    - `left`: the reduction of the cost that was expected after the shot before.
     - `shots`: the number of shots so far.
     - `done`: whether the stage ended by itself.
     """
@@ -45,7 +51,9 @@ class State(NamedTuple):
     model: LocalModel
     trial: WindowUnknowns
     damping: Scalar
-    after_failure: Bool[Array, ""]
+    failed: Bool[Array, ""]
+    is_steep: Bool[Array, ""]
+    left: Scalar
     shots: Count
     done: Bool[Array, ""]
 
@@ -53,15 +61,16 @@ class State(NamedTuple):
 class LevenbergMarquardt(AbstractSolver[State]):
     """The solver of output error and filter error.
 
-    Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded. After a failure, a
-    secant also corrects the next step.
+    Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded. Secants correct the
+    steps near a minimum, and those after a failure as long as the cost curves more than the information says.
 
     - `step_tolerance`: a stage ends with a step that moves no unknown by more than this fraction of its initial
       uncertainty. Cost and covariance are those before this step. After a step that failed, it is not taken. 0: no
       step is short enough.
     - `gain_tolerance`: a stage ends if steps with little damping promise to lower the cost by less. An error of one
       standard deviation costs 0.5.
-    - `flat`: while the damping is above 1, a stage also ends if a step with hardly any damping would promise less.
+    - `flat`: while the damping is above 1, a stage also ends if a step with hardly any damping would promise less; ten
+      times as much if even very short steps fail.
     - `max_steps`: the most steps of a stage.
     - `is_relative`: whether damping is relative to the information about each unknown (Marquardt). Otherwise it is
       relative to the knowledge before the flight (Levenberg), and hardly changes the steps of a flight with much
@@ -86,35 +95,45 @@ class LevenbergMarquardt(AbstractSolver[State]):
         """The first trial is the start, and its shot counts as better than none."""
         damping = jnp.full((), _FACTOR * self.damping, dtype=float)
         none, no = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        return State(before.unknowns, before.model, before.unknowns, damping, no, none, no)
+        return State(before.unknowns, before.model, before.unknowns, damping, no, no, damping, none, no)
 
     def step(self, stage: Stage, state: State) -> State:
         """Shoot at the trial, keep the better, and propose the next trial."""
-        found, before = stage.local_model(state.trial), state.model
+        found, before, count = stage.local_model(state.trial), state.model, stage.unknowns.count
         better = (state.shots == 0) | (cost_of(found) < cost_of(before))
         best, model = chosen(better, (state.trial, found), (state.best, before))
-        shows = ~better & found.feasible.all() & jnp.isfinite(found.gradient).all()
         # The step after a failure may succeed by its secant, or by its damping: keep the damping.
-        eased = jnp.where(state.after_failure, 1.0, 1 / _FACTOR)
+        eased = jnp.where(state.failed, 1.0, 1 / _FACTOR)
         damping = state.damping * jnp.where(better, eased, _FACTOR)
         damping = jnp.maximum(damping, self.least_damping)
 
-        def corrected() -> WindowUnknowns:
-            secant = state.trial - state.best, found.gradient - before.gradient
-            information = jax.vmap(_with_secant)(model.information, *secant)
-            return self._step(stage, best, model._replace(information=information), damping)
+        lower, upper = (limit - best for limit in stage.limits(self.reach))
+        minimum = self._minimum(stage, best, model, damping)
+        plain = limited(*minimum, (lower, upper), count)
+        left = self._left(stage, plain, model, damping)
+        # Neither a secant nor a stride makes a step the last one. No shot confirms it: it is not taken after a failure.
+        last = self._is_small(stage, plain) | self._is_stalled(left, damping)
+        end = jnp.where(last & better, best + plain, best)
 
-        plain = self._step(stage, best, model, damping)
-        whole = jax.lax.cond(shows, corrected, lambda: plain)  # a single flight factorises once unless a step failed
-        excess = jnp.maximum(jnp.abs(whole) / stage.stride, 1.0).max()
-        limits = stage.limits(self.reach)
-        trial = jnp.clip(best + whole / excess, *limits)  # all unknowns are shortened alike, so it still descends
-        # Neither a secant nor a stride makes a step the last one.
-        small = self._is_small(stage, jnp.clip(best + plain, *limits) - best)
-        small |= self._is_stalled(stage, plain, model, damping)
-        done = small | ~jnp.isfinite(trial).all()
-        end = jnp.where(small & better, trial, best)  # no shot confirms a last step: after a failure, it is not taken
-        return State(end, model, trial, damping, shows, state.shots + 1, done)
+        change = jnp.where(found.feasible.all() & before.feasible.all(), found.gradient - before.gradient, jnp.nan)
+        moved = state.trial - state.best
+        # Far from a minimum, secants of steps that succeeded would be a risk, and quick convergence needs none.
+        near = better & ~state.failed & (left < _NEAR) & (left > _SLOW * state.left)
+        steeper = jax.vmap(_steeper)(model.information, moved, change)
+        is_steep = (near | ~better | state.is_steep) & (steeper != 0).any()
+        flatter = jax.vmap(_flatter)(model.information, moved, change)
+        is_flat = near & ~is_steep & (flatter != 0).any()
+
+        def corrected() -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
+            information = model.information + jnp.where(is_steep, steeper, flatter)
+            return self._minimum(stage, best, model._replace(information=information), damping)
+
+        # Of a single flight, far from a minimum, the information is factorised once.
+        step, basis = jax.lax.cond(is_steep | is_flat, corrected, lambda: minimum)
+        room = jnp.maximum(lower, -stage.stride), jnp.minimum(upper, stage.stride)
+        trial = jnp.clip(best + limited(step, basis, room, count), *stage.limits(self.reach))
+        done = last | ~jnp.isfinite(trial).all()
+        return State(end, model, trial, damping, ~better, is_steep, left, state.shots + 1, done)
 
     def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
         """Whether a step was small, or there were too many."""
@@ -132,25 +151,33 @@ class LevenbergMarquardt(AbstractSolver[State]):
         tolerance = jnp.where(stage.last, self.step_tolerance, jnp.maximum(self.step_tolerance, _COARSE))
         return (jnp.abs(step) <= tolerance * stage.off).all()
 
-    def _is_stalled(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Bool[Array, ""]:
-        """Whether a step, before strides and limits shorten it, promises so little that it ends the stage."""
+    def _is_stalled(self, left: Scalar, damping: Scalar) -> Bool[Array, ""]:
+        """Whether so little is left to gain that the stage ends. A step that leads uphill says nothing."""
+        flat = self.flat * jnp.where(damping > _HOPELESS, 10.0, 1.0)
+        tolerance = jnp.where(damping > 1, jnp.maximum(self.gain_tolerance, flat), self.gain_tolerance)
+        return (left >= 0) & (left < tolerance)
+
+    def _left(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Scalar:
+        """The expected reduction of the cost: the larger of this step's and that of a step with hardly any damping.
+
+        Without damping it is half of this, so that a search ends later than it says.
+        """
         unit, least = self._unit(stage, model.information), self._least(stage)
-        # The expected reduction of the cost: the larger of this step's and that of a step with hardly any damping.
-        # Without damping it is half of this, so that a search ends later than it says.
         eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
         promised = -model.gradient * step
-        left = jnp.maximum(promised.sum(), (eased * promised).sum())
-        return (left < self.gain_tolerance) | ((damping > 1) & (left < self.flat))
+        return jnp.maximum(promised.sum(), (eased * promised).sum())
 
-    def _step(self, stage: Stage, best: WindowUnknowns, model: LocalModel, damping: Scalar) -> WindowUnknowns:
-        """The damped step of each window's unknowns; 0 for those that are fixed or at their limit."""
+    def _minimum(
+        self, stage: Stage, best: WindowUnknowns, model: LocalModel, damping: Scalar
+    ) -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
+        """The damped step to the minimum of the local model, 0 for what is fixed or at its limit, and the basis."""
         count = stage.unknowns.count
         moves = movable(best, model.gradient, stage.limits(self.reach), count) & stage.searched
         information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
         added = damping * self._unit(stage, information) + self._least(stage)
         basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
         slopes = slopes_along(basis, jnp.where(moves, model.gradient, 0.0), count)
-        return -(basis * slopes[:, None, :]).sum(axis=-1)
+        return -(basis * slopes[:, None, :]).sum(axis=-1), basis
 
     def _least(self, stage: Stage) -> WindowUnknowns:
         """The information that always damps each unknown."""
@@ -164,18 +191,29 @@ class LevenbergMarquardt(AbstractSolver[State]):
         return 1 / jnp.square(stage.off).at[:, : stage.unknowns.count].multiply(stage.off.shape[0])
 
 
-def _with_secant(
+def _steeper(
     information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
 ) -> Float[Array, "n n"]:
-    """The information, changed so that it predicts the `change` of the gradient over a step.
+    """What the information lacks to predict the `change` of the gradient over a step along which the cost curves more.
 
-    This is the update of Broyden, Fletcher, Goldfarb and Shanno, which keeps a matrix positive definite. Where the cost
-    curves less than the information says, nothing changes, because longer steps would be a risk.
+    This is the symmetric update of rank one. It is positive semidefinite, and 0 where the cost curves less.
     """
-    predicted, diagonal = information @ step, jnp.diagonal(information)
+    missing, diagonal = change - information @ step, jnp.diagonal(information)
+    steepness = (jnp.square(missing) / jnp.where(diagonal > 0, diagonal, 1.0)).sum()
+    applies = (missing @ step > 0) & (steepness < _STEEPEST * (change @ step))
+    return jnp.where(applies, jnp.outer(missing, missing) / jnp.where(applies, missing @ step, 1.0), 0.0)
+
+
+def _flatter(
+    information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
+) -> Float[Array, "n n"]:
+    """The same over a step along which the cost curves less than the information says; 0 where it curves more.
+
+    This is the update of Broyden, Fletcher, Goldfarb and Shanno, with which the information stays positive definite.
+    """
+    predicted = information @ step
     seen, expected = change @ step, predicted @ step
-    steepness = (jnp.square(change) / jnp.where(diagonal > 0, diagonal, 1.0)).sum()
-    applies = (expected > 0) & (seen > expected) & (steepness < _STEEPEST * seen)
+    applies = (seen < expected) & (seen > _FLATTEST * expected)
     new = jnp.outer(change, change) / jnp.where(applies, seen, 1.0)
     old = jnp.outer(predicted, predicted) / jnp.where(applies, expected, 1.0)
-    return information + jnp.where(applies, new - old, 0.0)
+    return jnp.where(applies, new - old, 0.0)

@@ -126,7 +126,7 @@ def search(
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
     usual = USUAL_DELAY_OF_COMMANDS if data.follows_commands else USUAL_DELAY
-    first, more = _lowest_in_delay(estimator, likelihood, first, usual, progress)
+    first, more = _lowest_in_delay(estimator, likelihood, first, usual, start=start, progress=progress)
     optimum = Optimum(data, likelihood, first, first, likelihood.problem.unknowns, spent + more)
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
@@ -138,16 +138,24 @@ def _lowest_in_delay(
     likelihood: InnovationsProblem,
     first: Estimate,
     usual: float,
-    progress: Progress = silent,
+    *,
+    start: Float[np.ndarray, " unknowns"] | None,
+    progress: Progress,
 ) -> tuple[Estimate, int]:
-    """The estimate, or a lower minimum near the `usual` delay of the rotors [s], and the rollouts that this took."""
+    """The estimate, or a lower minimum near the `usual` delay of the rotors [s], and the rollouts that this took.
+
+    `start`: the answer for longer samples, if the search began there; its minimum was compared already.
+    """
     names = likelihood.problem.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(first.result):
         return first, 0
-    if abs(float(first.parameters[names.index("rotor_delay")]) - usual) <= float(likelihood.flight.dt) / 2:
+    place = names.index("rotor_delay")
+    compared = [usual] if start is None else [usual, start[place]]
+    if np.abs(float(first.parameters[place]) - np.array(compared)).min() <= float(likelihood.flight.dt) / 2:
         return first, 0
     progress("fitting again near the usual delay of the rotors")
-    near = jax.block_until_ready(estimator(likelihood.fix({"rotor_delay": np.asarray(usual)})))
+    at_usual = likelihood.fix({"rotor_delay": np.asarray(usual)})
+    near = jax.block_until_ready(estimator(at_usual.starting_from(first.parameters)))
     if not has_answer(near.result):
         return first, int(near.rollouts)
     other = jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
