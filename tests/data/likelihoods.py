@@ -35,6 +35,11 @@ def misfit(x):
     return jnp.stack([5 * (x[0] - 0.4), 10 + 4 * (x[0] - 0.3) ** 2, 0.3 * (x[1] + 0.3), 0.2 * x[0] * x[1]])
 
 
+def shallow(x):
+    """Residuals that remain, so that Gauss-Newton steps in x are five times too short."""
+    return jnp.stack([5 * (x[0] - 0.4), 10 - 1.03 * (x[0] - 0.35) ** 2, 3 * (x[1] + 0.3), 0.2 * x[0] * x[1]])
+
+
 def wall(x):
     """A slope that ends at a wall, so that the first steps are much too long, and secants much steeper than before."""
     return jnp.stack([0.1 * x[0] - 1, 3 * jnp.maximum(x[0] - 1, 0.0), x[1]])
