@@ -13,7 +13,7 @@ from .._custom_types import Count, Scalar
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate, as_estimate
 from ..linalg import covariance_of_shared
-from ..shooting import AbstractProblem, LocalModel, Stage, Stages, WindowUnknowns, in_blocks
+from ..shooting import AbstractProblem, LocalModel, Stage, WindowUnknowns, in_blocks
 
 State = TypeVar("State")
 
@@ -103,7 +103,7 @@ def solve(
     """
     stages = problem.stages(solver.shares)
     starts, skip = _starts(problem, start), jnp.asarray(skip)
-    begin = before_search(problem, stages, spread, skip)
+    begin = before_search(problem, spread, skip)
     number = stages.first if is_close is False else jnp.where(is_close, stages.whole, stages.first)
     count = 1
     if starts.shape[0] > 1 and solver.is_local:
@@ -153,15 +153,16 @@ def solve(
 
 def before_search(
     problem: AbstractProblem,
-    stages: Stages,
     spread: Float[Array, "given given"] | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Found:
     """The knowledge before a search: the first start and its covariance, and nothing about the cost."""
     guess, zero = problem.initial_guess, jnp.zeros((), dtype=int)
     start, wide = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
-    shapes = jax.eval_shape(stages.at(0, start).local_model, start)
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    windows, count = start.shape
+    none, no = jnp.zeros(windows, dtype=start.dtype), jnp.zeros(windows, dtype=bool)
+    information = jnp.zeros((windows, count, count), dtype=start.dtype)
+    nothing = LocalModel(none, no, jnp.zeros_like(start), information, problem.no_parts)
     if spread is not None:
         given = slice(spread.shape[0])
         # A search that is skipped may have no finite spread.

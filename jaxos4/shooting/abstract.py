@@ -267,6 +267,11 @@ class AbstractProblem(eqx.Module):
         Everything that does not depend on the unknowns is computed when the function is made: make it before a loop.
         """
 
+    @property
+    def no_parts(self) -> Parts | None:
+        """Zeros for the `parts` of `local_model`: a search needs their shapes before its first shot."""
+        return None
+
     @abc.abstractmethod
     def fix(self: Problem, values: Mapping[str, Float[ArrayLike, ""]], bracket: Bracket | None = None) -> Problem:
         """The same likelihood, with some unknowns fixed at known values. `bracket`: where the others are searched.

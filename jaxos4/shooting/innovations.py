@@ -32,7 +32,7 @@ from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, levels, own_names, with_noise
 from .problem import ShootingProblem
 from .scans import with_tangents
-from .sums import Innovations, joined, placed
+from .sums import LAGS, Innovations, joined, placed
 
 SETTLING = 128
 """After this many samples a filter has settled, by default."""
@@ -223,6 +223,17 @@ class InnovationsProblem(AbstractProblem):
     def local_model(self) -> Callable[[WindowUnknowns], LocalModel]:
         """See `AbstractProblem`. `parts` are the segments."""
         return functools.partial(self._local_model(), jnp.nan_to_num(self.noise_feedthrough))
+
+    @property
+    def no_parts(self) -> Parts:
+        """See `AbstractProblem`."""
+        segments, count, channels = self.segments, self.unknowns.count, self.noise_feedthrough.shape[0]
+        return Parts(
+            gradient=jnp.zeros((segments, count), dtype=float),
+            information=jnp.zeros((segments, count, count), dtype=float),
+            products=jnp.zeros((segments, channels, LAGS + 1), dtype=float),
+            noise_feedthrough=jnp.zeros_like(self.noise_feedthrough),
+        )
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The whole problem. If it has feedthroughs, a second stage counts as noise the innovations they explain."""
