@@ -79,37 +79,38 @@ def movable(
 def limited(
     step: PerWindow, basis: Float[Array, "windows n n"], room: tuple[PerWindow, PerWindow], count: int
 ) -> PerWindow:
-    """The step to a low point of a quadratic, within the `room` below and above each of the `count` shared unknowns.
+    """A step that lowers a quadratic, within the `room` below and above each of the `count` shared unknowns.
 
-    The unknown whose step exceeds its room the most goes to its limit, and all others to the minimum that remains. This
-    is repeated until no step exceeds its room.
+    The unknown whose step exceeds its room the most goes to its limit and stays there, and all others go to the minimum
+    that remains, until no step exceeds its room. So this is not always the lowest point within the limits.
 
     `step`: to the minimum without limits. `basis`: see `joint_factor`.
     """
     shared = basis[:, :, basis.shape[2] - count :]
-    # Of all unknowns with the shared ones. A product of matrices would be no part of a native loop.
+    # The covariance of all unknowns with the shared ones; a product of matrices would be no part of a native loop.
     covariance = (shared[:, :, None] * shared[0, :count]).sum(axis=3)
-    low, high = (limit[0, :count] for limit in room)
+    (low, high), place = (limit[0, :count] for limit in room), np.arange(count)
 
-    def exceeds(carry: tuple) -> Bool[Array, " count"]:
-        step = carry[0][0, :count]
-        return (step < low) | (step > high)
+    def exceeds(step: PerWindow, at_limit: Bool[Array, " count"]) -> Bool[Array, " count"]:
+        own = step[0, :count]
+        return ((own < low) | (own > high)) & ~at_limit
 
     def go_to_limit(carry: tuple) -> tuple:
-        step, covariance = carry
-        own, place = step[0, :count], np.arange(count)
+        step, covariance, at_limit = carry
+        own, outside = step[0, :count], exceeds(step, at_limit)
         limit = jnp.clip(own, low, high)
-        excess = jnp.where(exceeds(carry), jnp.abs(own) / jnp.maximum(jnp.abs(limit), jnp.finfo(own.dtype).tiny), 0.0)
-        i = jnp.where(excess == excess.max(), place, count).min()
+        excess = jnp.where(outside, jnp.abs(own) / jnp.maximum(jnp.abs(limit), jnp.finfo(own.dtype).tiny), 0.0)
+        i = jnp.where(outside & (excess >= excess.max()), place, count).min()
         here, row = place == i, np.arange(covariance.shape[1])[:, None] == i
         column = jnp.where(here, covariance, 0.0).sum(axis=2)
         variance, off = jnp.where(here, column[0, :count], 0.0).sum(), jnp.where(here, limit - own, 0.0).sum()
         slope = column / jnp.where(variance > 0, variance, 1.0)
         covariance = jnp.where(here | row, 0.0, covariance - slope[:, :, None] * column[0, :count])
         step = step + slope * off
-        return step.at[:, :count].set(jnp.where(here, limit, step[:, :count])), covariance
+        return step.at[:, :count].set(jnp.where(here, limit, step[:, :count])), covariance, at_limit | here
 
-    return jax.lax.while_loop(lambda carry: exceeds(carry).any(), go_to_limit, (step, covariance))[0]
+    first = step, covariance, jnp.zeros(count, dtype=bool)
+    return jax.lax.while_loop(lambda carry: exceeds(carry[0], carry[2]).any(), go_to_limit, first)[0]
 
 
 def room_to_limits(

@@ -102,6 +102,18 @@ def test_an_unknown_at_its_limit_does_not_stop_the_others():
     np.testing.assert_allclose(found.parameters, [4.0, -0.5], atol=0.1)
 
 
+def test_a_bracket_beyond_a_limit_ends_a_search():
+    found = LevenbergMarquardt()(squares(quadratic, center=(-10.0, 0.0), lowest=np.array([0.0, -np.inf])))
+    assert names(found) == "at_bound"
+
+
+def test_a_gradient_that_is_nan_is_no_minimum():
+    found = LevenbergMarquardt()(
+        squares(quadratic, change=lambda x, gradient: gradient + jnp.where(x > 0.2, jnp.nan, 0.0))
+    )
+    assert names(found) != "successful"
+
+
 @pytest.mark.parametrize("windows", [1, 3])
 def test_a_limited_step_is_the_lowest_of_all_that_share_its_limits(windows):
     """Each window has two unknowns of its own behind the shared ones, which have no limit."""

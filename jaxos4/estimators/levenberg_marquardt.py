@@ -1,8 +1,8 @@
 """Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood, corrected by secants.
 
 Gauss-Newton ignores the second derivatives of the residuals. So its steps are too long along some unknowns, such as a
-delay, and damping shortens them along all unknowns. A secant, which is the change of the gradient over the last step,
-shows how the curvature differs from the information along this step alone.
+delay, and damping shortens them along all unknowns. The change of the gradient over the last step, a secant, shows by
+how much the information misjudges the curvature along that step.
 
 References: Marquardt 1963, SIAM J. Appl. Math. 11(2); compare Dennis, Gay and Welsch 1981, ACM Trans. Math.
 Softw. 7(3).
@@ -25,12 +25,14 @@ _COARSE = 1e-3  # the smallest `step_tolerance` of all stages except the last
 _FACTOR = 10.0  # by which the damping falls after a step that succeeded, and rises after one that failed
 # Information in 1/stride^2 that is always added for unknowns with a stride, whose own information is inexact.
 _STRIDE_INFORMATION = 0.3
-# A secant with more than this many times the curvature of the information is ignored: rounding would hide the rest.
-_STEEPEST = 1e3
-_FLATTEST = 0.1  # a secant with less than this part of the curvature of the information is ignored
-_HOPELESS = 1e3  # a damping with which no step fails unless the gradient, which may be approximate, misleads
-_NEAR = 1.0  # near a minimum, less is left to gain
-_SLOW = 0.05  # if convergence is slow, more than this part of what was left before is left after a step
+# Secants with more, or less, than these multiples of the curvature of the information are ignored: rounding, or the
+# distance to the minimum, would decide.
+_STEEPEST, _FLATTEST = 1e3, 0.1
+# The damping is a power of ten. Above the first of these, it shortens steps; above the second, failures are blamed on
+# the gradient, which may be approximate.
+_SHORTENS, _HOPELESS = 3.0, 3e3
+_NEAR = 1.0  # a minimum is near if less is left to gain
+_SLOW = 0.05  # convergence is slow if a step leaves more than this part of what was left
 
 
 class State(NamedTuple):
@@ -40,9 +42,9 @@ class State(NamedTuple):
       includes this step, and `model` is that of the point before it.
     - `trial`: where the shot will be.
     - `damping`: of the last step; before the first shot, `_FACTOR` times that of the first step.
-    - `failed`: whether the step before the trial failed. `is_steep`: whether its secant showed more curvature than the
-      information, and corrected the trial.
-    - `left`: the reduction of the cost that was expected after the shot before.
+    - `failed`: whether the step before the trial failed. `is_steep`: whether the last secant showed more curvature than
+      the information, and so corrected the trial.
+    - `left`: the reduction of the cost that was still expected at the last shot.
     - `shots`: the number of shots so far.
     - `done`: whether the stage ended by itself.
     """
@@ -61,16 +63,16 @@ class State(NamedTuple):
 class LevenbergMarquardt(AbstractSolver[State]):
     """The solver of output error and filter error.
 
-    Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded. Secants correct the
-    steps near a minimum, and those after a failure as long as the cost curves more than the information says.
+    Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded. Near a minimum,
+    secants lengthen or shorten the next step; after a failure, they only shorten it.
 
     - `step_tolerance`: a stage ends with a step that moves no unknown by more than this fraction of its initial
       uncertainty. Cost and covariance are those before this step. After a step that failed, it is not taken. 0: no
       step is short enough.
     - `gain_tolerance`: a stage ends if steps with little damping promise to lower the cost by less. An error of one
       standard deviation costs 0.5.
-    - `flat`: while the damping is above 1, a stage also ends if a step with hardly any damping would promise less; ten
-      times as much if even very short steps fail.
+    - `flat`: with damping above 1, a stage also ends if a step with hardly any damping would promise less than this;
+      with damping above 1000, less than ten times this.
     - `max_steps`: the most steps of a stage.
     - `is_relative`: whether damping is relative to the information about each unknown (Marquardt). Otherwise it is
       relative to the knowledge before the flight (Levenberg), and hardly changes the steps of a flight with much
@@ -94,8 +96,8 @@ class LevenbergMarquardt(AbstractSolver[State]):
     def init(self, stage: Stage, before: Found) -> State:
         """The first trial is the start, and its shot counts as better than none."""
         damping = jnp.full((), _FACTOR * self.damping, dtype=float)
-        none, no = jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        return State(before.unknowns, before.model, before.unknowns, damping, no, no, damping, none, no)
+        left, none, no = jnp.full((), jnp.inf, dtype=float), jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
+        return State(before.unknowns, before.model, before.unknowns, damping, no, no, left, none, no)
 
     def step(self, stage: Stage, state: State) -> State:
         """Shoot at the trial, keep the better, and propose the next trial."""
@@ -107,32 +109,33 @@ class LevenbergMarquardt(AbstractSolver[State]):
         damping = state.damping * jnp.where(better, eased, _FACTOR)
         damping = jnp.maximum(damping, self.least_damping)
 
-        lower, upper = (limit - best for limit in stage.limits(self.reach))
-        minimum = self._minimum(stage, best, model, damping)
+        limits = stage.limits(self.reach)
+        lower, upper = (limit - best for limit in limits)
+        minimum = self._minimum(stage, best, model.gradient, model.information, damping)
         plain = limited(*minimum, (lower, upper), count)
         left = self._left(stage, plain, model, damping)
-        # Neither a secant nor a stride makes a step the last one. No shot confirms it: it is not taken after a failure.
+        # The last step is the plain one, without secant or stride. No shot confirms it, so a success must come before.
         last = self._is_small(stage, plain) | self._is_stalled(left, damping)
-        end = jnp.where(last & better, best + plain, best)
+        end = jnp.where(last & better, jnp.clip(best + plain, *limits), best)
 
         change = jnp.where(found.feasible.all() & before.feasible.all(), found.gradient - before.gradient, jnp.nan)
         moved = state.trial - state.best
-        # Far from a minimum, secants of steps that succeeded would be a risk, and quick convergence needs none.
+        is_more = (moved * change).sum() > (moved * jnp.einsum("wij,wj->wi", model.information, moved)).sum()
+        # Far from a minimum, the secant of a success may mislead; where convergence is quick, none is needed.
         near = better & ~state.failed & (left < _NEAR) & (left > _SLOW * state.left)
         steeper = jax.vmap(_steeper)(model.information, moved, change)
-        is_steep = (near | ~better | state.is_steep) & (steeper != 0).any()
-        flatter = jax.vmap(_flatter)(model.information, moved, change)
-        is_flat = near & ~is_steep & (flatter != 0).any()
+        steeper = jnp.where((near | ~better | state.is_steep) & is_more, steeper, 0.0)
+        flatter = jnp.where(near & ~is_more, jax.vmap(_flatter)(model.information, moved, change), 0.0)
+        missing = steeper + flatter
 
         def corrected() -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
-            information = model.information + jnp.where(is_steep, steeper, flatter)
-            return self._minimum(stage, best, model._replace(information=information), damping)
+            return self._minimum(stage, best, model.gradient, model.information + missing, damping)
 
-        # Of a single flight, far from a minimum, the information is factorised once.
-        step, basis = jax.lax.cond(is_steep | is_flat, corrected, lambda: minimum)
+        # Unless batched, a second factorisation is made only where a secant applies.
+        step, basis = jax.lax.cond((missing != 0).any(), corrected, lambda: minimum)
         room = jnp.maximum(lower, -stage.stride), jnp.minimum(upper, stage.stride)
-        trial = jnp.clip(best + limited(step, basis, room, count), *stage.limits(self.reach))
-        done = last | ~jnp.isfinite(trial).all()
+        trial = jnp.clip(best + limited(step, basis, room, count), *limits)
+        done, is_steep = last | ~jnp.isfinite(trial).all(), (steeper != 0).any()
         return State(end, model, trial, damping, ~better, is_steep, left, state.shots + 1, done)
 
     def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
@@ -144,7 +147,8 @@ class LevenbergMarquardt(AbstractSolver[State]):
         (windows, _), count = state.best.shape, stage.unknowns.count
         tangents = count + windows * stage.searched[count:].sum()
         steps = jnp.maximum(state.shots - 1, 0)  # a search that is skipped makes no shot
-        return Found(state.best, state.model, before.spread, steps, state.shots * (1 + tangents), state.done)
+        done = state.done & jnp.isfinite(state.trial).all()  # a search without a next step may be anywhere
+        return Found(state.best, state.model, before.spread, steps, state.shots * (1 + tangents), done)
 
     def _is_small(self, stage: Stage, step: WindowUnknowns) -> Bool[Array, ""]:
         """Whether a step is so short that it ends the stage."""
@@ -152,15 +156,15 @@ class LevenbergMarquardt(AbstractSolver[State]):
         return (jnp.abs(step) <= tolerance * stage.off).all()
 
     def _is_stalled(self, left: Scalar, damping: Scalar) -> Bool[Array, ""]:
-        """Whether so little is left to gain that the stage ends. A step that leads uphill says nothing."""
+        """Whether so little is left to gain that the stage ends. A step uphill, possible at limits, ends nothing."""
         flat = self.flat * jnp.where(damping > _HOPELESS, 10.0, 1.0)
-        tolerance = jnp.where(damping > 1, jnp.maximum(self.gain_tolerance, flat), self.gain_tolerance)
+        tolerance = jnp.where(damping > _SHORTENS, jnp.maximum(self.gain_tolerance, flat), self.gain_tolerance)
         return (left >= 0) & (left < tolerance)
 
     def _left(self, stage: Stage, step: WindowUnknowns, model: LocalModel, damping: Scalar) -> Scalar:
         """The expected reduction of the cost: the larger of this step's and that of a step with hardly any damping.
 
-        Without damping it is half of this, so that a search ends later than it says.
+        An undamped step lowers a quadratic by half of this, so searches end later than the tolerance says.
         """
         unit, least = self._unit(stage, model.information), self._least(stage)
         eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
@@ -168,15 +172,23 @@ class LevenbergMarquardt(AbstractSolver[State]):
         return jnp.maximum(promised.sum(), (eased * promised).sum())
 
     def _minimum(
-        self, stage: Stage, best: WindowUnknowns, model: LocalModel, damping: Scalar
+        self,
+        stage: Stage,
+        best: WindowUnknowns,
+        gradient: WindowUnknowns,
+        information: Float[Array, "windows n n"],
+        damping: Scalar,
     ) -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
-        """The damped step to the minimum of the local model, 0 for what is fixed or at its limit, and the basis."""
+        """The damped step to the minimum of a local model, and its basis.
+
+        Fixed unknowns, and those at their limits, do not move.
+        """
         count = stage.unknowns.count
-        moves = movable(best, model.gradient, stage.limits(self.reach), count) & stage.searched
-        information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
+        moves = movable(best, gradient, stage.limits(self.reach), count) & stage.searched
+        information = jnp.where(moves[:, :, None] & moves[:, None, :], information, 0.0)
         added = damping * self._unit(stage, information) + self._least(stage)
         basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
-        slopes = slopes_along(basis, jnp.where(moves, model.gradient, 0.0), count)
+        slopes = slopes_along(basis, jnp.where(moves, gradient, 0.0), count)
         return -(basis * slopes[:, None, :]).sum(axis=-1), basis
 
     def _least(self, stage: Stage) -> WindowUnknowns:
@@ -194,22 +206,22 @@ class LevenbergMarquardt(AbstractSolver[State]):
 def _steeper(
     information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
 ) -> Float[Array, "n n"]:
-    """What the information lacks to predict the `change` of the gradient over a step along which the cost curves more.
+    """The rank-one correction with which the information predicts the `change` of the gradient over a step.
 
-    This is the symmetric update of rank one. It is positive semidefinite, and 0 where the cost curves less.
+    It is positive semidefinite; 0 unless the cost curves more than the information says, and not too steeply.
     """
     missing, diagonal = change - information @ step, jnp.diagonal(information)
-    steepness = (jnp.square(missing) / jnp.where(diagonal > 0, diagonal, 1.0)).sum()
-    applies = (missing @ step > 0) & (steepness < _STEEPEST * (change @ step))
-    return jnp.where(applies, jnp.outer(missing, missing) / jnp.where(applies, missing @ step, 1.0), 0.0)
+    steepness, more = (jnp.square(missing) / jnp.where(diagonal > 0, diagonal, 1.0)).sum(), missing @ step
+    applies = steepness < _STEEPEST * more
+    return jnp.where(applies, jnp.outer(missing, missing) / jnp.where(applies, more, 1.0), 0.0)
 
 
 def _flatter(
     information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
 ) -> Float[Array, "n n"]:
-    """The same over a step along which the cost curves less than the information says; 0 where it curves more.
+    """The correction of Broyden, Fletcher, Goldfarb and Shanno for a step along which the cost curves less.
 
-    This is the update of Broyden, Fletcher, Goldfarb and Shanno, with which the information stays positive definite.
+    The information stays positive definite. 0 if the cost curves more than it says, or hardly at all.
     """
     predicted = information @ step
     seen, expected = change @ step, predicted @ step

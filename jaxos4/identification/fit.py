@@ -204,10 +204,10 @@ def search_sample_times(
     for number, data in enumerate(reversed(several), start=1):
         step = 1e3 * float(data.problem.flight.dt)
         progress(f"fitting samples of {step:.3g} ms ({number} of {len(several)} sample times)")
-        start, own = None, data.likelihood
+        start, own, compared = None, data.likelihood, None
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
-            start = start_of(own, optimum.unrestricted)
-        optimum = search(estimator, data, start=start)
+            start, compared = start_of(own, optimum.unrestricted), optimum.compared_delay
+        optimum = search(estimator, data, start=start, compared_delay=compared)
         optima.insert(0, optimum)
     return optima
 

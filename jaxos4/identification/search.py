@@ -38,6 +38,7 @@ class Optimum(NamedTuple):
     - `nominal`: the parameters that are fixed at their nominal values.
     - `negative`: value and standard deviation of those that came out negative, and are fixed at 0.
     - `freed`: the covariance that these would add if they were free.
+    - `compared_delay`: of the rotors [s], if no minimum near their usual delay is lower.
     - `restarts`: how often a search began again where the cost is lower. `is_lowest`: false if the cost is known to be
       lower elsewhere.
     """
@@ -51,6 +52,7 @@ class Optimum(NamedTuple):
     nominal: tuple[str, ...] = ()
     negative: dict[str, tuple[float, float]] = {}
     freed: Float[ArrayLike, "..."] = 0.0
+    compared_delay: float | None = None
     restarts: int = 0
     is_lowest: bool = True
 
@@ -112,11 +114,13 @@ def search(
     data: Data[InnovationsProblem],
     *,
     start: Float[np.ndarray, " unknowns"] | None = None,
+    compared_delay: float | None = None,
     progress: Progress = silent,
 ) -> Optimum:
     """The optimum without the parameters that came out negative, or near their nominal values.
 
     **Arguments:** `start`: of the search; by default that of the likelihood, also if there is no answer from `start`.
+    `compared_delay`: that of an optimum for longer samples.
     """
     likelihood, first, spent = data.likelihood, None, 0
     if start is not None:
@@ -126,8 +130,10 @@ def search(
         first = jax.block_until_ready(estimator(likelihood))
         spent += int(first.rollouts)
     usual = USUAL_DELAY_OF_COMMANDS if data.follows_commands else USUAL_DELAY
-    first, more = _lowest_in_delay(estimator, likelihood, first, usual, start=start, progress=progress)
-    optimum = Optimum(data, likelihood, first, first, likelihood.problem.unknowns, spent + more)
+    first, compared, more = _lowest_in_delay(estimator, likelihood, first, usual, compared_delay, progress)
+    optimum = Optimum(
+        data, likelihood, first, first, likelihood.problem.unknowns, spent + more, compared_delay=compared
+    )
     optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_nominal_values(estimator, optimum, progress)
@@ -138,29 +144,30 @@ def _lowest_in_delay(
     likelihood: InnovationsProblem,
     first: Estimate,
     usual: float,
-    *,
-    start: Float[np.ndarray, " unknowns"] | None,
-    progress: Progress,
-) -> tuple[Estimate, int]:
-    """The estimate, or a lower minimum near the `usual` delay of the rotors [s], and the rollouts that this took.
+    compared: float | None = None,
+    progress: Progress = silent,
+) -> tuple[Estimate, float | None, int]:
+    """The estimate, or a lower minimum near the `usual` delay of the rotors [s].
 
-    `start`: the answer for longer samples, if the search began there; its minimum was compared already.
+    **Returns:** also the delay, if both minima were compared, and the rollouts that this took. A delay near the one
+    that was `compared` for longer samples is not compared again.
     """
     names = likelihood.problem.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(first.result):
-        return first, 0
-    place = names.index("rotor_delay")
-    compared = [usual] if start is None else [usual, start[place]]
-    if np.abs(float(first.parameters[place]) - np.array(compared)).min() <= float(likelihood.flight.dt) / 2:
-        return first, 0
+        return first, None, 0
+    delay, near_it = float(first.parameters[names.index("rotor_delay")]), float(likelihood.flight.dt) / 2
+    if abs(delay - usual) <= near_it:
+        return first, None, 0
+    if compared is not None and abs(delay - compared) <= near_it:
+        return first, compared, 0
     progress("fitting again near the usual delay of the rotors")
     at_usual = likelihood.fix({"rotor_delay": np.asarray(usual)})
     near = jax.block_until_ready(estimator(at_usual.starting_from(first.parameters)))
     if not has_answer(near.result):
-        return first, int(near.rollouts)
+        return first, None, int(near.rollouts)
     other = jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
     is_lower = has_answer(other.result) and float(first.cost) - float(other.cost) > LOWER
-    return other if is_lower else first, int(near.rollouts) + int(other.rollouts)
+    return other if is_lower else first, None if is_lower else delay, int(near.rollouts) + int(other.rollouts)
 
 
 def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:

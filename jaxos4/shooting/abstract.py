@@ -269,7 +269,7 @@ class AbstractProblem(eqx.Module):
 
     @property
     def no_parts(self) -> Parts | None:
-        """Zeros for the `parts` of `local_model`: a search needs their shapes before its first shot."""
+        """Zeros in the shape of `parts`, which a search needs before its first shot, if `local_model` returns parts."""
         return None
 
     @abc.abstractmethod

@@ -118,7 +118,7 @@ def squares(residuals, center=(0.0, 0.0), half_width=1.0, **more):
         half_width=np.full(2, half_width),
         free=np.ones(2, dtype=bool),
         precision=np.zeros(2),
-        lowest=-infinite,
+        lowest=more.pop("lowest", -infinite),
         highest=infinite,
         stride=more.pop("stride", infinite),
     )
