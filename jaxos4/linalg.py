@@ -79,15 +79,16 @@ def movable(
 def limited(
     step: PerWindow, basis: Float[Array, "windows n n"], room: tuple[PerWindow, PerWindow], count: int
 ) -> PerWindow:
-    """A step that lowers a quadratic, within the `room` below and above each of the `count` shared unknowns.
+    """A step, low on a quadratic, within the `room` below and above each of the `count` shared unknowns.
 
-    The unknown whose step exceeds its room the most goes to its limit and stays there, and all others go to the minimum
-    that remains, until no step exceeds its room. So this is not always the lowest point within the limits.
+    The unknown that exceeds its room by the largest factor goes to its limit and stays there, and all others go to the
+    minimum that remains, until none exceeds its room. So this is not always the lowest point within the limits, and it
+    may, rarely, lie above the start.
 
     `step`: to the minimum without limits. `basis`: see `joint_factor`.
     """
     shared = basis[:, :, basis.shape[2] - count :]
-    # The covariance of all unknowns with the shared ones; a product of matrices would be no part of a native loop.
+    # The covariance of all unknowns with the shared ones. A matrix product would not become part of a native loop.
     covariance = (shared[:, :, None] * shared[0, :count]).sum(axis=3)
     (low, high), place = (limit[0, :count] for limit in room), np.arange(count)
 

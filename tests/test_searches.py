@@ -75,7 +75,7 @@ def test_steps_that_creep_become_longer():
 def test_a_gradient_that_misleads_a_little_ends_a_search():
     """That of innovations is approximate: the noise of a channel acts on its own innovations only.
 
-    At the minimum, where this search begins, it promises to lower the cost by 0.2, and no step does, however short.
+    At the minimum, where this search begins, it promises a gain of 0.2 to 0.3, and no step has any, however short.
     """
 
     def change(x, gradient):
@@ -116,7 +116,7 @@ def test_a_gradient_that_is_nan_is_no_minimum():
 
 @pytest.mark.parametrize("windows", [1, 3])
 def test_a_limited_step_is_the_lowest_of_all_that_share_its_limits(windows):
-    """Each window has two unknowns of its own behind the shared ones, which have no limit."""
+    """Behind the shared unknowns, each window has two of its own, without limits."""
     count, random = 4, np.random.default_rng(5)
     width, at_limits = count + 2, 0
     shared = np.eye(count, count + 2 * windows)

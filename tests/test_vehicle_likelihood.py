@@ -226,10 +226,10 @@ def test_the_search_begins_again_near_the_usual_delay(delay, compared, cost, cho
         return estimate(USUAL_DELAY_OF_COMMANDS, cost)
 
     first = estimate(delay, 2.0)
-    found, lost, rollouts = _lowest_in_delay(estimator, likelihood, first, USUAL_DELAY_OF_COMMANDS, compared)
+    found, kept_delay, rollouts = _lowest_in_delay(estimator, likelihood, first, USUAL_DELAY_OF_COMMANDS, compared)
     assert (found is not first, rollouts, len(starts)) == (bool(chosen), 5 * searches, searches)
-    # What comes of a comparison holds for shorter samples.
-    assert lost == (None if chosen or delay == 0.003 else compared or delay)
+    # Searches of shorter samples need not compare this delay again.
+    assert kept_delay == (None if chosen or delay == 0.003 else compared or delay)
     if starts:
         assert [free for free, _ in starts] == [False, True]
         assert starts[1][1] == USUAL_DELAY_OF_COMMANDS

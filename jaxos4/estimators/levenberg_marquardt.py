@@ -28,8 +28,8 @@ _STRIDE_INFORMATION = 0.3
 # Secants with more, or less, than these multiples of the curvature of the information are ignored: rounding, or the
 # distance to the minimum, would decide.
 _STEEPEST, _FLATTEST = 1e3, 0.1
-# The damping is a power of ten. Above the first of these, it shortens steps; above the second, failures are blamed on
-# the gradient, which may be approximate.
+# The dampings of our solvers are powers of ten. Above the first of these, damping shortens steps; above the second,
+# failures are blamed on the gradient, which may be approximate.
 _SHORTENS, _HOPELESS = 3.0, 3e3
 _NEAR = 1.0  # a minimum is near if less is left to gain
 _SLOW = 0.05  # convergence is slow if a step leaves more than this part of what was left
@@ -38,7 +38,7 @@ _SLOW = 0.05  # convergence is slow if a step leaves more than this part of what
 class State(NamedTuple):
     """The search of a stage before a shot.
 
-    - `best`, `model`: the best unknowns so far, and the local model there. If a small step ends the stage, `best`
+    - `best`, `model`: the best unknowns so far, and the local model there. If a last step ends the stage, `best`
       includes this step, and `model` is that of the point before it.
     - `trial`: where the shot will be.
     - `damping`: of the last step; before the first shot, `_FACTOR` times that of the first step.
@@ -63,12 +63,13 @@ class State(NamedTuple):
 class LevenbergMarquardt(AbstractSolver[State]):
     """The solver of output error and filter error.
 
-    Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded. Near a minimum,
-    secants lengthen or shorten the next step; after a failure, they only shorten it.
+    Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded, unless the step
+    before failed. Near a minimum, secants lengthen or shorten the next step. After a failure, and then as long as the
+    cost curves more than the information says, they shorten it.
 
     - `step_tolerance`: a stage ends with a step that moves no unknown by more than this fraction of its initial
-      uncertainty. Cost and covariance are those before this step. After a step that failed, it is not taken. 0: no
-      step is short enough.
+      uncertainty. Cost and covariance are those before this step. After a step that failed, it is not taken. In stages
+      before the last, it is at least 0.001.
     - `gain_tolerance`: a stage ends if steps with little damping promise to lower the cost by less. An error of one
       standard deviation costs 0.5.
     - `flat`: with damping above 1, a stage also ends if a step with hardly any damping would promise less than this;
@@ -121,7 +122,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
         change = jnp.where(found.feasible.all() & before.feasible.all(), found.gradient - before.gradient, jnp.nan)
         moved = state.trial - state.best
         is_more = (moved * change).sum() > (moved * jnp.einsum("wij,wj->wi", model.information, moved)).sum()
-        # Far from a minimum, the secant of a success may mislead; where convergence is quick, none is needed.
+        # Far from a minimum, the secant of a first success may mislead; where convergence is quick, none is needed.
         near = better & ~state.failed & (left < _NEAR) & (left > _SLOW * state.left)
         steeper = jax.vmap(_steeper)(model.information, moved, change)
         steeper = jnp.where((near | ~better | state.is_steep) & is_more, steeper, 0.0)
@@ -139,7 +140,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
         return State(end, model, trial, damping, ~better, is_steep, left, state.shots + 1, done)
 
     def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
-        """Whether a step was small, or there were too many."""
+        """Whether the stage ended by itself, has no next step, or had too many."""
         return state.done | (state.shots > self.max_steps)
 
     def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
@@ -147,7 +148,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
         (windows, _), count = state.best.shape, stage.unknowns.count
         tangents = count + windows * stage.searched[count:].sum()
         steps = jnp.maximum(state.shots - 1, 0)  # a search that is skipped makes no shot
-        done = state.done & jnp.isfinite(state.trial).all()  # a search without a next step may be anywhere
+        done = state.done & jnp.isfinite(state.trial).all()  # without a finite next step, no minimum was found
         return Found(state.best, state.model, before.spread, steps, state.shots * (1 + tangents), done)
 
     def _is_small(self, stage: Stage, step: WindowUnknowns) -> Bool[Array, ""]:

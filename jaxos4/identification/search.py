@@ -38,7 +38,7 @@ class Optimum(NamedTuple):
     - `nominal`: the parameters that are fixed at their nominal values.
     - `negative`: value and standard deviation of those that came out negative, and are fixed at 0.
     - `freed`: the covariance that these would add if they were free.
-    - `compared_delay`: of the rotors [s], if no minimum near their usual delay is lower.
+    - `compared_delay`: of the rotors [s], where the search stayed after a comparison with their usual delay.
     - `restarts`: how often a search began again where the cost is lower. `is_lowest`: false if the cost is known to be
       lower elsewhere.
     """
@@ -120,7 +120,7 @@ def search(
     """The optimum without the parameters that came out negative, or near their nominal values.
 
     **Arguments:** `start`: of the search; by default that of the likelihood, also if there is no answer from `start`.
-    `compared_delay`: that of an optimum for longer samples.
+    `compared_delay`: that of the optimum for longer samples.
     """
     likelihood, first, spent = data.likelihood, None, 0
     if start is not None:
@@ -149,8 +149,8 @@ def _lowest_in_delay(
 ) -> tuple[Estimate, float | None, int]:
     """The estimate, or a lower minimum near the `usual` delay of the rotors [s].
 
-    **Returns:** also the delay, if both minima were compared, and the rollouts that this took. A delay near the one
-    that was `compared` for longer samples is not compared again.
+    **Returns:** also the delay, if the search stays there after a comparison, and the rollouts that this took. A delay
+    near the one that was `compared` for longer samples is not compared again.
     """
     names = likelihood.problem.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(first.result):
