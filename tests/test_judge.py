@@ -277,7 +277,6 @@ def test_a_recorded_flight_does_not_end_successful_without_skill_or_against_phys
     skills = [getattr(found.skill, rate).skill[0] for rate in "pqr"] if found.skill is not None else []
     assert any(skill is not None and skill <= 0 for skill in skills)
     assert found.result == "unidentifiable"
-    assert found.verdicts["predictions"].status == "not identified"
-    # Samples of 2 ms give a quarter of what those of 4 ms give. For Ix, the difference is near the limit of the rule.
-    assert found.verdicts["Ix"].status in ("not identified", "contradicted")
+    assert {found.verdicts[name].status for name in ("Ix", "predictions")} == {"not identified"}
+    # Samples of 2 ms give a quarter of what those of 4 ms give.
     assert found.verdicts["Iy"].status == "contradicted"

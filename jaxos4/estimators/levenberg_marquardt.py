@@ -112,7 +112,9 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
         limits = stage.limits(self.reach)
         lower, upper = (limit - best for limit in limits)
-        minimum = self._minimum(stage, best, model.gradient, model.information, damping)
+        moves = movable(best, model.gradient, limits, count) & stage.searched
+        slope = jnp.where(moves, model.gradient, 0.0)
+        minimum = self._minimum(stage, moves, slope, model.information, damping)
         plain = limited(*minimum, (lower, upper), count)
         left = self._left(stage, plain, model, damping)
         # The last step is the plain one, without secant or stride. No shot confirms it, so a success must come before.
@@ -121,16 +123,17 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
         change = jnp.where(found.feasible.all() & before.feasible.all(), found.gradient - before.gradient, jnp.nan)
         moved = state.trial - state.best
-        is_more = (moved * change).sum() > (moved * jnp.einsum("wij,wj->wi", model.information, moved)).sum()
+        predicted = jnp.einsum("wij,wj->wi", model.information, moved)
+        is_more = (moved * change).sum() > (moved * predicted).sum()
         # Far from a minimum, the secant of a first success may mislead; where convergence is quick, none is needed.
         near = better & ~state.failed & (left < _NEAR) & (left > _SLOW * state.left)
-        steeper = jax.vmap(_steeper)(model.information, moved, change)
+        steeper = jax.vmap(_steeper)(model.information, moved, change, predicted)
         steeper = jnp.where((near | ~better | state.is_steep) & is_more, steeper, 0.0)
-        flatter = jnp.where(near & ~is_more, jax.vmap(_flatter)(model.information, moved, change), 0.0)
+        flatter = jnp.where(near & ~is_more, jax.vmap(_flatter)(moved, change, predicted), 0.0)
         missing = steeper + flatter
 
         def corrected() -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
-            return self._minimum(stage, best, model.gradient, model.information + missing, damping)
+            return self._minimum(stage, moves, slope, model.information + missing, damping)
 
         # Unless batched, a second factorisation is made only where a secant applies.
         step, basis = jax.lax.cond((missing != 0).any(), corrected, lambda: minimum)
@@ -175,22 +178,20 @@ class LevenbergMarquardt(AbstractSolver[State]):
     def _minimum(
         self,
         stage: Stage,
-        best: WindowUnknowns,
-        gradient: WindowUnknowns,
+        moves: Bool[Array, "windows n"],
+        slope: WindowUnknowns,
         information: Float[Array, "windows n n"],
         damping: Scalar,
     ) -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
-        """The damped step to the minimum of a local model, and its basis.
+        """The damped step to the minimum of a local model along the unknowns that move, and its basis.
 
-        Fixed unknowns, and those at their limits, do not move.
+        `slope`: the gradient, 0 for unknowns that do not move.
         """
         count = stage.unknowns.count
-        moves = movable(best, gradient, stage.limits(self.reach), count) & stage.searched
         information = jnp.where(moves[:, :, None] & moves[:, None, :], information, 0.0)
         added = damping * self._unit(stage, information) + self._least(stage)
         basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
-        slopes = slopes_along(basis, jnp.where(moves, gradient, 0.0), count)
-        return -(basis * slopes[:, None, :]).sum(axis=-1), basis
+        return -(basis * slopes_along(basis, slope, count)[:, None, :]).sum(axis=-1), basis
 
     def _least(self, stage: Stage) -> WindowUnknowns:
         """The information that always damps each unknown."""
@@ -205,26 +206,28 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
 
 def _steeper(
-    information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
+    information: Float[Array, "n n"],
+    step: Float[Array, " n"],
+    change: Float[Array, " n"],
+    predicted: Float[Array, " n"],
 ) -> Float[Array, "n n"]:
     """The rank-one correction with which the information predicts the `change` of the gradient over a step.
 
-    It is positive semidefinite; 0 unless the cost curves more than the information says, and not too steeply.
+    It is positive semidefinite; 0 unless the cost curves more than `predicted` by the information, and not too steeply.
     """
-    missing, diagonal = change - information @ step, jnp.diagonal(information)
+    missing, diagonal = change - predicted, jnp.diagonal(information)
     steepness, more = (jnp.square(missing) / jnp.where(diagonal > 0, diagonal, 1.0)).sum(), missing @ step
     applies = steepness < _STEEPEST * more
     return jnp.where(applies, jnp.outer(missing, missing) / jnp.where(applies, more, 1.0), 0.0)
 
 
 def _flatter(
-    information: Float[Array, "n n"], step: Float[Array, " n"], change: Float[Array, " n"]
+    step: Float[Array, " n"], change: Float[Array, " n"], predicted: Float[Array, " n"]
 ) -> Float[Array, "n n"]:
     """The correction of Broyden, Fletcher, Goldfarb and Shanno for a step along which the cost curves less.
 
     The information stays positive definite. 0 if the cost curves more than it says, or hardly at all.
     """
-    predicted = information @ step
     seen, expected = change @ step, predicted @ step
     applies = (seen < expected) & (seen > _FLATTEST * expected)
     new = jnp.outer(change, change) / jnp.where(applies, seen, 1.0)

@@ -156,9 +156,13 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
     # Torque before a measured instant cannot answer it, and motors take longer to answer than a short sample lasts.
     is_short, is_instant = float(flight.dt) <= UNANSWERED, float(flight.averaging_time) == 0.0
     is_lagged, measured_first = is_short and commanded, is_short and is_instant and not commanded
-    means = MEANS if is_short else ()
     innovations = _input_innovations(
-        shooting, capacity, commanded, is_lagged, means=means, measured_first=measured_first
+        shooting,
+        capacity,
+        commanded=commanded,
+        is_lagged=is_lagged,
+        means=MEANS if is_short else (),
+        measured_first=measured_first,
     )
     return InnovationsProblem(
         with_capacity(shooting, capacity),
@@ -173,9 +177,9 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
 def _input_innovations(
     shooting: ShootingProblem,
     capacity: int,
+    *,
     commanded: bool,
     is_lagged: bool,
-    *,
     means: Sequence[float],
     measured_first: bool,
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
