@@ -189,20 +189,20 @@ class Regression(NamedTuple):
         choices = (parameters, initial_state), (center, problem.first_state()[0])
         choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
         # In sequence, so that the simulation is compiled once.
-        shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
-        flies = shots.feasible[0] & jnp.isfinite(shots.cost[0])
-        (parameters, initial_state), shot = jax.tree.map(
-            lambda both: jnp.where(identifiable | flies, *both), (choices, shots)
+        costs, feasible = jax.lax.map(lambda choice: problem.shots(*choice), choices)
+        flies = feasible[0] & jnp.isfinite(costs[0])
+        (parameters, initial_state), cost, feasible = jax.tree.map(
+            lambda both: jnp.where(identifiable | flies, *both), (choices, costs, feasible)
         )
         return as_estimate(
             problem,
             parameters=parameters,
             covariance=covariance,
             initial_state=initial_state,
-            cost=shot.cost,
+            cost=cost,
             rollouts=rollouts + 1,
             sweeps=1,
-            feasible=shot.feasible,
+            feasible=feasible,
             done=jnp.ones((), dtype=bool),
             history=history,
         )

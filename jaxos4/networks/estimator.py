@@ -248,7 +248,7 @@ class TrainedNetwork(AbstractEstimator):
         std = jnp.exp(log_spread[:count]) * self.scaling.bound(within)[:count] * rms * inflation
         deviations = std * coordinates.width[:count]
         parameters, correlation = _given_fixed(problem.unknowns, parameters, deviations, correlation)
-        shot = problem.shots(parameters, initial_state)
+        cost, flies = problem.shots(parameters, initial_state)
         free = problem.unknowns.free
         outside = (jnp.abs(u[:count]) > 1 + factors[-1] * std) & free
         unidentifiable = (std > self.prior) & free
@@ -258,7 +258,7 @@ class TrainedNetwork(AbstractEstimator):
         other |= (inflation > MAX_INFLATION).any() | (scale > self.settings.noise[1] * (1 + SAME))
         result = RESULTS.where(outside.any(), RESULTS.at_bound, RESULTS.successful)
         result = RESULTS.where(unidentifiable.any(), RESULTS.unidentifiable, result)
-        feasible = finite & shot.feasible & jnp.isfinite(parameters).all()
+        feasible = finite & flies & jnp.isfinite(parameters).all()
         result = RESULTS.where(feasible, result, RESULTS.nonfinite_trajectory)
         result = RESULTS.where(other, RESULTS.network_mismatch, result)
         result = RESULTS.where(problem.unknowns.valid, result, RESULTS.bracket_invalid)
@@ -267,7 +267,7 @@ class TrainedNetwork(AbstractEstimator):
             parameters=jnp.where(usable, parameters, self.bracket.center),
             covariance=jnp.where(usable, correlation * deviations[:, None] * deviations[None, :], jnp.inf),
             initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
-            cost=jnp.where(usable, shot.cost, jnp.inf),
+            cost=jnp.where(usable, cost, jnp.inf),
             rollouts=jnp.ones((), dtype=int),
             sweeps=jnp.zeros((), dtype=int),
             result=result,

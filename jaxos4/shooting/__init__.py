@@ -6,7 +6,6 @@ from .abstract import (
     InitialGuess as InitialGuess,
     LocalModel as LocalModel,
     Parts as Parts,
-    Shot as Shot,
     Stage as Stage,
     Stages as Stages,
     Unknowns as Unknowns,

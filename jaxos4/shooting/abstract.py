@@ -138,17 +138,6 @@ def _fixed(
     return jnp.where(fixed, jnp.stack(given), center), free & ~fixed
 
 
-class Shot(NamedTuple):
-    """One simulated window: the cost of the samples before the trajectory fails, and whether it is `feasible`.
-
-    A trajectory fails at a pitch of +-90 degrees, or at a body rate above `FASTEST` in `scans.py`. The cost of a failed
-    shot is meaningless, but its derivative still points back to feasible trajectories.
-    """
-
-    cost: Scalar
-    feasible: Bool[Array, ""]
-
-
 class Parts(NamedTuple):
     """The likelihood of each part of a flight, without the prior.
 
@@ -166,7 +155,7 @@ class Parts(NamedTuple):
 class LocalModel(NamedTuple):
     """The quadratic model of a cost around some unknowns, for one window or with the windows as first axis.
 
-    - `cost`, `feasible`: as in a `Shot`.
+    - `cost`, `feasible`: as `shooting.scans.shoot` returns them.
     - `gradient`, `information`: in the parameters, and then in a free initial state. The information is the Fisher
       information, J^T W^2 J for a shot.
     - `parts`: only of a likelihood whose parts are compared.

@@ -21,13 +21,14 @@ from .._custom_types import (
     StateVector,
     as_float,
 )
+from ..batching import in_blocks
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
-from ..simulation import STEPPERS
-from .abstract import AbstractProblem, InitialGuess, LocalModel, Shot, Stage, Stages, Unknowns, WindowUnknowns
+from ..simulation import STEPPERS, runge_kutta
+from .abstract import AbstractProblem, InitialGuess, LocalModel, Stage, Stages, Unknowns, WindowUnknowns
 from .layout import each_window, first_measured, window_samples, windowed
 from .scans import Length, Rows, predict_window, shoot, shot_with_derivatives, with_tangents
 
@@ -158,7 +159,11 @@ class ShootingProblem(AbstractProblem):
                 forcing_parameters=self.model.forcing_parameters,
                 initial_state_is_free=self.initial_state is None,
             )
-            model = each_window(window, rows, unknowns[:, :count], own[:, : fewer.size])
+            each = rows, unknowns[:, :count], own[:, : fewer.size]
+            if self.windows > 1:
+                model = jax.vmap(window)(*each)
+            else:  # see `each_window`
+                model = jax.tree.map(lambda leaf: leaf[None], window(*jax.tree.map(lambda leaf: leaf[0], each)))
             both = searched & searched[:, None]
             return model._replace(
                 gradient=jnp.where(searched, jnp.pad(model.gradient, ((0, 0), others)), 0.0),
@@ -262,11 +267,11 @@ class ShootingProblem(AbstractProblem):
 
         return each_window(predict, self.rows(parameters).forcing, self.split(initial_state))[within]
 
-    def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
-        """The cost of all windows together."""
+    def shots(self, parameters: Parameters, initial_state: InitialStates) -> tuple[Scalar, Bool[Array, ""]]:
+        """The cost of all windows together, and whether all are feasible."""
         rows, starts = self.rows(parameters), self.split(initial_state)
-        each = each_window(lambda rows, start: self.shot(rows, parameters, start), rows, starts)
-        return Shot(each.cost.sum(), each.feasible.all())
+        costs, feasible = each_window(lambda rows, start: self.shot(rows, parameters, start), rows, starts)
+        return costs.sum(), feasible.all()
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
         """The body rates of a short part of the flight first, then more; the last stage fits the whole flight.
@@ -315,9 +320,9 @@ class ShootingProblem(AbstractProblem):
 
         return Stages(len(stages), 0, len(stages) - 1, at)
 
-    def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
-        """The cost of one window, from `rows` that an inner loop prepares once."""
-        return shoot(self.advance, rows, self.weights, parameters, initial_state, self.length)
+    def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> tuple[Scalar, Bool[Array, ""]]:
+        """The cost of one window and whether it is feasible, from `rows` that an inner loop prepares once."""
+        return in_blocks(shoot, self.advance, rows, self.weights, parameters, initial_state, self.length)
 
     def reweighted(self, residuals: Float[ArrayLike, "..."]) -> "ShootingProblem":
         """The problem with each channel's sigma estimated from the weighted `residuals` of a fit, by NumPy.
@@ -344,7 +349,11 @@ class ShootingProblem(AbstractProblem):
 
     def advance(self, forcing: Forcing, state: State, parameters) -> tuple[State, tuple[Scalar, ...]]:
         """The state one sample later, down to the same level of the cascade, and the output of noise-free sensors."""
-        following = STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
+        dt, derivative = self.flight.dt, functools.partial(self.model.cascade, forcing=forcing, parameters=parameters)
+        if self.method == "euler":
+            following = jax.tree.map(lambda x, dx: x + dt * dx, state, derivative(state))
+        else:
+            following = runge_kutta(derivative, state, dt)
         return following, self.model.observe(state, forcing, parameters)
 
     @property

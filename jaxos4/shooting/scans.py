@@ -17,9 +17,9 @@ from jax.extend.core import Literal
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, InitialState, Parameters, Scalar
-from ..batching import computed_once, in_blocks, with_batch
+from ..batching import computed_once, with_batch
 from ..models.state import CHANNELS, Forcing, State, Translation, unstack
-from .abstract import LocalModel, Shot
+from .abstract import LocalModel
 
 # rad/s; no quadrotor reaches this body rate and no gyro measures it, so a faster trajectory has diverged.
 FASTEST = 1e3
@@ -94,30 +94,22 @@ def shoot(
     parameters: Parameters,
     initial_state: InitialState,
     length: Length = None,
-) -> Shot:
-    """Simulate one window and compare it with the measurements. `weights`: 1 / sigma of each channel."""
-    return in_blocks(_shoot, advance, rows, weights, parameters, initial_state, length)
+) -> tuple[Scalar, Bool[Array, ""]]:
+    """The cost of one simulated window, and whether its trajectory is feasible. `weights`: 1 / sigma of each channel.
 
+    A trajectory fails at a pitch of +-90 degrees, or at a body rate above `FASTEST`. Only the samples before count. The
+    cost of a failed shot is meaningless, but its derivative still points back to feasible trajectories.
+    """
+    scalars = tuple(parameters)
 
-def _shoot(
-    advance: Advance, rows: Rows, weights: tuple[Scalar, ...], at: Parameters, start: InitialState, length: Length
-) -> Shot:
-    scalars = tuple(at)
-
-    def step(i: Count, carry: tuple[State, Shot]) -> tuple[State, Shot]:
-        row, (state, shot) = jax.tree.map(lambda leaf: leaf[i], rows), carry
-        feasible = shot.feasible & _is_feasible(state)
+    def step(i: Count, carry: tuple[State, Scalar, Array]) -> tuple[State, Scalar, Array]:
+        row, (state, cost, feasible) = jax.tree.map(lambda leaf: leaf[i], rows), carry
+        feasible = feasible & _is_feasible(state)
         following, predicted = advance(row.forcing, state, scalars)
-        cost = shot.cost + _half_square(_errors(row, predicted, weights, feasible))
-        return following, Shot(cost, feasible)
+        return following, cost + _half_square(_errors(row, predicted, weights, feasible)), feasible
 
-    nothing = Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
-    return jax.lax.fori_loop(0, _samples(rows, length), step, (unstack(start), nothing))[1]
-
-
-def _samples(rows: Rows, length: Length) -> Count | int:
-    """The number of rows that count."""
-    return rows.forcing.roll.shape[0] if length is None else length
+    first = unstack(initial_state), jnp.zeros((), dtype=float), jnp.ones((), dtype=bool)
+    return jax.lax.fori_loop(0, rows.forcing.roll.shape[0] if length is None else length, step, first)[1:]
 
 
 def shot_with_derivatives(
@@ -152,21 +144,10 @@ def shot_with_derivatives(
     return with_batch(alone, together, advance, length, weights)
 
 
-class _Carried(NamedTuple):
-    """A linearised shot up to some sample.
-
-    - `late`: the tangents of the unknowns that act on the translation alone. `tangent`: those of all other unknowns.
-    - `gradient`: in the unknowns of `tangent`, and then of `late`.
-    - `panels`: some rows of the information, in the columns of `tangent`, and then of `late`. Columns to the right of
-      the rows' diagonal block are left out.
-    """
-
-    state: State
-    tangent: State
-    late: Translation | None
-    shot: Shot
-    gradient: list[Array]
-    panels: list[list[Array]]
+# A linearised shot up to some sample: its state; the tangents of the unknowns that act on rates or attitude, and of the
+# late ones, which act on the translation alone; its cost, and whether it is feasible; its gradient in both kinds of
+# unknowns; and its information, in panels of rows, each with the columns of both kinds up to its diagonal block.
+_Carry = tuple[State, State, Translation | None, Lanes, Bool[Array, "*lanes"], list[Array], list[list[Array]]]
 
 
 def _linearised_shot(
@@ -194,19 +175,35 @@ def _linearised_shot(
     # NumPy, so that they are constants of the program.
     parameter_tangents = tuple(np.eye(count, first_late, dtype=parameters.dtype))
 
-    def step(i: Count, carry: _Carried) -> _Carried:
+    def step(i: Count, carry: _Carry) -> _Carry:
+        state, tangent, late, cost, feasible, gradient, information = carry
         row = jax.tree.map(lambda leaf: leaf[i], rows)
-        feasible = carry.shot.feasible & _is_feasible(carry.state)
+        feasible = feasible & _is_feasible(state)
         # After a failure the state is 0, so that no derivative overflows.
-        state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), carry.state)
+        state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), state)
         forcing = jax.tree.map(along_lanes, row.forcing)
+
+        def sample() -> tuple[State, Callable, Callable | None, Lanes, list[Lanes], list[Lanes]]:
+            """The next state, its derivatives in all and in the translation, cost, weighted errors, squared weights."""
+            if row.forcing_tangents is None:
+                linear = jax.linearize(functools.partial(advance, forcing), state, scalars)
+            else:
+                linear = jax.linearize(advance, forcing, state, scalars)
+            (following, predicted), push = linear
+            errors = _errors(row, predicted, weights, feasible)
+            known = [jnp.where(jnp.isnan(y) | ~feasible, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
+            pull = [w * e for w, e in zip(known, errors, strict=True)]
+            push_late = None
+            if late is not None:
+                _, push_late = jax.linearize(
+                    lambda t: advance(forcing, state._replace(translation=t), scalars), state.translation
+                )
+            return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 
         # If only the rates are simulated, repeating them is cheaper.
         repeated = not lanes or state.attitude is None
-        at, late = (forcing, state, scalars), carry.late
-        sample = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
-        following, push, push_late, cost, pull, squares = sample() if repeated else computed_once(feasible, sample)
-        directions = [carry.tangent, parameter_tangents]
+        following, push, push_late, more, pull, squares = sample() if repeated else computed_once(feasible, sample)
+        directions = [tangent, parameter_tangents]
         if row.forcing_tangents is not None:
             nothing, positions = jnp.zeros((first_late, *lanes), parameters.dtype), np.asarray(forcing_parameters)
             wide = jax.tree.map(lambda slope: nothing.at[positions].set(slope), row.forcing_tangents)
@@ -217,25 +214,24 @@ def _linearised_shot(
 
         tangent, *slopes = jax.vmap(pushed)(*directions)
         if push_late is not None:
-            moved, more = jax.vmap(push_late)(late)
-            late, slopes = moved.translation, [*slopes, more]
+            moved, of_late = jax.vmap(push_late)(late)
+            late, slopes = moved.translation, [*slopes, of_late]
 
-        gradient = [g - sum(map(operator.mul, pull, s)) for g, s in zip(carry.gradient, slopes, strict=True)]
+        gradient = [g - sum(map(operator.mul, pull, s)) for g, s in zip(gradient, slopes, strict=True)]
         information = [
             _added(blocks, panel, first_late, squares, slopes)
-            for panel, blocks in zip(panels, carry.panels, strict=True)
+            for panel, blocks in zip(panels, information, strict=True)
         ]
-        shot = Shot(carry.shot.cost + cost, feasible)
-        return _Carried(following, tangent, late, shot, gradient, information)
+        return following, tangent, late, cost + more, feasible, gradient, information
 
+    samples = rows.forcing.roll.shape[0] if length is None else length
     first = _before(initial_state, count, first_late, panels)
-    last = jax.lax.fori_loop(0, _samples(rows, length), step, first)
-    information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)
-    cost, feasible = last.shot
-    return LocalModel(cost, feasible, jnp.concatenate(last.gradient), symmetric(information))
+    *_, cost, feasible, gradient, information = jax.lax.fori_loop(0, samples, step, first)
+    whole = symmetric(tuple(jnp.concatenate(blocks, axis=1) for blocks in information))
+    return LocalModel(cost, feasible, jnp.concatenate(gradient), whole)
 
 
-def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: int, panels: list[Panel]) -> _Carried:
+def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: int, panels: list[Panel]) -> _Carry:
     """The carry before the first sample, for `count` parameters. The unknowns before `first_late` have a `tangent`."""
     (size, *lanes), unknowns, dtype = initial_state.shape, panels[-1][1], initial_state.dtype
     own = np.eye(size, unknowns, count, dtype=dtype).reshape(size, unknowns, *(1 for _ in lanes))
@@ -247,13 +243,14 @@ def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: 
     def blocks(top: int, end: int) -> list[Array]:
         return [zeros(end - top, width) for width in ([end] if top < first_late else [first_late, end - first_late])]
 
-    return _Carried(
-        state=unstack(initial_state),
-        tangent=unstack(tangents[:, :first_late]),
-        late=unstack(tangents[:, first_late:]).translation if first_late < unknowns else None,
-        shot=Shot(zeros(), jnp.ones(tuple(lanes), dtype=bool)),
-        gradient=[zeros(width) for width in (first_late, unknowns - first_late) if width],
-        panels=[blocks(top, end) for top, end, _ in panels],
+    return (
+        unstack(initial_state),
+        unstack(tangents[:, :first_late]),
+        unstack(tangents[:, first_late:]).translation if first_late < unknowns else None,
+        zeros(),
+        jnp.ones(tuple(lanes), dtype=bool),
+        [zeros(width) for width in (first_late, unknowns - first_late) if width],
+        [blocks(top, end) for top, end, _ in panels],
     )
 
 
@@ -265,35 +262,6 @@ def _added(
     own = slice(top - first_late * late, end - first_late * late)
     rows = [(i, (squares[i] * slopes[late][i][own])[:, None]) for i in outputs]
     return [b + sum(row * s[i][: b.shape[1]] for i, row in rows) for b, s in zip(blocks, slopes, strict=False)]
-
-
-def _linearised_sample(
-    advance: Advance,
-    row: Rows,
-    at: tuple[Forcing, State, tuple[Lanes, ...]],
-    weights: tuple[Lanes, ...],
-    feasible: Bool[Array, "*lanes"],
-    late: bool,
-) -> tuple[State, Callable, Callable | None, Lanes, list[Lanes], list[Lanes]]:
-    """The next state, the derivative of `advance`, the cost, and the weighted errors and squared weights.
-
-    The second derivative is in the translation alone; `None` unless `late`.
-    """
-    forcing, state, scalars = at
-    if row.forcing_tangents is None:
-        linear = jax.linearize(functools.partial(advance, forcing), state, scalars)
-    else:
-        linear = jax.linearize(advance, *at)
-    (following, predicted), push = linear
-    errors = _errors(row, predicted, weights, feasible)
-    known = [jnp.where(jnp.isnan(y) | ~feasible, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
-    pull = [w * e for w, e in zip(known, errors, strict=True)]
-    push_late = None
-    if late:
-        _, push_late = jax.linearize(
-            lambda t: advance(forcing, state._replace(translation=t), scalars), state.translation
-        )
-    return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 
 
 def _is_feasible(state: State) -> Bool[Array, " *lanes"]:
@@ -315,29 +283,26 @@ def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
 
 
-def dependence(function: Callable, *arguments: Any) -> Bool[np.ndarray, "results arguments"]:
-    """Which leaves of a function's result depend on which arguments. An inner function counts as one operation."""
-    program = jax.make_jaxpr(function)(*arguments).jaxpr
-    nothing = np.zeros(len(program.invars), dtype=bool)
-    known = dict(zip(program.invars, np.eye(nothing.size, dtype=bool), strict=True))
-
-    def sources(variables: list) -> np.ndarray:
-        return np.any([nothing, *(known.get(v, nothing) for v in variables if not isinstance(v, Literal))], axis=0)
-
-    for equation in program.eqns:
-        known |= dict.fromkeys(equation.outvars, sources(equation.invars))
-    return np.array([sources([v]) for v in program.outvars])
-
-
 def panels_of(
     advance: Callable, at: tuple[Any, Any, tuple], forcing_parameters: tuple[int, ...], *, free: bool
 ) -> tuple[int, list[Panel]]:
     """The index after the last unknown that acts on rates or attitude, and the panels of all rows.
 
     - `advance`: returns the next state and the outputs, from the forcing, a state and the parameters, which are `at`.
+      An inner function of it counts as one operation.
     - `free`: whether the initial state is unknown too. Its leaves then follow the parameters.
     """
-    leaves = dependence(advance, *at)
+    program = jax.make_jaxpr(advance)(*at).jaxpr
+    nothing = np.zeros(len(program.invars), dtype=bool)
+    known = dict(zip(program.invars, np.eye(nothing.size, dtype=bool), strict=True))
+
+    def sources(variables: list) -> np.ndarray:
+        """The leaves of `at` on which any of these variables depends."""
+        return np.any([nothing, *(known.get(v, nothing) for v in variables if not isinstance(v, Literal))], axis=0)
+
+    for equation in program.eqns:
+        known |= dict.fromkeys(equation.outvars, sources(equation.invars))
+    leaves = np.array([sources([v]) for v in program.outvars])
     forces, size, count = (len(jax.tree.leaves(part)) for part in at)
     unknowns = np.eye(count + size * free, dtype=bool)
     reached = unknowns[count:] if free else np.zeros((size, count), dtype=bool)

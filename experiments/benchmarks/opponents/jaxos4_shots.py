@@ -35,7 +35,7 @@ def shots(
     def shoot(measured, alpha):
         def cost(alpha):
             data = rows if measured is None else rows._replace(measured=measured)
-            return problem.shot(data, alpha, first).cost
+            return problem.shot(data, alpha, first)[0]
 
         return jax.jvp(cost, (alpha,), (jnp.asarray(case.half_width),)) if slope else (cost(alpha),)
 
