@@ -17,8 +17,9 @@ import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.flight import RATES
 from jaxos4.shooting import InnovationsProblem, pad_flight
-from jaxos4.shooting.gains import LogNoise, Observed
+from jaxos4.shooting.gains import LogNoise
 from jaxos4.shooting.innovations import SETTLING
+from jaxos4.shooting.layout import observe_in_segments
 
 MODEL = jaxos4.PublishedOS4()
 # Without gyroscopic torques a disturbed rate changes no other channel.
@@ -28,10 +29,11 @@ NOISE = LogNoise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 
 
 @eqx.filter_jit
 def observed_in(problem, segments=1):
-    """The measurements in segments of about this many samples, by default in one."""
+    """Where filters restart, and which samples count, in segments of about this many samples; by default in one."""
     found = InnovationsProblem(problem, segments=segments)
-    rows, (measured, restart, counts, known) = found.segmentation.rows, found.observed()
-    return Observed(measured[:rows], restart[:rows], counts[:rows], known)
+    cut = found.segmentation
+    _, restart, counts, _ = observe_in_segments(found.problem, cut, SETTLING)
+    return restart[: cut.rows, 0], counts[: cut.rows, 0]
 
 
 @eqx.filter_jit
@@ -154,18 +156,18 @@ def test_the_likelihood_does_not_depend_on_the_segments_and_no_trajectory_runs_a
 @pytest.mark.slow
 def test_a_long_gap_and_another_recording_restart_the_filter_and_a_while_after_does_not_count():
     """Recordings begin in mid-flight, where the controller has answered the disturbance for some time."""
-    observed = observed_in(disturbed())
-    assert observed.restart[:, 0].nonzero()[0].tolist() == [0, *range(210, 231)]
-    assert observed.counts[:, 0].nonzero()[0].tolist() == [*range(210), *range(230 + SETTLING, 501)]
+    restart, counts = observed_in(disturbed())
+    assert restart.nonzero()[0].tolist() == [0, *range(210, 231)]
+    assert counts.nonzero()[0].tolist() == [*range(210), *range(230 + SETTLING, 501)]
     problem = standard_problem(channels="rates", free=True, states=noisy_states(1, seed=4)[0])
     # The second half of the flight as one recording, and then its first half as another.
     flight, order = problem.flight, np.concatenate([np.arange(250, 501), np.arange(250)])
     stretch = jnp.asarray(np.arange(501) > 250, dtype=int)
     joined = dataclasses.replace(flight, omega=flight.omega[order], states=flight.states[order], stretch=stretch)
     problem = eqx.tree_at(lambda p: p.flight, problem, joined)
-    observed = observed_in(problem)
-    assert observed.restart[:, 0].nonzero()[0].tolist() == [0, 251]
-    assert (~observed.counts[:, 0]).nonzero()[0].tolist() == [*range(SETTLING), *range(251, 251 + SETTLING)]
+    restart, counts = observed_in(problem)
+    assert restart.nonzero()[0].tolist() == [0, 251]
+    assert (~counts).nonzero()[0].tolist() == [*range(SETTLING), *range(251, 251 + SETTLING)]
     found = FilterError()(problem)
     assert names(found) == "successful"
     assert (np.abs(found.parameters - MODEL.alpha) < 4 * found.std).all()

@@ -59,21 +59,6 @@ class LogNoise(NamedTuple):
     smoothing: Float[Numeric, "channels *segments"] | None = None
 
 
-class Observed(NamedTuple):
-    """The measurements, in segments.
-
-    - `measured`: body rates, then specific force. NaN: not measured.
-    - `restart`: whether the filter of a segment restarts before this sample.
-    - `counts`: whether the innovations at a sample count.
-    - `known`: the rates at the first sample. `None`: unknown.
-    """
-
-    measured: Series
-    restart: Bool[Array, "time segments"]
-    counts: Bool[Array, "time segments"]
-    known: Float[Array, "3 segments"] | None = None
-
-
 class Gains(NamedTuple):
     """The effect of a unit of innovation, and the variance of the innovation.
 
@@ -109,8 +94,8 @@ class Transition(NamedTuple):
     @classmethod
     def of(cls, noise: LogNoise, dt: Float[Array, "..."]) -> "Transition":
         """The propagation over one sample of this length."""
-        response = _Response.of(noise)
-        return cls(response.fading(dt), response.driven_fading(dt), response.driven(dt))
+        tau, fast = _times(noise)
+        return cls(jnp.exp(-dt / tau), _x_to_x(fast, dt), _x_to_d(tau, fast, dt))
 
 
 class Step(NamedTuple):
@@ -142,45 +127,29 @@ def is_rate(channels: Float[Numeric, "channels *rest"]) -> Bool[np.ndarray, "cha
     return (np.arange(len(channels)) < RATE_COUNT).reshape(-1, *(1,) * (channels.ndim - 1))
 
 
-class _Response(NamedTuple):
-    """The response of a channel to a unit of x or of d after a time [s]. `driven` is the response of x to d."""
+def _times(noise: LogNoise) -> tuple[Channels, Channels]:
+    """The time constants [s] of a channel's disturbance d, and of the low-pass filter from d to x."""
+    tau = jnp.exp(noise.time_constant)
+    if noise.smoothing is None:
+        return tau, jnp.full_like(tau, _NO_FILTER)
+    return tau, jnp.where(is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing))
 
-    time_constant: Channels
-    smoothing: Channels
 
-    @classmethod
-    def of(cls, noise: LogNoise) -> "_Response":
-        tau = jnp.exp(noise.time_constant)
-        if noise.smoothing is None:
-            return cls(tau, jnp.full_like(tau, _NO_FILTER))
-        return cls(tau, jnp.where(is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing)))
+def _x_to_x(fast: Channels, time: Array) -> Array:
+    """The response of x to x after a time [s]."""
+    return jnp.where(is_rate(fast), 1.0, jnp.exp(-time / fast))
 
-    def fading(self, time: Array) -> Array:
-        """The response of d to d."""
-        return jnp.exp(-time / self.time_constant)
 
-    def driven_fading(self, time: Array) -> Array:
-        """The response of x to x."""
-        return jnp.where(is_rate(self.smoothing), 1.0, jnp.exp(-time / self.smoothing))
-
-    def driven(self, time: Array) -> Array:
-        """The response of x to d."""
-        tau = self.time_constant
-        force = tau / (tau - self.smoothing) * (self.fading(time) - jnp.exp(-time / self.smoothing))
-        return jnp.where(is_rate(tau), -tau * jnp.expm1(-time / tau), force)
-
-    def driven_sum(self, time: Array) -> Array:
-        """The response of the integral of x to d."""
-        tau, fast = self.time_constant, self.smoothing
-        slow, quick = (-x * jnp.expm1(-time / x) for x in (tau, fast))
-        return jnp.where(is_rate(tau), tau * (time - slow), tau * (slow - quick) / (tau - fast))
+def _x_to_d(tau: Channels, fast: Channels, time: Array) -> Array:
+    """The response of x to d after a time [s]."""
+    force = tau / (tau - fast) * (jnp.exp(-time / tau) - jnp.exp(-time / fast))
+    return jnp.where(is_rate(tau), -tau * jnp.expm1(-time / tau), force)
 
 
 def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = INSTANT) -> Step:
     """The step over one sample of this length. Measurements are means over `window`."""
     noise = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0], -1), noise)
-    response, variance = _Response.of(noise), jnp.exp(2 * noise.strength)
-    tau, fast = response
+    (tau, fast), variance = _times(noise), jnp.exp(2 * noise.strength)
     rate = is_rate(tau)
     # `strength` is the standard deviation of a force; its disturbance has a larger one.
     drive = jnp.where(rate, variance, variance * (tau + fast) / tau)
@@ -188,11 +157,16 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = 
     begin, end = jnp.asarray(begin, dtype=float), jnp.asarray(begin + length, dtype=float)
     long = jnp.where(length > 0, length, 1.0)
 
+    def integral(time: Array) -> Array:
+        """The response of the integral of x to d after a time [s]."""
+        slow, quick = (-x * jnp.expm1(-time / x) for x in (tau, fast))
+        return jnp.where(rate, tau * (time - slow), tau * (slow - quick) / (tau - fast))
+
     def measured(time: Array) -> Array:
         """The change of the measurement for a unit of d at this time of the sample."""
         until_begin, until_end = jnp.maximum(begin - time, 0.0), jnp.maximum(end - time, 0.0)
-        mean = (response.driven_sum(until_end) - response.driven_sum(until_begin)) / long
-        return jnp.where(length > 0, mean, response.driven(until_begin))
+        mean = (integral(until_end) - integral(until_begin)) / long
+        return jnp.where(length > 0, mean, _x_to_d(tau, fast, until_begin))
 
     # The parts of the sample before, in and after the window, and the nodes of a quadrature in each.
     edges = jnp.stack(jnp.broadcast_arrays(jnp.zeros_like(begin), begin, end, dt))
@@ -200,7 +174,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = 
     parts = edges[1:] - edges[:-1]
     time = (edges[:-1] + (nodes + 1) / 2 * parts).reshape(-1, 1, *edges.shape[1:] or (1,))
     share = (weights / 2 * parts).reshape(time.shape) * 2 * drive / tau
-    x, d, m = response.driven(dt - time), response.fading(dt - time), measured(time)
+    x, d, m = _x_to_d(tau, fast, dt - time), jnp.exp(-(dt - time) / tau), measured(time)
     products = x * x, x * d, d * d, m * m, m * x, m * d
     x_x, x_d, d_d, m_m, m_x, m_d = ((share * each).sum(axis=0) for each in products)
     # The mean over the window of the share of x that remains. It is finite for every filter.
@@ -209,9 +183,9 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = 
     force = jnp.where(rate, 0.0, variance)
     return Step(
         transition=Transition.of(noise, dt),
-        driven_seen=jnp.where(rate, 1.0, response.driven_fading(begin) * mean),
+        driven_seen=jnp.where(rate, 1.0, _x_to_x(fast, begin) * mean),
         seen=measured(jnp.zeros_like(begin)),
-        since_seen=jnp.where(rate, 1.0, response.driven_fading(dt - begin) / mean),
+        since_seen=jnp.where(rate, 1.0, _x_to_x(fast, dt - begin) / mean),
         added=Covariance(x_x, x_d, d_d),
         noise=m_m,
         with_driven=m_x,

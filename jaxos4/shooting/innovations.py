@@ -26,8 +26,8 @@ from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
-from .filters import Point, Segmented, innovate
-from .gains import INSTANT, AveragingWindow, LogNoise, Observed
+from .filters import Segmented, innovate
+from .gains import INSTANT, AveragingWindow, LogNoise
 from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, levels, own_names, with_noise
 from .problem import ShootingProblem
@@ -287,10 +287,6 @@ class InnovationsProblem(AbstractProblem):
         """The samples of each segment. An index beyond the flight is replaced by that of its last sample."""
         return jnp.minimum(jnp.asarray(self.segmentation.place), self.flight.time.shape[0] - 1)
 
-    def observed(self) -> Observed:
-        """The measurements in segments, see `observe_in_segments`."""
-        return observe_in_segments(self.problem, self.segmentation, self.settling)
-
     def innovations(
         self,
         parameters: Parameters,
@@ -308,7 +304,8 @@ class InnovationsProblem(AbstractProblem):
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
         """`innovations` for a loop: everything that does not depend on parameters and noise is computed once."""
-        problem, observed, forced, each = self.problem, self.observed(), self._forced(), self._by_recording
+        observed = observe_in_segments(self.problem, self.segmentation, self.settling)
+        problem, forced, each = self.problem, self._forced(), self._by_recording
         places = None
         if each is not None:
             problem = dataclasses.replace(problem, model=each.model)
@@ -321,9 +318,9 @@ class InnovationsProblem(AbstractProblem):
         def at(parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
-            flight = Segmented(observed, inputs, forcing, tangents, *fixed)
+            flight = Segmented(*observed, inputs, forcing, tangents, *fixed)
             driven, disturbance, feedthrough = (tuple(each.T) for each in input_unknowns)
-            point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), (driven, disturbance))
+            point = own, noise, feedthrough, tuple(noise_feedthrough.T), (driven, disturbance)
             return innovate(functions, model.forcing_parameters, flight, point)
 
         return at

@@ -13,7 +13,7 @@ from .._custom_types import Count, Numeric
 from ..flight import SIGNALS, Flight, Signal
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing
 from .filters import BLOCK
-from .gains import Observed
+from .gains import Series as Measured
 
 if TYPE_CHECKING:
     from .problem import ShootingProblem
@@ -104,8 +104,10 @@ class Segments(NamedTuple):
         return cls(place, owned, rows if isinstance(rows, jax.Array) else int(rows), recording)
 
 
-def observe_in_segments(problem: "ShootingProblem", segments: Segments, settling: int) -> Observed:
-    """The measurements in segments, where filters restart, and which innovations count.
+def observe_in_segments(
+    problem: "ShootingProblem", segments: Segments, settling: int
+) -> tuple[Measured, Bool[Array, "time segments"], Bool[Array, "time segments"], Float[Array, "3 segments"] | None]:
+    """The first four fields of `Segmented`: measurements, where filters restart, what counts, and known rates.
 
     A filter restarts in a gap, and where a stretch begins. Its innovations do not count until it has settled. Only a
     flight without stretches counts from its first sample, because a simulation begins at rest.
@@ -127,7 +129,7 @@ def observe_in_segments(problem: "ShootingProblem", segments: Segments, settling
         known = jnp.where(is_first, rates[:, None], 0.0)
     restarts = in_segments(restart) | begins | ~exists
     measured = jnp.where(exists[:, None], in_segments(measured), jnp.nan)
-    return Observed(measured, restarts, in_segments(settled) & segments.owned.T, known)
+    return measured, restarts, in_segments(settled) & segments.owned.T, known
 
 
 def _restarts(
