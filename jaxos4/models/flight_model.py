@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from .._custom_types import Count, Numeric, Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
-from .abstract import PARAMETER_NAMES, AbstractModel, ByRecording, OfAirframe, Parameter
+from .abstract import PARAMETER_NAMES, AbstractModel, OfAirframe, Parameter
 from .os4 import CorrectedOS4
 from .rotors import Batch, Grid, measured_speeds, of_stretches, squared
 from .state import Forcing, Orientation, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
@@ -118,7 +118,9 @@ class FlightModel(AbstractModel):
         """Half the width of a bracket for each parameter: our choice, for small and large quadrotors."""
         return jnp.concatenate([self._rigid_body.half_width, self._of_terms(lambda parameter: parameter.half_width)])
 
-    def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> ByRecording | None:
+    def by_recording(
+        self, stretch: Int[Numeric, " samples"] | None
+    ) -> tuple[AbstractModel, Int[np.ndarray, "recordings parameters"], Int[Numeric, " samples"]] | None:
         """See `AbstractModel`."""
         if stretch is None or max(self.recordings) == 0 or list(self.recordings) != sorted(self.recordings):
             return None
@@ -127,7 +129,7 @@ class FlightModel(AbstractModel):
             [names.index(name if name in names else f"{name}_{i + 1}") for name in one.parameter_names]
             for i in range(max(self.recordings) + 1)
         ]
-        return ByRecording(one, np.array(places), of_stretches(self.recordings, stretch))
+        return one, np.array(places), of_stretches(self.recordings, stretch)
 
     @property
     def gyroscopic_factor(self) -> Scalar:
@@ -192,14 +194,27 @@ class FlightModel(AbstractModel):
         self, inputs: Inputs, parameters, *, parts: int = 0, of_parts: Callable[[Forcing], Forcing] = lambda fine: fine
     ) -> Forcing:
         """The forcing by the rotors, transformed by `of_parts`. `parts`: parts per sample; 0: `inputs` are samples."""
-        grid = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=parts > 0)
-        if inputs.length is not None:
-            whole = self.batch - self.batch % max(parts, 1)  # a batch holds all parts of its samples
-            return self._rotor_forcing_in_batches(inputs, inputs.length, grid, parameters, whole, of_parts)
-        every = Batch(grid, jnp.arange(len(inputs.omega)), jnp.zeros_like(inputs.omega[0]))
-        return of_parts(self._rotor_forcing(inputs, grid, every, parameters)[0])
+        grid, samples = Grid.of(inputs, self.battery_voltage, self.recordings, are_parts=parts > 0), len(inputs.omega)
+        before = jnp.zeros_like(inputs.omega[0])
+        if inputs.length is None:
+            return of_parts(self._rotor_forcing(inputs, Batch(grid, jnp.arange(samples), before), parameters)[0])
+        # Batch after batch, so that padding takes no time. A batch holds all parts of its samples.
+        rows = self.batch - self.batch % max(parts, 1)
+        zeros = jnp.zeros(-(-samples // rows) * rows, float)
+        nothing = of_parts(Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros))
+        many = nothing.roll.shape[0] * rows // zeros.shape[0]
 
-    def _rotor_forcing(self, inputs: Inputs, grid: Grid, batch: Batch, parameters) -> tuple[Forcing, Array]:
+        def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
+            filled, before = carry
+            batch = Batch(grid, jnp.minimum(i * rows + jnp.arange(rows), samples - 1), before)
+            found, before = self._rotor_forcing(inputs, batch, parameters)
+            place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * many, axis=0)
+            return jax.tree.map(place, filled, of_parts(found)), before
+
+        filled, _ = jax.lax.fori_loop(0, -(-inputs.length // rows), fill, (nothing, before))
+        return jax.tree.map(lambda leaf: leaf[: samples * many // rows], filled)
+
+    def _rotor_forcing(self, inputs: Inputs, batch: Batch, parameters) -> tuple[Forcing, Array]:
         """The forcing by the rotors over some samples, and the rotor speeds at the end of the last sample."""
         airframe = self.airframe
 
@@ -207,7 +222,7 @@ class FlightModel(AbstractModel):
             return inputs.omega[rows]
 
         for change, values in self._contributions("command", parameters):
-            omega = change(omega, values, grid)
+            omega = change(omega, values, batch.grid)
         drive, values = next(iter(self._contributions("speed", parameters)), (None, {}))
         speeds = drive(omega(batch.rows), values, batch, airframe) if drive else measured_speeds(omega, batch)
         mean, around = squared(speeds, batch)
@@ -223,24 +238,6 @@ class FlightModel(AbstractModel):
             specific_thrust=around.sum(axis=1) * airframe.thrust_coefficient / mass,
         )
         return found, speeds.end[-1]
-
-    def _rotor_forcing_in_batches(
-        self, inputs: Inputs, length: Count, grid: Grid, parameters, rows: int, of_parts: Callable[[Forcing], Forcing]
-    ) -> Forcing:
-        """Transforms `_rotor_forcing` by `of_parts`, `rows` samples at a time, so that padding takes no time."""
-        samples, zeros = inputs.omega.shape[0], jnp.zeros(-(-inputs.omega.shape[0] // rows) * rows, float)
-        nothing = of_parts(Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros))
-        many = nothing.roll.shape[0] * rows // zeros.shape[0]
-
-        def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
-            filled, before = carry
-            batch = Batch(grid, jnp.minimum(i * rows + jnp.arange(rows), samples - 1), before)
-            found, before = self._rotor_forcing(inputs, grid, batch, parameters)
-            place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * many, axis=0)
-            return jax.tree.map(place, filled, of_parts(found)), before
-
-        filled, _ = jax.lax.fori_loop(0, -(-length // rows), fill, (nothing, jnp.zeros_like(inputs.omega[0])))
-        return jax.tree.map(lambda leaf: leaf[: samples * many // rows], filled)
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """p', q', r' [rad/s^2] of the rigid body, with the contribution of each term."""
