@@ -27,7 +27,7 @@ from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
 from .filters import Segmented, innovate
-from .gains import INSTANT, AveragingWindow, LogNoise
+from .gains import INSTANT, LogNoise
 from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, levels, own_names, with_noise
 from .problem import ShootingProblem
@@ -131,14 +131,6 @@ class InnovationsProblem(AbstractProblem):
     def channels(self) -> tuple[str, ...]:
         """The names of the compared channels."""
         return tuple(CHANNEL_NAMES[column] for column in self.problem.columns)
-
-    @property
-    def averaging_window(self) -> AveragingWindow:
-        """The part of a sample over which measurements are means, see `Flight.within`."""
-        if self.flight.within is None:
-            return INSTANT
-        length = self.flight.averaging_time
-        return (self.flight.dt - length) / 2, length
 
     @property
     def segmentation(self) -> Segments:
@@ -316,7 +308,10 @@ class InnovationsProblem(AbstractProblem):
             places = jnp.asarray(places)[self.segmentation.recording].T
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
-        fixed = self.segmentation.rows, self.flight.dt, self.averaging_window
+        flight, window = self.flight, INSTANT
+        if flight.within is not None:  # measurements are means
+            window = (flight.dt - flight.averaging_time) / 2, flight.averaging_time
+        fixed = self.segmentation.rows, flight.dt, window
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
         def at(parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array) -> Innovations:

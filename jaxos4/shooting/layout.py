@@ -26,16 +26,6 @@ _GAP = 0.1
 _CAPACITIES = (4096, 16384, 65536)
 
 
-def window_samples(
-    samples: int, windows: int
-) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-    """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
-    ends = np.arange(windows + 1) * samples // windows
-    index = ends[:-1, None] + np.arange(np.diff(ends).max())
-    within = index < ends[1:, None]
-    return np.where(within, index, ends[1:, None] - 1), within
-
-
 def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
     """The series of each window, from the series of the flight. Windows of equal length need no copy."""
 
@@ -51,15 +41,6 @@ def each_window(function: Callable, *arguments: Any) -> Any:
         return jax.vmap(function)(*arguments)
     only = jax.tree.map(lambda leaf: leaf[0], arguments)
     return jax.tree.map(lambda leaf: leaf[None], function(*only))
-
-
-def first_measured(
-    measured: Float[Array, "windows length columns"],
-) -> tuple[Float[Array, "windows columns"], Bool[Array, "windows columns"]]:
-    """The first measurement of each window, or 0 if there is none; and whether it was made at the first sample."""
-    first = jnp.argmin(jnp.isnan(measured), axis=1)
-    value = jnp.take_along_axis(measured, first[:, None], axis=1)[:, 0]
-    return jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)
 
 
 class Segments(NamedTuple):

@@ -29,7 +29,7 @@ from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS, runge_kutta
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Stage, Stages, Unknowns, WindowUnknowns
-from .layout import each_window, first_measured, window_samples, windowed
+from .layout import each_window, windowed
 from .scans import Length, Rows, predict_window, shoot, shot_with_derivatives, with_tangents
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
@@ -234,8 +234,10 @@ class ShootingProblem(AbstractProblem):
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
         (index, within), sigma = self.window_samples(), self.sigma[order]
         states = jnp.where(within[:, :, None], self.measured()[index, : self.size], jnp.nan)
-        value, is_first = first_measured(states)
-        return value.ravel(), (3 * sigma + jnp.where(is_first, 0.0, _UNMEASURED[: self.size])).ravel()
+        first = jnp.argmin(jnp.isnan(states), axis=1)
+        value = jnp.take_along_axis(states, first[:, None], axis=1)[:, 0]
+        start, is_first = jnp.nan_to_num(value), (first == 0) & ~jnp.isnan(value)
+        return start.ravel(), (3 * sigma + jnp.where(is_first, 0.0, _UNMEASURED[: self.size])).ravel()
 
     @eqx.filter_jit
     def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
@@ -344,8 +346,11 @@ class ShootingProblem(AbstractProblem):
         return eqx.tree_at(lambda p: p.sigma, self, as_float(after))
 
     def window_samples(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-        """The samples of each window, and which of them belong to it."""
-        return window_samples(self.flight.states.shape[-2], self.windows)
+        """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
+        ends = np.arange(self.windows + 1) * self.flight.states.shape[-2] // self.windows
+        index = ends[:-1, None] + np.arange(np.diff(ends).max())
+        within = index < ends[1:, None]
+        return np.where(within, index, ends[1:, None] - 1), within
 
     def advance(self, forcing: Forcing, state: State, parameters) -> tuple[State, tuple[Scalar, ...]]:
         """The state one sample later, down to the same level of the cascade, and the output of noise-free sensors."""
