@@ -41,8 +41,10 @@ from .airframe import (
 from .analysis.diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
 from .analysis.evaluation import (
     Evaluation as Evaluation,
+    Identifiability as Identifiability,
     cramer_rao_bound as cramer_rao_bound,
     evaluate as evaluate,
+    identifiability as identifiability,
     robust_covariance as robust_covariance,
 )
 from .analysis.frequency_response import (
@@ -51,7 +53,6 @@ from .analysis.frequency_response import (
     FrequencyResponse as FrequencyResponse,
     frequency_response as frequency_response,
 )
-from .analysis.identifiability import Identifiability as Identifiability, identifiability as identifiability
 from .analysis.inertia import (
     CenterOfMass as CenterOfMass,
     InertiaFit as InertiaFit,

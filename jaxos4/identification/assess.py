@@ -7,8 +7,7 @@ import msgspec
 import numpy as np
 
 from .._custom_types import finite_or_none
-from ..analysis.evaluation import evaluate
-from ..analysis.identifiability import Identifiability, identifiability
+from ..analysis.evaluation import Identifiability, evaluate, identifiability
 from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..logs import Recording, as_recordings

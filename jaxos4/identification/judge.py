@@ -14,9 +14,8 @@ from .._custom_types import Numeric, as_float, finite_or_none
 from .._xla import compiled_cheaply
 from ..airframe import AXES, INERTIAS, MOTIONS, PITCH, ROLL, YAW
 from ..analysis.diagnostics import Correlations, Diagnostics, residual_correlations, residual_diagnostics
-from ..analysis.evaluation import evaluate
+from ..analysis.evaluation import evaluate, identifiability
 from ..analysis.frequency_response import frequency_response, modelled_acceleration
-from ..analysis.identifiability import identifiability
 from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import HORIZONS, Predictions, filtered, predictions, skill, trajectory_horizons
 from ..analysis.traces import Traces, os4_traces, position_of
