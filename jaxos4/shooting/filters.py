@@ -157,16 +157,11 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     zero = jnp.zeros(segments, dtype=float)
     start = (zero,) * RATE_COUNT if known is None else known
     estimates = _emptied(((*start, *(zero,) * (channels - RATE_COUNT)), (zero,) * channels), restart[0])
-    nothing = Innovations(
-        cost=zero,
-        feasible=jnp.ones(segments, dtype=bool),
-        gradient=jnp.zeros((channels, unknowns, segments), dtype=float),
-        information=jnp.zeros((channels, unknowns, unknowns, segments), dtype=float),
-        products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
-    )
+    shapes = (channels, unknowns), (channels, unknowns, unknowns), (channels, LAGS + 1)
+    nothing = zero, *(jnp.zeros((*shape, segments), dtype=float) for shape in shapes)
     no_slopes = jax.tree.map(lambda _: jnp.zeros((driving, segments), dtype=float), estimates)
     # Covariance and estimates have derivatives beside them, on the first axis: in the noise, and in `driving` unknowns.
-    first = (covariance, jax.vmap(push)(steps[1])), (estimates, no_slopes)
+    first = (covariance, jax.vmap(push)(steps[1])), (estimates, no_slopes), jnp.ones(segments, dtype=bool)
     missing, restart_next = jnp.isnan(measured), jnp.roll(restart, -1, axis=0)
     known_rows = jnp.where(missing, 0.0, measured), ~missing, jnp.where(missing[:, None], 0.0, inputs)
     data = (*known_rows, restart, restart_next), counts, forcing, forcing_tangents
@@ -203,11 +198,11 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         return ((covariance, by_noise), (estimates, slopes), feasible), found
 
     def block(i: Count, carry: tuple) -> tuple:
-        """The filters after some more rows, the last standardised innovations, and the sums."""
+        """The filters after some more rows, the last standardised innovations, and the sums of the likelihood."""
         filters, last, sums = carry
         row, counts, forcing, tangents = jax.tree.map(lambda leaf: leaf[i], blocks)
         _, is_measured, inputs, *_ = row
-        (*filters, feasible), found = jax.lax.scan(sample, (*filters, sums.feasible), (forcing, tangents, row))
+        filters, found = jax.lax.scan(sample, filters, (forcing, tangents, row))
         (errors, slopes), variance, variance_slopes = found
         counts = is_measured & counts[:, None]
         # Known feedthroughs explain a part of the innovations that counts as noise; the others are estimated.
@@ -215,11 +210,12 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         explained, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(each, inputs) for each in both)
         errors, slopes = errors - explained, jnp.concatenate([slopes, -jnp.moveaxis(inputs, 2, 1)], axis=2)
         squares = jnp.square(as_noise)
-        found, last = likelihood(counts, variance, variance_slopes, last, feasible, errors, slopes, squares, levels)
-        return tuple(filters), last, jax.tree.map(jnp.add, sums, found)._replace(feasible=feasible)
+        found, last = likelihood(counts, variance, variance_slopes, last, errors, slopes, squares, levels)
+        return filters, last, jax.tree.map(jnp.add, sums, found)
 
     begin = first, jnp.zeros((LAGS, channels, segments), dtype=float), nothing
-    return jax.lax.fori_loop(0, -(-rows // BLOCK), block, begin)[-1]
+    (*_, feasible), _, (cost, *sums) = jax.lax.fori_loop(0, -(-rows // BLOCK), block, begin)
+    return Innovations(cost, feasible, *sums)
 
 
 def _advance(

@@ -38,16 +38,17 @@ def likelihood(
     variance: Series,
     variance_slopes: Float[Array, "time levels channels segments"],
     last: Float[Array, "lags channels segments"],
-    feasible: Bool[Array, " segments"],
     errors: Series,
     slopes: Float[Array, "time channels unknowns segments"],
     feedthrough_squares: Series,
     noise: slice,
-) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
+) -> tuple[tuple[PerSegment, Array, Array, Array], Float[Array, "lags channels segments"]]:
     """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations.
 
     `feedthrough_squares`: the squares of the explained part of the innovations, which counts as noise. `noise`: the
     indices of the noise among the unknowns.
+
+    **Returns:** `cost`, `gradient`, `information` and `products` of `Innovations`; then the next `last`.
     """
     weight = jnp.where(counts, 1 / variance, 0.0)
     logarithm = jnp.where(counts, jnp.log(variance), 0.0)
@@ -62,7 +63,7 @@ def likelihood(
     standard = jnp.concatenate([last, jnp.sqrt(weight) * errors])
     now = standard[LAGS:]
     products = [(now * standard[LAGS - lag : standard.shape[0] - lag]).sum(axis=0) for lag in range(LAGS + 1)]
-    return Innovations(cost, feasible, gradient, information, jnp.stack(products, axis=1)), standard[-LAGS:]
+    return (cost, gradient, information, jnp.stack(products, axis=1)), standard[-LAGS:]
 
 
 def joined(
