@@ -64,7 +64,7 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
     `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom. Correlations are those
     of residuals up to 25 samples apart, in a short flight up to half of it.
     """
-    from scipy.special import gammainc, gammaincc  # slow to import, and few need it
+    from scipy.special import gammainc, gammaincc, ndtr  # slow to import, and few need it
 
     lags = min(25, evaluation.measured.shape[0] // 2)
     problem, feasible = evaluation.problem, evaluation.feasible
@@ -89,7 +89,14 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
     box = ((most + 2) / most) * (pairs * np.square(autocorrelation)).sum(axis=1)
     white_p = gammaincc(np.maximum((pairs > 0).sum(axis=1), 1) / 2, box / 2)
     colour = autocorrelation[np.arange(count.size), np.argmax(pairs > 0, axis=1)]
-    input_correlation, input_p = _dependence(errors, measured, autocorrelation, evaluation.torques, rounding, lags)
+    # The largest correlation with each torque, and the p-value of residuals that depend on no torque.
+    moves = _moves(evaluation.torques)
+    moves = np.where(np.abs(moves).max(axis=0) > rounding * np.abs(evaluation.torques[:-1]).max(axis=0), moves, 0.0)
+    correlations, deviations = _with_torques(errors, measured, autocorrelation, moves, lags)
+    ratios = np.abs(correlations) / deviations
+    at = ratios.argmax(axis=2)[:, :, None]
+    input_correlation, worst = (np.take_along_axis(each, at, axis=2)[:, :, 0] for each in (correlations, ratios))
+    p = np.minimum((2 * lags + 1) * np.min(2 * ndtr(-worst), axis=1), 1.0)
     return Diagnostics(
         feasible=feasible,
         count=count,
@@ -101,7 +108,7 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
         colour=np.where(trivial, 0.0, colour),
         white_p=np.where(trivial | (problem.windows > 1), 1.0, white_p),
         input_correlation=np.where(trivial[:, None], 0.0, input_correlation),
-        input_p=np.where(trivial, 1.0, input_p),
+        input_p=np.where(trivial, 1.0, np.minimum(3 * p, 1.0)),
     )
 
 
@@ -137,27 +144,6 @@ def _with_torques(
         found.append((correlation, np.sqrt(inflation[:, None] / np.maximum(pairs, 1e-9))))
     correlations, deviations = (np.stack(each, axis=1) for each in zip(*found, strict=True))
     return correlations, deviations
-
-
-def _dependence(
-    errors: np.ndarray,
-    measured: np.ndarray,
-    autocorrelation: np.ndarray,
-    torques: np.ndarray,
-    rounding: float,
-    lags: int,
-) -> tuple[Float[np.ndarray, "size 3"], Float[np.ndarray, " size"]]:
-    """The largest correlation with each torque, and the p-value of residuals that depend on no torque."""
-    from scipy.special import ndtr
-
-    moves = _moves(torques)
-    moves = np.where(np.abs(moves).max(axis=0) > rounding * np.abs(torques[:-1]).max(axis=0), moves, 0.0)
-    correlations, deviations = _with_torques(errors, measured, autocorrelation, moves, lags)
-    ratios = np.abs(correlations) / deviations
-    at = ratios.argmax(axis=2)[:, :, None]
-    largest, worst = (np.take_along_axis(each, at, axis=2)[:, :, 0] for each in (correlations, ratios))
-    p = np.minimum((2 * lags + 1) * np.min(2 * ndtr(-worst), axis=1), 1.0)
-    return largest, np.minimum(3 * p, 1.0)
 
 
 def _correlations(
