@@ -61,15 +61,15 @@ class Directions(NamedTuple):
         return cls(matrix, matrix, jnp.zeros(unknowns.shape, dtype=bool), zero, zero, zero)
 
     @classmethod
-    def at(
-        cls,
-        unknowns: WindowUnknowns,
-        model: LocalModel,
-        limits: tuple[WindowUnknowns, WindowUnknowns],
-        added: WindowUnknowns,
-        count: int,
-    ) -> "Directions":
-        """The directions at some unknowns, of which `count` are shared. `added`: information added to the cost's."""
+    def at(cls, stage: Stage, unknowns: WindowUnknowns, model: LocalModel, reach: Scalar) -> "Directions":
+        """The directions at some unknowns. The search does not go further than `reach` half-widths from the center.
+
+        The parameters' bracket counts as weak prior information, so that no direction is without any.
+        """
+        limits, count, windows = stage.limits(reach), stage.unknowns.count, len(unknowns)
+        of_bracket, of_stride = 1 / jnp.square(stage.off / 2), _DAMPING / jnp.square(stage.unknowns.stride)
+        shared = jnp.where(stage.unknowns.precision > 0, of_stride, of_bracket[:, :count] / windows)
+        added = of_bracket.at[:, :count].set(shared)
         moves = movable(unknowns, model.gradient, limits, count)
         information = jnp.where(moves[:, :, None] & moves[:, None, :], model.information, 0.0)
         factor, basis = joint_factor(information + jax.vmap(jnp.diag)(added), count)
@@ -234,7 +234,7 @@ class IBSS(AbstractSolver[State]):
         )
         kept, stalled = self._judge(stage, state, unknowns, model)
         unknowns, model = chosen(kept, (unknowns, model), (state.unknowns, state.model))
-        directions = self._look_around(stage, unknowns, model)
+        directions = Directions.at(stage, unknowns, model, self.reach)
         share, growth = self._next_widths(stage, state, brackets)
         trust = jnp.where(kept, jnp.minimum(state.trust * _ADVANCE, 1.0), state.trust * _RETREAT)
         later = jnp.maximum(share * directions.longest, stage.smallest_step) * growth
@@ -268,17 +268,6 @@ class IBSS(AbstractSolver[State]):
         spread = jnp.where(known, covariance, before.spread)
         rollouts = state.shots * stage.searched.sum()
         return Found(state.unknowns, state.model, spread, state.sweeps, rollouts, state.done)
-
-    def _look_around(self, stage: Stage, unknowns: WindowUnknowns, model: LocalModel) -> Directions:
-        """The directions along which the cost is nearly separable, and predicted steps.
-
-        The parameters' bracket counts as weak prior information, so that no direction is without any.
-        """
-        of_bracket, (windows, _) = 1 / jnp.square(stage.off / 2), unknowns.shape
-        shared = of_bracket[:, : stage.unknowns.count] / windows
-        has_prior, of_stride = stage.unknowns.precision > 0, _DAMPING / jnp.square(stage.unknowns.stride)
-        added = of_bracket.at[:, : stage.unknowns.count].set(jnp.where(has_prior, of_stride, shared))
-        return Directions.at(unknowns, model, stage.limits(self.reach), added, stage.unknowns.count)
 
     def _shoot(self, stage: Stage, state: State, before: Sweep) -> Sweep:
         """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes."""

@@ -95,7 +95,7 @@ class Transition(NamedTuple):
     def of(cls, noise: LogNoise, dt: Float[Array, "..."]) -> "Transition":
         """The propagation over one sample of this length."""
         tau, fast = _times(noise)
-        return cls(jnp.exp(-dt / tau), _x_to_x(fast, dt), _x_to_d(tau, fast, dt))
+        return cls(jnp.exp(-dt / tau), _x_from_x(fast, dt), _x_from_d(tau, fast, dt))
 
 
 class Step(NamedTuple):
@@ -135,12 +135,12 @@ def _times(noise: LogNoise) -> tuple[Channels, Channels]:
     return tau, jnp.where(is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing))
 
 
-def _x_to_x(fast: Channels, time: Array) -> Array:
+def _x_from_x(fast: Channels, time: Array) -> Array:
     """The response of x to x after a time [s]."""
     return jnp.where(is_rate(fast), 1.0, jnp.exp(-time / fast))
 
 
-def _x_to_d(tau: Channels, fast: Channels, time: Array) -> Array:
+def _x_from_d(tau: Channels, fast: Channels, time: Array) -> Array:
     """The response of x to d after a time [s]."""
     force = tau / (tau - fast) * (jnp.exp(-time / tau) - jnp.exp(-time / fast))
     return jnp.where(is_rate(tau), -tau * jnp.expm1(-time / tau), force)
@@ -166,7 +166,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = 
         """The change of the measurement for a unit of d at this time of the sample."""
         until_begin, until_end = jnp.maximum(begin - time, 0.0), jnp.maximum(end - time, 0.0)
         mean = (integral(until_end) - integral(until_begin)) / long
-        return jnp.where(length > 0, mean, _x_to_d(tau, fast, until_begin))
+        return jnp.where(length > 0, mean, _x_from_d(tau, fast, until_begin))
 
     # The parts of the sample before, in and after the window, and the nodes of a quadrature in each.
     edges = jnp.stack(jnp.broadcast_arrays(jnp.zeros_like(begin), begin, end, dt))
@@ -174,7 +174,7 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = 
     parts = edges[1:] - edges[:-1]
     time = (edges[:-1] + (nodes + 1) / 2 * parts).reshape(-1, 1, *edges.shape[1:] or (1,))
     share = (weights / 2 * parts).reshape(time.shape) * 2 * drive / tau
-    x, d, m = _x_to_d(tau, fast, dt - time), jnp.exp(-(dt - time) / tau), measured(time)
+    x, d, m = _x_from_d(tau, fast, dt - time), jnp.exp(-(dt - time) / tau), measured(time)
     products = x * x, x * d, d * d, m * m, m * x, m * d
     x_x, x_d, d_d, m_m, m_x, m_d = ((share * each).sum(axis=0) for each in products)
     # The mean over the window of the share of x that remains. It is finite for every filter.
@@ -183,9 +183,9 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."], window: AveragingWindow = 
     force = jnp.where(rate, 0.0, variance)
     return Step(
         transition=Transition.of(noise, dt),
-        driven_seen=jnp.where(rate, 1.0, _x_to_x(fast, begin) * mean),
+        driven_seen=jnp.where(rate, 1.0, _x_from_x(fast, begin) * mean),
         seen=measured(jnp.zeros_like(begin)),
-        since_seen=jnp.where(rate, 1.0, _x_to_x(fast, dt - begin) / mean),
+        since_seen=jnp.where(rate, 1.0, _x_from_x(fast, dt - begin) / mean),
         added=Covariance(x_x, x_d, d_d),
         noise=m_m,
         with_driven=m_x,

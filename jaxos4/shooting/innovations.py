@@ -158,16 +158,7 @@ class InnovationsProblem(AbstractProblem):
     @eqx.filter_jit  # one compiled program instead of one for each operation, and traced once
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
         """The parameters, then the logarithms of the noise levels, in brackets from differences of measurements."""
-        data = self.problem.measured(), self.flight.dt, self.least_noise
-        has_input = (self.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
-        return with_noise(
-            self.problem.unknowns,
-            self.channels,
-            *data,
-            has_input=has_input,
-            answers_within=self.answers_within,
-            lagged=self.lagged,
-        )
+        return with_noise(self)
 
     @property
     def initial_guess(self) -> InitialGuess:
@@ -299,7 +290,7 @@ class InnovationsProblem(AbstractProblem):
 
     def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
         """`innovations` for a loop: everything that does not depend on parameters and noise is computed once."""
-        observed = observe_in_segments(self.problem, self.segmentation, self.settling)
+        observed = observe_in_segments(self)
         problem, forced, each = self.problem, self._forced(), self._by_recording
         places = None
         if each is not None:

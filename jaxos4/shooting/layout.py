@@ -13,9 +13,9 @@ from .._custom_types import Count, Numeric
 from ..flight import SIGNALS, Flight, Signal
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing
 from .filters import BLOCK
-from .gains import Series as Measured
 
 if TYPE_CHECKING:
+    from .innovations import InnovationsProblem
     from .problem import ShootingProblem
 
 Series = TypeVar("Series", Forcing, tuple[Array, ...])
@@ -86,27 +86,32 @@ class Segments(NamedTuple):
 
 
 def observe_in_segments(
-    problem: "ShootingProblem", segments: Segments, settling: int
-) -> tuple[Measured, Bool[Array, "time segments"], Bool[Array, "time segments"], Float[Array, "3 segments"] | None]:
+    problem: "InnovationsProblem",
+) -> tuple[
+    Float[Array, "time channels segments"],
+    Bool[Array, "time segments"],
+    Bool[Array, "time segments"],
+    Float[Array, "3 segments"] | None,
+]:
     """The first four fields of `Segmented`: measurements, where filters restart, what counts, and known rates.
 
     A filter restarts in a gap, and where a stretch begins. Its innovations do not count until it has settled. Only a
     flight without stretches counts from its first sample, because a simulation begins at rest.
     """
-    flight, index, samples = problem.flight, jnp.asarray(segments.place), problem.flight.time.shape[0]
+    flight, segments, known = problem.flight, problem.segmentation, None
+    index, samples = jnp.asarray(segments.place), flight.time.shape[0]
     exists, place = ((index >= 0) & (index < samples)).T, jnp.minimum(index, samples - 1)
-    measured = problem.measured()
-    restart, settled = _restarts(jnp.isnan(measured[:, :3]).all(axis=1), flight, settling)
+    measured, initial_state = problem.problem.measured(), problem.problem.initial_state
+    restart, settled = _restarts(jnp.isnan(measured[:, :3]).all(axis=1), flight, problem.settling)
 
     def in_segments(series: Array) -> Array:
         return jnp.moveaxis(series[place], 0, -1)  # segments last
 
-    known = None
     begins = np.broadcast_to(np.arange(index.shape[1])[:, None] == 0, exists.shape)
-    if problem.initial_state is not None:
+    if initial_state is not None:
         is_first = np.arange(index.shape[0]) == 0
         begins = begins & ~is_first
-        rates = problem.initial_state[CASCADE_ORDER[: CHANNELS["rates"]]]
+        rates = initial_state[CASCADE_ORDER[: CHANNELS["rates"]]]
         known = jnp.where(is_first, rates[:, None], 0.0)
     restarts = in_segments(restart) | begins | ~exists
     measured = jnp.where(exists[:, None], in_segments(measured), jnp.nan)

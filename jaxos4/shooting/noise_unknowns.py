@@ -1,15 +1,20 @@
 """The unknowns of the noise in filter error: names, first values and brackets."""
 
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._custom_types import Scalar
 from ..bracket import PROPER_PRIOR
 from ..flight import FORCE_NAMES
 from .abstract import Unknowns
 from .gains import RATE_COUNT, LogNoise, is_rate
+
+if TYPE_CHECKING:
+    from .innovations import InnovationsProblem
 
 PRECISION = 1e-2  # of a weak prior on each logarithm of a noise level, as the reciprocal of a variance
 TIMES = 0.2, 0.03  # s; time constants of the disturbance at which searches start: the likelihood has several maxima
@@ -47,22 +52,13 @@ def levels(channels: int) -> int:
     return 4 if channels > RATE_COUNT else 3
 
 
-def with_noise(
-    own: Unknowns,
-    channels: tuple[str, ...],
-    measured: Float[Array, "samples channels"],
-    dt: Scalar,
-    least_noise: Float[Array, " channels"],
-    *,
-    has_input: Bool[Array, "channels feedthroughs"],
-    answers_within: Bool[Array, ""],
-    lagged: Bool[Array, ""],
-) -> Unknowns:
+def with_noise(problem: "InnovationsProblem") -> Unknowns:
     """The parameters, then noise, gains and feedthroughs of each channel, in brackets from the measurements.
 
-    The unknowns are the logarithms of noise levels, see `LogNoise`. `has_input`: which input innovations a channel has.
-    `answers_within`, `lagged`: see `InnovationsProblem`.
+    The unknowns of the noise are the logarithms of its levels, see `LogNoise`.
     """
+    own, measured, dt = problem.problem.unknowns, problem.problem.measured(), problem.flight.dt
+    has_input = (problem.input_innovations != 0).any(axis=0).T  # by channel and feedthrough
     first = jnp.stack(first_noise(measured, dt, TIMES[0])[:3], axis=1)
     count, rate, shortest = levels(first.shape[0]), is_rate(first), jnp.log(_SHORTEST * dt)
     smoothing = jnp.full((first.shape[0], count - first.shape[1]), np.log(_SMOOTHING))
@@ -73,7 +69,7 @@ def with_noise(
     # A rate has no filter: its `smoothing` is fixed.
     lowest = lowest.at[:, 3:].set(jnp.where(rate, first[:, 3:], shortest))
     highest = highest.at[:, 3:].set(jnp.where(rate, first[:, 3:], np.log(_LONGEST_SMOOTHING)))
-    lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(least_noise, jnp.finfo(float).tiny)))
+    lowest = lowest.at[:, 2].max(jnp.log(jnp.maximum(problem.least_noise, jnp.finfo(float).tiny)))
     free = jnp.ones(first.shape, dtype=bool).at[:, 3:].set(~rate)
     more = 3 * has_input.shape[1]
     first, lowest, highest = (
@@ -82,9 +78,9 @@ def with_noise(
     )
     # An input innovation that is always 0 has no gain to estimate. Of lagged innovations, only the first has a gain on
     # the disturbance: one sample later, it is the same disturbance less a step of the rate.
-    of_disturbance = has_input & ~(lagged & (np.arange(has_input.shape[1]) > 0))
-    free = jnp.concatenate([free, has_input, of_disturbance, has_input & rate & answers_within], axis=1)
-    names = tuple(each.format(name) for name in channels for each in own_names(count, has_input.shape[1]))
+    of_disturbance = has_input & ~(problem.lagged & (np.arange(has_input.shape[1]) > 0))
+    free = jnp.concatenate([free, has_input, of_disturbance, has_input & rate & problem.answers_within], axis=1)
+    names = tuple(each.format(name) for name in problem.channels for each in own_names(count, has_input.shape[1]))
     precision = jnp.full(first.size, PRECISION)
     return Unknowns(
         names=own.names + names,

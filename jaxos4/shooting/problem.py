@@ -152,13 +152,7 @@ class ShootingProblem(AbstractProblem):
             rows, own = forced(unknowns[0, :count]), unknowns[:, count:] if self.free_size else first
             # The states of fewer channels, then the specific force.
             rows = rows._replace(measured=rows.measured[: fewer.size] + rows.measured[self.size :])
-            window = shot_with_derivatives(
-                fewer.advance,
-                length,
-                fewer.weights,
-                forcing_parameters=self.model.forcing_parameters,
-                initial_state_is_free=self.initial_state is None,
-            )
+            window = shot_with_derivatives(fewer, length)
             each = rows, unknowns[:, :count], own[:, : fewer.size]
             if self.windows > 1:
                 model = jax.vmap(window)(*each)
@@ -355,7 +349,7 @@ class ShootingProblem(AbstractProblem):
     def advance(self, forcing: Forcing, state: State, parameters) -> tuple[State, tuple[Scalar, ...]]:
         """The state one sample later, down to the same level of the cascade, and the output of noise-free sensors."""
         dt, derivative = self.flight.dt, functools.partial(self.model.cascade, forcing=forcing, parameters=parameters)
-        if self.method == "euler":
+        if self.method == "euler":  # the paper's x_{k+1} = x_k + T f(x_k, u_k)
             following = jax.tree.map(lambda x, dx: x + dt * dx, state, derivative(state))
         else:
             following = runge_kutta(derivative, state, dt)

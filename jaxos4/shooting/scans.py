@@ -7,7 +7,7 @@ inside a scan are scalars of a lane, because stacking them in every step is slow
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +20,9 @@ from .._custom_types import Count, InitialState, Parameters, Scalar
 from ..batching import computed_once, with_batch
 from ..models.state import CHANNELS, Forcing, State, Translation, unstack
 from .abstract import LocalModel
+
+if TYPE_CHECKING:
+    from .problem import ShootingProblem
 
 # rad/s; no quadrotor reaches this body rate and no gyro measures it, so a faster trajectory has diverged.
 FASTEST = 1e3
@@ -113,19 +116,14 @@ def shoot(
 
 
 def shot_with_derivatives(
-    advance: Advance,
-    length: Length,
-    weights: tuple[Scalar, ...],
-    *,
-    forcing_parameters: tuple[int, ...],
-    initial_state_is_free: bool,
+    problem: "ShootingProblem", length: Length
 ) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
     """What `shoot` computes, with gradient and information in the parameters and a free initial state.
 
     It has a loop of its own, `_linearised_shot`. A batch runs in lanes.
     """
-    how = {"forcing_parameters": forcing_parameters, "initial_state_is_free": initial_state_is_free}
-    alone = functools.partial(_linearised_shot, **how)
+    places, is_free = problem.model.forcing_parameters, problem.initial_state is None
+    alone = functools.partial(_linearised_shot, forcing_parameters=places, initial_state_is_free=is_free)
 
     def together(lanes: int, many: Any, shared: Any) -> LocalModel:
         if many[1] is not None:  # lanes of different lengths
@@ -141,7 +139,7 @@ def shot_with_derivatives(
         out = alone(advance, shared[1], weights, rows, parameters, initial_state)
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), out)
 
-    return with_batch(alone, together, advance, length, weights)
+    return with_batch(alone, together, problem.advance, length, problem.weights)
 
 
 # A linearised shot up to some sample: its state; the tangents of the unknowns that act on rates or attitude, and of the
