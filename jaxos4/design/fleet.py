@@ -21,8 +21,7 @@ from ..models.state import Attitude, Orientation, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
-from ..shooting.noise_unknowns import PRECISION
-from ..shooting.sums import joined
+from ..shooting.noise_unknowns import PRECISION, joined
 from .envelope import Envelope, hover_squares
 from .rotor_speeds import drawn
 from .task import Series

@@ -34,7 +34,6 @@ from .gains import (
     step_of,
 )
 from .scans import FASTEST
-from .sums import LAGS, Innovations, likelihood
 
 Scalars = tuple[Float[Array, "*#segments"], ...]
 Move = Callable[[State, Forcing, Scalars], State]
@@ -43,6 +42,27 @@ Functions = tuple[Move, Move, Observe]
 
 BLOCK = 32
 """The number of rows that are filtered before their likelihood is summed."""
+
+
+LAGS = 8
+"""The largest lag at which innovations are compared, in samples."""
+
+
+class Innovations(NamedTuple):
+    """The innovations of each segment and their negative log-likelihood.
+
+    The unknowns of a channel are the parameters, then its `LogNoise`, gains of input innovations, and feedthroughs.
+
+    - `feasible`: whether the rates stay below `FASTEST`.
+    - `information`: the Fisher information.
+    - `products`: sums of the products of standardised innovations 0 to `LAGS` samples apart.
+    """
+
+    cost: PerSegment
+    feasible: Bool[Array, " segments"]
+    gradient: Float[Array, "channels unknowns segments"]
+    information: Float[Array, "channels unknowns unknowns segments"]
+    products: Float[Array, "channels lags segments"]
 
 
 class Segmented(NamedTuple):
@@ -210,7 +230,7 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         explained, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(each, inputs) for each in both)
         errors, slopes = errors - explained, jnp.concatenate([slopes, -jnp.moveaxis(inputs, 2, 1)], axis=2)
         squares = jnp.square(as_noise)
-        found, last = likelihood(counts, variance, variance_slopes, last, errors, slopes, squares, levels)
+        found, last = _likelihood(counts, variance, variance_slopes, last, errors, slopes, squares, levels)
         return filters, last, jax.tree.map(jnp.add, sums, found)
 
     begin = first, jnp.zeros((LAGS, channels, segments), dtype=float), nothing
@@ -260,3 +280,36 @@ def _advance(
 
 def _emptied(estimates: Estimates, where: Bool[Array, " segments"]) -> Estimates:
     return jax.tree.map(lambda leaf: jnp.where(where, 0.0, leaf), estimates)
+
+
+def _likelihood(
+    counts: Bool[Array, "time channels segments"],
+    variance: Series,
+    variance_slopes: Float[Array, "time levels channels segments"],
+    last: Float[Array, "lags channels segments"],
+    errors: Series,
+    slopes: Float[Array, "time channels unknowns segments"],
+    feedthrough_squares: Series,
+    noise: slice,
+) -> tuple[tuple[PerSegment, Array, Array, Array], Float[Array, "lags channels segments"]]:
+    """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations.
+
+    `feedthrough_squares`: the squares of the explained part of the innovations, which counts as noise. `noise`: the
+    indices of the noise among the unknowns.
+
+    **Returns:** `cost`, `gradient`, `information` and `products` of `Innovations`; then the next `last`.
+    """
+    weight = jnp.where(counts, 1 / variance, 0.0)
+    logarithm = jnp.where(counts, jnp.log(variance), 0.0)
+    relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, levels, segments)
+    gradient = jnp.einsum("tcul,tcl->cul", slopes, weight * errors)
+    squares = errors**2 + feedthrough_squares
+    surprise = (weight > 0) * (1 - weight * squares) / 2
+    gradient = gradient.at[:, noise].add(jnp.einsum("tcul,tcl->cul", relative, surprise))
+    information = jnp.einsum("tcul,tcvl->cuvl", slopes * weight[:, :, None], slopes)
+    information = information.at[:, noise, noise].add(jnp.einsum("tcul,tcvl->cuvl", relative, relative) / 2)
+    cost = (weight * squares + logarithm).sum(axis=(0, 1)) / 2
+    standard = jnp.concatenate([last, jnp.sqrt(weight) * errors])
+    now = standard[LAGS:]
+    products = [(now * standard[LAGS - lag : standard.shape[0] - lag]).sum(axis=0) for lag in range(LAGS + 1)]
+    return (cost, gradient, information, jnp.stack(products, axis=1)), standard[-LAGS:]

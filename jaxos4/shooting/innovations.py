@@ -26,13 +26,12 @@ from ..models.abstract import AbstractModel
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
-from .filters import Segmented, innovate
+from .filters import LAGS, Innovations, Segmented, innovate
 from .gains import INSTANT, LogNoise
 from .layout import Segments, observe_in_segments
-from .noise_unknowns import TIMES, levels, own_names, with_noise
+from .noise_unknowns import TIMES, joined, levels, own_names, placed, with_noise
 from .problem import ShootingProblem
 from .scans import with_tangents
-from .sums import LAGS, Innovations, joined, placed
 
 SETTLING = 128
 """After this many samples a filter has settled, by default."""

@@ -1,13 +1,13 @@
-"""The unknowns of the noise in filter error: names, first values and brackets."""
+"""The unknowns of filter error, in their order: the parameters, then noise and gains of each channel, with brackets."""
 
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._custom_types import Scalar
+from .._custom_types import Numeric, Scalar
 from ..bracket import PROPER_PRIOR
 from ..flight import FORCE_NAMES
 from .abstract import Unknowns
@@ -110,3 +110,34 @@ def _unit(name: str) -> str:
     if name.startswith(FORCE_NAMES):
         return "m/s^2"
     return "rad/s^2" if "disturbance" in name else "rad/s"
+
+
+def joined(
+    gradient: Float[Array, "channels some"], information: Float[Array, "channels some some"], count: int
+) -> tuple[Float[Array, " unknowns"], Float[Array, "unknowns unknowns"]]:
+    """Gradient and information in all unknowns, from each channel's in `count` parameters and its other unknowns."""
+    channels, each = gradient.shape[0], gradient.shape[1] - count
+    size = count + each * channels
+    total = jnp.concatenate([gradient[:, :count].sum(axis=0), gradient[:, count:].ravel()])
+    whole = jnp.zeros((size, size), dtype=float).at[:count, :count].set(information[:, :count, :count].sum(axis=0))
+    for i in range(channels):
+        own = slice(count + each * i, count + each * (i + 1))
+        whole = whole.at[:count, own].set(information[i, :count, count:])
+        whole = whole.at[own, :count].set(information[i, count:, :count])
+        whole = whole.at[own, own].set(information[i, count:, count:])
+    return total, whole
+
+
+def placed(
+    gradient: Float[Array, "segments some"],
+    information: Float[Array, "segments some some"],
+    places: Int[Numeric, "segments some"],
+    size: int,
+) -> tuple[Float[Array, "segments size"], Float[Array, "segments size size"]]:
+    """Gradient and information of each segment in all `size` unknowns, from its own, which are at `places`."""
+    segments = np.arange(places.shape[0])
+    pairs = segments[:, None, None], places[:, :, None], places[:, None, :]
+    return (
+        jnp.zeros((places.shape[0], size), dtype=float).at[segments[:, None], places].add(gradient),
+        jnp.zeros((places.shape[0], size, size), dtype=float).at[pairs].add(information),
+    )
