@@ -17,7 +17,7 @@ from .values import COLUMNS, PWM, PWM_ZERO, ColumnLimits
 ColumnsGiven = LogPath | Mapping[str, Any] | None
 """A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
 
-PRESETS = {path.stem: path for path in sorted(Path(__file__).with_name("presets").glob("*.toml"))}
+PRESETS: dict[str, Any] = read_toml(Path(__file__).with_name("presets.toml"))
 QUATERNION = ("qw", "qx", "qy", "qz")
 _QUATERNION = ColumnLimits("of a quaternion", -math.inf, math.inf, "")
 _COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
@@ -83,10 +83,9 @@ def column_map(given: ColumnsGiven) -> ColumnMap:
         name, table = "columns", dict(given)
         check_plain(name, table, "correct it")
     else:
-        preset = PRESETS.get(os.fspath(given))
         name = os.fspath(given)
         try:
-            table = read_toml(preset or given)
+            table = dict(PRESETS.get(name) or read_toml(given))
         except FileNotFoundError:
             refuse(name, f"neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}")
         if not table:
