@@ -125,11 +125,6 @@ def cut(flight: Recording, stretch: Stretch) -> Recording:
     return flight.rows(slice(int(inside[0]), int(inside[-1]) + 1))
 
 
-def usable(recording: Recording, airframe: Airframe | None = None) -> list[Recording]:
-    """The usable stretches of a flight, each as a recording."""
-    return [cut(recording, stretch) for stretch in stretches(recording, airframe) if not stretch.reason]
-
-
 # The smallest share of full command at which a vehicle hovers: no vehicle has a thrust of 25 times its weight.
 LEAST_HOVER = 0.2
 

@@ -32,8 +32,11 @@ SLOW_GYRO = 0.0202  # s; the longest sample of a gyro whose integral is compared
 
 def wrong_scale(evidence: Evidence) -> Finding | None:
     """The attitude turns more or less than the gyro says. A slow gyro misses turns between its samples."""
-    turns = evidence.turns
-    if turns is None or _gyro_step(evidence) > SLOW_GYRO:
+    turns, steps = evidence.turns, [0.0]
+    for rates, time in ((each.states[:, RATES], each.time) for each in evidence.stretches):
+        measured = (time[np.isfinite(rate)] for rate in rates.T)
+        steps += [float(np.median(np.diff(each))) for each in measured if each.size > 1]
+    if turns is None or max(steps) > SLOW_GYRO:
         return None
     matrix, error = turns.matrix.value, np.diagonal(turns.matrix.error)
     clear = np.abs(matrix) > STANDARD_ERRORS * turns.matrix.error  # others only add noise
@@ -62,15 +65,6 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
     axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(MOTIONS, scale, error, judged, strict=True) if j]
     cause = f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}"
     return Finding(name, cause, ", ".join(axes), remedy, quantities, True)
-
-
-def _gyro_step(evidence: Evidence) -> float:
-    """The longest median time between samples of p, q or r in flight [s]; 0 without any."""
-    steps = [0.0]
-    for flown in evidence.stretches:
-        seen = np.isfinite(flown.states[:, RATES])
-        steps += [float(np.median(np.diff(flown.time[one]))) for one in seen.T if np.count_nonzero(one) > 1]
-    return max(steps)
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:

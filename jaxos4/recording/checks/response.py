@@ -26,7 +26,6 @@ from .estimates import BATCHES, Measured, interpolated, peak
 
 Signals = Float[np.ndarray, "samples _signals"]
 
-
 STEP = 0.012  # s; samples of the gyro; shorter ones would show only the start of a filter's response
 LONGEST = 0.034  # s; the longest step
 ORDER = 5  # samples; the memory of the noise model
@@ -37,12 +36,9 @@ PASSES = 4  # of the fit of gains and of the noise model in turn
 FORCE_STEP = 0.004  # s; samples of the accelerometer
 SPECTRUM = 2.0  # s; duration of the samples of one spectrum
 BAND = 2.0, 15.0  # Hz; below are wind and height control; above, the rotors' lag and the gyro's noise leave little
-FORGETS = 2.0
-"""Angle and velocity, on which damping and inflow act, are forgotten with this time constant [s]."""
-GAP = 0.05
-"""The longest gap that is interpolated [s]."""
-SECONDS = 6.0
-"""The shortest flight whose response is measured [s]."""
+FORGETS = 2.0  # s; angle and velocity, on which damping and inflow act, are forgotten with this time constant
+GAP = 0.05  # s; the longest gap that is interpolated
+SECONDS = 6.0  # s; the shortest flight whose response is measured
 
 
 class Response(msgspec.Struct, frozen=True):
@@ -61,10 +57,7 @@ class Response(msgspec.Struct, frozen=True):
     lag: float
 
 
-def rotor_response(
-    stretches: Sequence[Recording],
-    airframe: Airframe,
-) -> Response | None:
+def rotor_response(stretches: Sequence[Recording], airframe: Airframe) -> Response | None:
     """Compare gyro and accelerometer with the rotors. `None`: the flight is too short, too slow, or has no gyro."""
     if sum(float(np.ptp(each.time)) for each in stretches) < SECONDS:
         return None
