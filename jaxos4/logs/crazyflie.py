@@ -6,7 +6,6 @@ Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 import array
 import re
 import zlib
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -32,11 +31,7 @@ _SOURCES = {
     **{(name,): ([f"stateEstimate.{name}"], 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")},
     ("voltage",): (["pm.vbat"], 1.0),
 }
-_ROTORS = (
-    ("rpm.m{}", True, RPM),
-    ("motor.m{}", False, 1 / _FULL),
-    ("pwm.m{}_pwm", False, 1 / _FULL),
-)
+_ROTORS = (("rpm.m{}", True, RPM), ("motor.m{}", False, 1 / _FULL), ("pwm.m{}_pwm", False, 1 / _FULL))
 _AGAIN = "copy it again from the card"
 _REMEDY = f"the log is corrupt there: {_AGAIN}, or choose another"
 _DAMAGED = f"it is corrupt; {_AGAIN}"
@@ -55,7 +50,7 @@ def read_crazyflie(path: LogPath) -> tuple[Table, tuple[str, ...]]:
         refuse(path, "holds no events; a flight needs at least two")
     log = Messages(path, events, _REMEDY, notes, prefixed=False)
     return log.table(
-        {columns: _logged(log, columns, *source) for columns, source in _SOURCES.items()},
+        {columns: log.fastest(columns, [(event, *source) for event in events]) for columns, source in _SOURCES.items()},
         _rotors(log),
         remedies=(
             "add gyro.x, gyro.y and gyro.z to the deck's config.txt",
@@ -73,17 +68,11 @@ CRAZYFLIE = LogFormat(
 )
 
 
-def _logged(
-    log: Messages, columns: Sequence[str], variables: Sequence[str], factor: float | np.ndarray
-) -> Series | None:
-    """The columns that these variables hold, if one event holds them all."""
-    return log.fastest(columns, [(event, variables, factor) for event in log.fields])
-
-
 def _rotors(log: Messages) -> Rotors | None:
     for variable, is_measured, factor in _ROTORS:
         names = [variable.format(i) for i in range(1, 5)]
-        series = _logged(log, SPEED_NAMES if is_measured else COMMAND_NAMES, names, factor)
+        sources = [(event, names, factor) for event in log.fields]  # all four in one event
+        series = log.fastest(SPEED_NAMES if is_measured else COMMAND_NAMES, sources)
         if series is None:
             continue
         series = series if is_measured else Series(series.t, np.clip(series.values, 0.0, 1.0))
