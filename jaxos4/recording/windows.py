@@ -81,16 +81,16 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
 
     A length that does not exceed the flight's own sample time leaves its samples as they are.
     """
-    within = speeds_within(flight.time, flight.omega, held=flight.held)
-    columns = flight.columns()
-    average = averages(flight.time, flight.omega, np.column_stack([*columns.values()]), held=flight.held)
-    found = []
+    columns, found = flight.columns(), []
     for dt in steps:
         if dt <= flight.dt * (1 + _SAME):
-            found.append(flight._replace(within=within(flight.time, flight.dt)))
+            within = speeds_within(flight.time, flight.omega, flight.time, flight.dt, held=flight.held)
+            found.append(flight._replace(within=within))
             continue
-        time, omega, means = average(dt)
-        signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within(time, dt)}
+        channels = np.column_stack([*columns.values()])
+        time, omega, means = averages(flight.time, flight.omega, channels, dt, held=flight.held)
+        within = speeds_within(flight.time, flight.omega, time, dt, held=flight.held)
+        signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within}
         # A mean of n instants has the same variance in time as a continuous mean over this shorter time.
         averaging_time = dt * math.sqrt(1 - (flight.dt / dt) ** 2)
         found.append(flight._replace(**signals, time=time, held=True, averaging_time=averaging_time))

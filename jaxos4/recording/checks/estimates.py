@@ -234,7 +234,7 @@ def _slopes(
             continue
         own = max(step, flown.dt)
         columns = np.hstack([states[:, :3], flown.specific_force, states[:, 3:]])
-        _, _, means = averages(flown.time, flown.omega, columns, held=flown.held)(own)
+        _, _, means = averages(flown.time, flown.omega, columns, own, held=flown.held)
         given, found = vectors(*np.split(means, 3, axis=1), own)
         known = np.isfinite(given).all(axis=1) & np.isfinite(found).all(axis=1)
         if known.any():
