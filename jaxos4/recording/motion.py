@@ -18,6 +18,7 @@ from .sensor_errors import Ups, white_noise
 PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
 
 Signs = tuple[float, ...]
+Vectors = Float[np.ndarray, "samples 3"]
 
 # An axis is excited weakly or well from these standard deviations of its rate on [rad/s], and weakly only if they
 # exceed this many times the gyro's noise.
@@ -199,9 +200,7 @@ LEVELS = 2.0, 8.0
 FORGETS, FORGETS_WITHOUT_ATTITUDE = 20.0, 2.0
 
 
-def velocity_of(
-    recording: Recording, *, forgets: float | None = None
-) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
+def velocity_of(recording: Recording, *, forgets: float | None = None) -> tuple[Vectors, Ups] | None:
     """The motion of a vehicle through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
@@ -250,7 +249,7 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
     axes = np.asarray(airframe.sensor_axes)
     axes = np.where(np.abs(axes) < 1e-12, 0.0, axes)  # of right angles
 
-    def turned(measured: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
+    def turned(measured: Vectors) -> Vectors:
         # A channel that was not measured is missing along the axes to which it contributes, and not along others.
         return np.column_stack([measured[:, row != 0] @ row[row != 0] for row in axes])
 
@@ -259,13 +258,7 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
     return recording._replace(states=states, specific_force=None if force is None else turned(force))
 
 
-def _dead_reckoned(
-    rates: Float[np.ndarray, "samples 3"],
-    force: Float[np.ndarray, "samples 3"],
-    up: Float[np.ndarray, "samples 3"],
-    dt: float,
-    forgets: float,
-) -> Float[np.ndarray, "samples 3"]:
+def _dead_reckoned(rates: Vectors, force: Vectors, up: Vectors, dt: float, forgets: float) -> Vectors:
     """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays."""
     push = force - GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
@@ -280,9 +273,7 @@ def _dead_reckoned(
     return np.array(velocities)
 
 
-def _upright(
-    rates: Float[np.ndarray, "samples 3"], force: Float[np.ndarray, "samples 3"], dt: float, level: float
-) -> Float[np.ndarray, "samples 3"]:
+def _upright(rates: Vectors, force: Vectors, dt: float, level: float) -> Vectors:
     """The upright direction: fixed in the earth, and drawn to the specific force with the time constant `level` [s]."""
     x, y, z, turn, directions = 0.0, 0.0, 1.0, dt / level, []
     drawn = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-3)
