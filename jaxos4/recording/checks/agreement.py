@@ -38,8 +38,8 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
         steps += [float(np.median(np.diff(each))) for each in measured if each.size > 1]
     if turns is None or max(steps) > SLOW_GYRO:
         return None
-    matrix, error = turns.matrix.value, np.diagonal(turns.matrix.error)
-    clear = np.abs(matrix) > STANDARD_ERRORS * turns.matrix.error  # others only add noise
+    matrix, errors = turns.matrix
+    clear, error = np.abs(matrix) > STANDARD_ERRORS * errors, np.diagonal(errors)  # others only add noise
     scale = np.linalg.norm(np.where(clear | np.eye(3, dtype=bool), matrix, 0.0), axis=1)
     judged = (error < 0.3 * scale) & (turns.explained > FOLLOWS)
     far = np.abs(np.log(np.where(judged, scale, 1.0))) > math.log1p(SCALE)
@@ -70,7 +70,7 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
     """The cause if the attitude is right: the gyro or the time stamps. A measured velocity tells them apart."""
     if evidence.velocity is not None:
-        slope, unlike = float(evidence.velocity.value[0]), VELOCITY_ERROR
+        slope, unlike = float(evidence.velocity[0, 0]), VELOCITY_ERROR
         if abs(slope / scale - 1) < unlike < abs(slope - 1):
             return "the time stamps are wrong, as the velocity changes by as much"
         if abs(slope - 1) < unlike < abs(slope / scale - 1):
@@ -83,7 +83,7 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     turns = evidence.turns
     if turns is None:
         return None
-    matrix, error = turns.matrix.value, STANDARD_ERRORS * turns.matrix.error
+    matrix, error = turns.matrix[0], STANDARD_ERRORS * turns.matrix[1]
     opposite = [axis for axis, m, e in zip(MOTIONS, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
     tilts = matrix[:2, :2]
     follows = float(turns.explained[:2].max())
@@ -164,11 +164,11 @@ def _delays(evidence: Evidence) -> tuple[list[tuple[tuple[int, int, int, int], f
     turns, response = evidence.turns, evidence.response
     delays, differ = [], False
     if turns is not None and turns.explained[:2].max() > FOLLOWS:
-        late, error = float(turns.delay.value), float(turns.delay.error)
+        late, error = turns.delay.tolist()
         delays.append(((-1, 0, 1, 0), late, math.hypot(error, FILTERS)))
         differ |= abs(late) > max(LATE_ATTITUDE, STANDARD_ERRORS * error)
     if response is not None and response.explained[:2].max() > EXPLAINED[0]:
-        gyro, _, between = zip(response.delays.value.tolist(), response.delays.error.tolist(), strict=True)
+        gyro, _, between = response.delays.T.tolist()
         answered = ANSWERED * (1 - float(response.explained[:2].mean()))
         late, usual = _beyond(gyro[0], answered), DAMPING
         if response.lag:  # commands: the rotors' own lag and delay are unknown
@@ -197,7 +197,7 @@ def velocity_axes(evidence: Evidence) -> Finding | None:
     slopes = evidence.velocity
     if slopes is None:
         return None
-    (along, across), errors = slopes.value, STANDARD_ERRORS * slopes.error
+    (along, across), errors = slopes[0], STANDARD_ERRORS * slopes[1]
     angle, scale = math.atan2(across, along), math.hypot(along, across)
     turned = abs(angle) > ANGLE and abs(across) > errors[1] and scale > errors.max()
     if not turned and abs(scale - 1) <= max(VELOCITY_ERROR, errors[0]):

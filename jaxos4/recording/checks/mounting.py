@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..._custom_types import Numeric
 from ...airframe import GRAVITY, INERTIAS, YAW
 from ...rotations import angles_of, rotation
-from .estimates import BATCHES, Measured, batched
+from .estimates import BATCHES, Measured, batched, jackknife
 from .evidence import EXPLAINED, STANDARD_ERRORS, Evidence, Finding
 
 ANGLE = 0.14  # rad about the vertical axis; 20 degrees change inertias by 8 %, 8 degrees by 1 %
@@ -81,9 +81,8 @@ def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     response = evidence.response
     if response is None or response.explained[:2].sum() < EXPLAINED[0]:
         return None
-    sizes = np.hypot(*response.turning.value)
-    (a, b), (c, d) = response.turning.value / sizes
-    errors = response.turning.error / sizes
+    turning, errors = response.turning / np.hypot(*response.turning[0])
+    (a, b), (c, d) = turning
     apart = abs(math.remainder(math.atan2(-c, a) - math.atan2(b, d), math.tau))
     across = math.hypot(errors[0, 1], errors[1, 0])
     if not apart < max(SAME_ANGLE, STANDARD_ERRORS * across) or across > UNCERTAIN:
@@ -96,8 +95,9 @@ def _by_attitude(evidence: Evidence) -> tuple[float, float] | None:
     turns = evidence.turns
     if turns is None:
         return None
-    (a, b), (c, d) = turns.matrix.value[:2, :2]
-    size, error = math.sqrt(abs(a * d - b * c)), math.hypot(turns.matrix.error[0, 1], turns.matrix.error[1, 0])
+    matrix, errors = turns.matrix[:, :2, :2]
+    (a, b), (c, d) = matrix
+    size, error = math.sqrt(abs(a * d - b * c)), math.hypot(errors[0, 1], errors[1, 0])
     if a * d < b * c or error >= size:
         return None
     return math.atan2(c - b, a + d), error / (2 * size)
@@ -110,7 +110,7 @@ def earth_axes(evidence: Evidence) -> Finding | None:
     """Specific force along the axes of the earth: its horizontal part follows the tilt."""
     if evidence.tilt is None:
         return None
-    slope, error = float(evidence.tilt.value[0]), float(evidence.tilt.error[0])
+    slope, error = evidence.tilt[:, 0].tolist()
     if slope < max(ALONG_EARTH, STANDARD_ERRORS * error):
         return None
     return Finding(
@@ -236,9 +236,9 @@ def different_thrust(every: Sequence[Evidence]) -> Finding | None:
         ratios = [ratio for evidence in every if (ratio := _thrust_ratio(evidence)) is not None]
     if len(ratios) < 2:
         return None
-    least, most = (choose(ratios, key=lambda ratio: float(ratio.value)) for choose in (min, max))
-    apart = float(most.value / least.value) - 1
-    error = STANDARD_ERRORS * np.hypot(least.error / least.value, most.error / most.value)
+    least, most = (choose(ratios, key=lambda ratio: float(ratio[0])) for choose in (min, max))
+    apart = float(most[0] / least[0]) - 1
+    error = STANDARD_ERRORS * np.hypot(least[1] / least[0], most[1] / most[0])
     commanded = any(evidence.logged.commanded for evidence in every)
     if apart < max(VEHICLES, error):
         return None
@@ -265,4 +265,4 @@ def _thrust_ratio(evidence: Evidence) -> Measured | None:
     both = np.concatenate(every)
     if len(both) < BATCHES or both.mean(axis=0).min() <= 0:
         return None
-    return Measured.of(batched(both), lambda sums: sums[0] / sums[1])
+    return jackknife(batched(both), lambda sums: sums[0] / sums[1])
