@@ -174,26 +174,24 @@ def _cleaned(
     name, facts = recording.name, recording.facts
     if np.isnan(recording.states[:, RATES]).all(axis=0).any():
         raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
-    found = [msgspec.structs.replace(each, cause=f"{name}: {each.cause}") for each in findings(evidence)]
-    judged = [
-        each
-        for each in found
-        if {*each.quantities} & {*INERTIAS} or (each.contradicted and each.quantities != ("attitude",))
-    ]
-    notes = [str(each) for each in found if each not in judged]
     slow = (facts._replace(gyro=None) if predicted else facts).too_slow
     usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
     if slow:
         raise InputError(f"{name}: {slow}.")
+    opposite = opposite_axes(usable, airframe)
+    if refused := refused_note(opposite):
+        raise InputError(f"{name}: {refused}.")
+    notes, judged = [], []
+    for found in filter(None, (*findings(evidence), opposite_yaw(opposite.get("yaw")))):
+        found = msgspec.structs.replace(found, cause=f"{name}: {found.cause}")
+        if {*found.quantities} & {*INERTIAS} or (found.contradicted and found.quantities != ("attitude",)):
+            judged.append(found)
+        else:
+            notes.append(str(found))
     if limited := at_limit(evidence.recording, airframe):
         notes.append(limited)
     if begin is None and (recovered := end_of_tumble(evidence.recording, airframe)) is not None:
         notes.append(f"{name}: tumbles at launch until {recovered:.1f} s (`begin` {recovered:.1f} leaves this out)")
-    opposite = opposite_axes(usable, airframe)
-    if refused := refused_note(opposite):
-        raise InputError(f"{name}: {refused}.")
-    if yaw := opposite_yaw(opposite.get("yaw")):
-        judged.append(msgspec.structs.replace(yaw, cause=f"{name}: {yaw.cause}"))
     return usable, [*notes, *recording.named_notes, *note], judged
 
 
