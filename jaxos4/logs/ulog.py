@@ -39,7 +39,6 @@ _BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
 _OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other units
 _REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 
-
 # By the protocol of the motors' outputs: the values at idle and at full speed; parameters that hold other values, and
 # the limits of these.
 _PROTOCOLS: dict[str, tuple[tuple[float, float], tuple[str, ...], tuple[float, float]]] = {

@@ -70,7 +70,6 @@ _RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
 PITCH = {"theta": ColumnLimits("rad", -_RIGHT_ANGLE, _RIGHT_ANGLE, _PITCH)}
 """The pitch of a log: one that was not read from a file may be any number."""
 
-
 _RESTART = 0.1  # s; a rotor that has stopped needs longer to turn again
 
 

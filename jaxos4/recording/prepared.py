@@ -27,7 +27,6 @@ HOLDOUT = 0.25
 _NEARLY = 1.01  # sample times that differ by less than this factor count as equal
 _SAME = 1e-6  # durations that differ by less than this share are equal
 
-
 WINDOW = 0.25  # s
 MIN_SAMPLES = 4  # of a window
 # The shortest sample by default [s]. A fast controller responds to single rows of a log, which a mean does not hold: in

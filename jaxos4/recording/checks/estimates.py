@@ -19,7 +19,6 @@ _STEP, _SPAN, _SHIFTS = 0.01, 0.1, np.arange(-50, 51)
 
 Pair = tuple[np.ndarray, np.ndarray]
 
-
 Measured = Float[np.ndarray, "2 ..."]
 """Numbers that follow from the log, and then their standard errors."""
 
