@@ -157,33 +157,16 @@ def _settings_above(path: LogPath) -> tuple[Settings, int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _sessions(path: LogPath) -> list[tuple[Settings, bytes]]:
-    """The settings and the frames of each session. A header ends before a line without `H `, or that is not text."""
-    content, found = read_bytes(path, 1 << 29), []  # more than an hour of flight
-    places = [match.start() for match in re.finditer(_MAGIC, content)]
-    for at, end in itertools.pairwise([*places, len(content)]):
-        settings: Settings = {}
-        while content.startswith(b"H ", at, end):
-            stop = content.find(b"\n", at, min(at + _LONGEST_HEADER[1], end))
-            line = content[at:stop]
-            if stop < 0 or not line.isascii():
-                break
-            name, _, value = line[2:].decode().partition(":")
-            settings.setdefault(name.strip(), value.strip())
-            at = stop + 1
-        found.append((settings, content[at:end]))
-    return found
-
-
 def _decoded(path: LogPath, *, between: float = 1.0) -> _Log:
     """A `.bbl` or `.BFL` file: all sessions, with a time `between` [s] them. Raises `InputError`."""
     notes: list[str] = []
     found: list[tuple[Settings, Columns]] = []
-    every = _sessions(path)
-    for number, (settings, frames) in enumerate(every, start=1):
-        columns, remark = _session(settings, frames)
+    content = read_bytes(path, 1 << 29)  # more than an hour of flight
+    places = [match.start() for match in re.finditer(_MAGIC, content)]
+    for number, (begin, end) in enumerate(itertools.pairwise([*places, len(content)]), start=1):
+        settings, columns, remark = _session(content[begin:end])
         if remark:
-            notes.append((f"session {number}: " if len(every) > 1 else "") + remark)
+            notes.append((f"session {number}: " if len(places) > 1 else "") + remark)
         if columns is not None:
             found.append((settings, columns))
     if not found:
@@ -205,19 +188,31 @@ def _decoded(path: LogPath, *, between: float = 1.0) -> _Log:
     return _Log(path, longest, joined, notes=notes)
 
 
-def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
-    """The columns of one session with the time from 0, or `None`, and a remark on what is lost."""
+def _session(content: bytes) -> tuple[Settings, Columns | None, str]:
+    """The settings and the columns of one session with the time from 0, or `None`, and a remark on what is lost.
+
+    Its header ends before a line that has no `H `, or is not text.
+    """
+    settings, at = {}, 0
+    while content.startswith(b"H ", at):
+        stop = content.find(b"\n", at, at + _LONGEST_HEADER[1])
+        line = content[at:stop]
+        if stop < 0 or not line.isascii():
+            break
+        name, _, value = line[2:].decode().partition(":")
+        settings.setdefault(name.strip(), value.strip())
+        at = stop + 1
     try:
-        columns, damaged, ended = decode_frames(settings, frames, _RAW)
+        columns, damaged, ended = decode_frames(settings, content[at:], _RAW)
     except BadHeader as error:
-        return None, f"{error}: it is ignored"
+        return settings, None, f"{error}: it is ignored"
     later = in_order(columns["time"])
     if later is None or np.count_nonzero(later) < 2:
-        return None, "holds no frames that can be decoded: it is ignored"
+        return settings, None, "holds no frames that can be decoded: it is ignored"
     damage = f"is damaged in {counted(damaged, 'place')}; what follows up to the next complete frame is ignored"
     end = "has no end: it was cut while it was written, or is corrupt"
     remarks = [damage] * (damaged > 0) + [end] * (not ended)
-    return {name: column[later] for name, column in columns.items()}, "; ".join(remarks)
+    return settings, {name: column[later] for name, column in columns.items()}, "; ".join(remarks)
 
 
 def _add_rates(log: _Log) -> None:

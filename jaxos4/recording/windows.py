@@ -82,12 +82,12 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
     A length that does not exceed the flight's own sample time leaves its samples as they are.
     """
     columns, found = flight.columns(), []
+    channels = np.column_stack([*columns.values()])
     for dt in steps:
         if dt <= flight.dt * (1 + _SAME):
             within = speeds_within(flight.time, flight.omega, flight.time, flight.dt, held=flight.held)
             found.append(flight._replace(within=within))
             continue
-        channels = np.column_stack([*columns.values()])
         time, omega, means = averages(flight.time, flight.omega, channels, dt, held=flight.held)
         within = speeds_within(flight.time, flight.omega, time, dt, held=flight.held)
         signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within}
