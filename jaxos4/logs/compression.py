@@ -35,11 +35,11 @@ def check_sizes(path: LogPath) -> None:
             continue
         if each.parent == place and not each.is_file():
             refuse(each, "is a pipe or a device in the folder of a bag; remove it")
-        if each.name == "metadata.yaml":
-            _check_metadata(each)
         with opened(each, "rb") as file:
             begin = file.read(8)
-            if begin.startswith(_MCAP):
+            if each.name == "metadata.yaml":
+                _check_metadata(each, begin + file.read(MAX_METADATA))
+            elif begin.startswith(_MCAP):
                 _check_mcap(path, file, end=1 << 62)
             elif begin == b"#ROSBAG ":
                 file.readline()
@@ -49,10 +49,8 @@ def check_sizes(path: LogPath) -> None:
                 _check_whole(each, file)
 
 
-def _check_metadata(path: Path) -> None:
+def _check_metadata(path: Path, content: bytes) -> None:
     """Refuse a text in YAML that is too long or refers to itself: lists of its own lists could have any length."""
-    with opened(path, "rb") as file:
-        content = file.read(MAX_METADATA + 1)
     if len(content) > MAX_METADATA:
         refuse(path, f"has more than {MAX_METADATA:,} bytes; make it anew by `ros2 bag reindex`")
     if re.search(rb"[:,[{-]\s*[*&]\w", content):
