@@ -27,7 +27,7 @@ from .table import MAX_ROWS, LogFormat, LogPath, Table, listed, opened, quoted, 
 _ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"rosbag2_bagfile_information:"
 _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it
 _FIELD = re.compile(r"[^.\[\]]+")
-_STAMPS = (("timestamp_sample", 1000), ("timestamp", 1000))  # of PX4, and their unit [ns]
+_STAMPS = ("timestamp_sample", "timestamp")  # of PX4 [us]
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
 _REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
 _LONGEST_DEFINITIONS = 1 << 16  # characters: usual definitions have a few thousand, and their parser is slow
@@ -146,7 +146,7 @@ def _messages(
     for place in sorted(places):
         topic, _, field = place.partition(".")
         getters.setdefault(topic, {})[place] = _getter(path, place, field)
-    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in getters}
+    logged: dict[str, list[list[float]]] = {topic: [[] for _ in range(2 + len(getters[topic]))] for topic in getters}
     wanted = [each for each in reader.connections if each.topic in getters]
     with _damage(path):
         decode = _decoder(path, wanted, ros1=type(reader).__module__.startswith("rosbags.rosbag1"))
@@ -154,9 +154,11 @@ def _messages(
             if number > MAX_ROWS:
                 refuse(path, f"has more than {MAX_ROWS:,} messages of these topics; cut it into flights")
             message, topic = decode(content, connection.msgtype), connection.topic
-            values = [get(message) for get in getters[topic].values()]
-            rows[topic].append((float(at), _stamp(message), *values))  # in SQLite, a time can be of any type
-    every = {topic: [*zip(*each, strict=True)] for topic, each in rows.items() if each}
+            # In SQLite, a time can be of any type.
+            values = float(at), _stamp(message), *(get(message) for get in getters[topic].values())
+            for column, value in zip(logged[topic], values, strict=True):
+                column.append(value)
+    every = {topic: columns for topic, columns in logged.items() if columns[0]}
     times = [(np.array(at, float), np.array(stamps, float)) for at, stamps, *_ in every.values()]
     apart = [float(np.median(stamps - at)) for at, stamps in times]
     stamped = all((stamps > 0).all() for _, stamps in times)
@@ -221,7 +223,7 @@ def _stamp(message: Any) -> int:
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is not None:
         return stamp.sec * 10**9 + stamp.nanosec
-    return next((t * unit for name, unit in _STAMPS if (t := getattr(message, name, 0))), 0)
+    return next((1000 * t for name in _STAMPS if (t := getattr(message, name, 0))), 0)
 
 
 def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[Table, tuple[str, ...]]:
