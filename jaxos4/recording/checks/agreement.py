@@ -64,7 +64,7 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
     which = "" if far.sum() == judged.sum() else f" in {' and '.join(np.array(MOTIONS)[far])}"
     axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(MOTIONS, scale, error, judged, strict=True) if j]
     cause = f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}"
-    return Finding(name, cause, ", ".join(axes), remedy, quantities, True)
+    return Finding(name, cause, ", ".join(axes), remedy, quantities)
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
@@ -102,7 +102,7 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     else:
         cause, size = "roll and pitch of attitude and gyro are exchanged", f"slope {matrix[0, 1]:.2f}"
     remedy = "give both with x forward, y left, z up; angles in the order of docs/logs.md"
-    return Finding("attitude_axes", cause, size, remedy, _ATTITUDE, True)
+    return Finding("attitude_axes", cause, size, remedy, _ATTITUDE)
 
 
 LIKELIER = 6.0  # of chi^2: a clock 20 times less likely to be wrong than another is not named
@@ -217,5 +217,4 @@ def velocity_axes(evidence: Evidence) -> Finding | None:
         f"{scale:.2f} times as much, turned by {math.degrees(angle):.0f} degrees",
         "give the velocity along the earth's axes that the attitude refers to, in m/s",
         ("thrust", "attitude", "damping"),
-        True,
     )

@@ -32,7 +32,6 @@ def uneven_time(evidence: Evidence) -> Finding | None:
         size,
         "write the flight to a CSV and read it with `jaxos4.recording.read_recording`, which resamples it",
         (*INERTIAS, "thrust", "motors", "damping", "attitude"),
-        True,
     )
 
 
@@ -87,7 +86,6 @@ def constant_force(evidence: Evidence) -> Finding | None:
         f"{measured[0]:.4g} m/s^2 in all {measured.size} samples",
         "log what the accelerometer measures, or leave its columns out",
         ("thrust", *INERTIAS),
-        True,
     )
 
 
@@ -121,7 +119,6 @@ def rare_motors(evidence: Evidence) -> Finding | None:
         f"new values every {1e3 * evidence.motor_step:.0f} ms",
         "log motors at 100 Hz or more, on board",
         ("damping",),
-        True,
     )
 
 

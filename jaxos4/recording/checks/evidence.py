@@ -41,7 +41,7 @@ class Finding(msgspec.Struct, frozen=True):
     size: str
     remedy: str
     quantities: tuple[str, ...]
-    contradicted: bool
+    contradicted: bool = True
 
     def __str__(self) -> str:
         return f"{self.cause} ({self.size}); {self.remedy}"

@@ -45,7 +45,7 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     if quantities != ("attitude",):
         turn = rotation(np.array([0.0, 0.0, angle[0]]))
         remedy = f"{_rotation_for(evidence, turn)}: counter-clockwise seen from above"
-    return Finding("mounting", cause, ways, remedy, quantities, True)
+    return Finding("mounting", cause, ways, remedy, quantities)
 
 
 def _rotation_for(evidence: Evidence, turn: Float[Numeric, "3 3"]) -> str:
@@ -68,7 +68,6 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
         "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
         "all four signs",
         (YAW.inertia,),
-        True,
     )
 
 
@@ -120,7 +119,6 @@ def earth_axes(evidence: Evidence) -> Finding | None:
         "axes of the earth, 0 or less along those of the body",
         "log the accelerometer along the body's axes, or turn it by the attitude",
         ("thrust", *INERTIAS),
-        True,
     )
 
 
@@ -158,7 +156,6 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
         f"{math.degrees(tilt):.0f} degrees, along {along}" + ("" if rest is None else ", at rest before take-off"),
         f"log x forward, y left, z up, or {_rotation_for(evidence, level)}: the angle about z is not known",
         ("thrust", *INERTIAS),
-        True,
     )
 
 
