@@ -90,15 +90,10 @@ def column_map(given: ColumnsGiven) -> ColumnMap:
             refuse(name, f"neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}")
         if not table:
             refuse(name, "names no column; a column map has a table [columns]")
-    return _checked(name, table, needed=name not in PRESETS)
-
-
-def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
-    """The map in the table of a file; its presets are not `needed`."""
     columns = table.pop("columns", {})
     settings = {"preset": ("", *PRESETS), "frame": ("FLU", "FRD"), "time": ("stamp", "recorded")}
-    preset, frame, time = given = [table.pop(key, values[0]) for key, values in settings.items()]
-    for (key, values), value in zip(settings.items(), given, strict=True):
+    preset, frame, time = chosen = [table.pop(key, values[0]) for key, values in settings.items()]
+    for (key, values), value in zip(settings.items(), chosen, strict=True):
         if value not in values:
             refuse(name, f"{key} is {quoted(str(value))}; give one of {', '.join(filter(None, values))}")
     if table or not isinstance(columns, dict):
@@ -108,7 +103,8 @@ def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
     sources = begin.sources | {column: _source(name, column, value) for column, value in columns.items()}
     for column in _TURNED & (columns.keys() if preset else _TURNED) if frame == "FRD" else ():
         sources[column] = sources[column]._replace(factor=-sources[column].factor)
-    return ColumnMap(quoted(name), sources, frozenset(columns) if needed else frozenset(), time == "recorded")
+    needed = () if name in PRESETS else columns
+    return ColumnMap(quoted(name), sources, frozenset(needed), time == "recorded")
 
 
 def _source(name: str, column: str, value: Any) -> ColumnSource:
