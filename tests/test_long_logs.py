@@ -8,12 +8,12 @@ from helpers import CRAZYFLIE
 
 from jaxos4.flight import RATES
 from jaxos4.logs.values import plausible
-from jaxos4.recording import Recording, richest
+from jaxos4.recording import Recording, prepared, windows
 from jaxos4.recording.checks import Evidence
 from jaxos4.recording.inspection import inspect_log
 from jaxos4.recording.prepared import finest, prepare
-from jaxos4.recording.richest import fair_share
 from jaxos4.recording.stretches import Stretch
+from jaxos4.recording.windows import fair_share, richest
 from jaxos4.report.log_figures import logged, spectra
 
 DT, HOVER = 0.01, float(CRAZYFLIE.hover_speed)
@@ -43,12 +43,13 @@ def log(seconds=600.0, *, manoeuvres=(), name="long.csv", ground=3.0, seed=0):
 
 @pytest.fixture
 def two_minutes(monkeypatch):
-    monkeypatch.setattr(richest, "MOST", round(120 / DT))
+    for module in (windows, prepared):
+        monkeypatch.setattr(module, "MOST", round(120 / DT))
 
 
 def test_the_parts_of_a_long_log_that_excite_each_axis_are_fitted(two_minutes):
     ready = prepare([log(manoeuvres=MANOEUVRES)], CRAZYFLIE, sample_time=DT, holdout=0.0)[0]
-    assert 0.9 * richest.MOST < ready.fitted.time.shape[0] <= richest.MOST
+    assert 0.9 * windows.MOST < ready.fitted.time.shape[0] <= windows.MOST
     for begin, end, _, _ in MANOEUVRES.values():
         assert np.count_nonzero((ready.time > begin) & (ready.time < end)) > 0.99 * (end - begin) / DT
     (note,) = (each for each in ready.notes if "torques vary" in each)
@@ -80,7 +81,7 @@ def test_checks_and_inspection_see_the_parts_that_are_fitted(two_minutes):
     seconds = fair_share([long], finest(DT))
     assert seconds == 120
     evidence, whole = Evidence(long, CRAZYFLIE, seconds=seconds), Evidence(long, CRAZYFLIE)
-    assert sum(each.time.size for each in evidence.stretches) <= richest.MOST + len(evidence.stretches)
+    assert sum(each.time.size for each in evidence.stretches) <= windows.MOST + len(evidence.stretches)
     assert sum(each.time.size for each in whole.stretches) > 590 / DT
     np.testing.assert_array_equal(evidence.rest, whole.rest)  # before take-off, which is not fitted
     assert evidence.rest is not None
@@ -89,7 +90,7 @@ def test_checks_and_inspection_see_the_parts_that_are_fitted(two_minutes):
 
 def test_equal_parts_are_taken_in_the_order_of_time_and_as_one():
     calm = log()
-    (chosen,) = richest.richest(calm, [Stretch(10, 590)], np.asarray(CRAZYFLIE.mixer)[:3], 120.0)
+    (chosen,) = richest(calm, [Stretch(10, 590)], np.asarray(CRAZYFLIE.mixer)[:3], 120.0)
     assert chosen == Stretch(10, 126)
 
 
@@ -107,7 +108,7 @@ def test_each_of_many_logs_is_fitted(two_minutes):
     logs = [log(20, name=f"{i}.csv", seed=i, ground=0.0) for i in range(30)]
     ready = prepare(logs, CRAZYFLIE, sample_time=DT, holdout=0.0)[0]
     assert {*ready.recordings} == {*range(30)}
-    assert ready.fitted.time.shape[0] <= richest.MOST
+    assert ready.fitted.time.shape[0] <= windows.MOST
 
 
 @pytest.mark.parametrize("what", ["values", "signals", "spectra"])

@@ -3,6 +3,7 @@
 Each log format is one file and one line in `FORMATS`, or an entry point of another package in `jaxos4.log_formats`.
 """
 
+import contextlib
 import os
 import re
 import warnings
@@ -150,21 +151,18 @@ def log_format(path: LogPath) -> LogFormat:
         begin = file.read(_BEGIN) if file.seekable() else b""
     # An archive may begin with a log that it holds without compression.
     formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1]
-    kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin) or FORMATS[-1]
-    unread = (each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL))
-    if kind is FORMATS[-1] and (known := next(unread, None) or (_TOML if _is_toml(source, begin) else None)):
-        what, remedy = known
+    kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin)
+    if kind is not None:
+        return kind
+    unread = [each for magic, each in _UNREAD.items() if re.match(magic, begin, re.DOTALL)]
+    with contextlib.suppress(InputError):  # no rows of a CSV are TOML
+        if not unread and 0 < len(begin) < _BEGIN and read_toml(source):
+            unread = [_TOML]
+    if unread:
+        what, remedy = unread[0]
         labels = ", ".join((*(each.label for each in FORMATS), *_OTHERS))
         refuse(path, f"is {what}; {remedy}. Logs that are read: {labels}")
-    return kind
-
-
-def _is_toml(path: LogPath, begin: bytes) -> bool:
-    """Whether a file that begins with these bytes is short and holds a table of TOML. No rows of a CSV are TOML."""
-    try:
-        return 0 < len(begin) < _BEGIN and bool(read_toml(path))
-    except InputError:
-        return False
+    return FORMATS[-1]
 
 
 def _of_others(begin: bytes) -> LogFormat | None:

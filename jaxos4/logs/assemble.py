@@ -123,7 +123,17 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
         table.refuse(what, column=lacking)
     if speeds and commands:
         notes.append(f"measured {speeds[0]}..{speeds[-1]} are used; {', '.join(commands)} are ignored")
-    omega = np.column_stack([_held(table, name, notes) for name in names])
+    omega, t = np.column_stack([table.columns[name] for name in names]), table.columns["t"]
+    for name, column in zip(names, omega.T, strict=True):
+        empty = np.isnan(column)
+        if not empty.any():
+            continue
+        # A cell gets the value before it; an impossible first one gets the next.
+        last, cells = last_measured(~empty), int(np.count_nonzero(empty)) - table.impossible.get(name, (0, ""))[0]
+        if cells:
+            filled = f"filled with the value before, for up to {(t - t[last]).max():.3g} s"
+            notes.append(f"{name}: {counted(cells, 'empty cell')} {filled}")
+        column[:] = column[last]
     if speeds:
         return omega
     known = np.inf if airframe is None else float(airframe.max_rotor_speed)
@@ -133,19 +143,6 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
         what = "the rotor speed of full command is not known; set max_rotor_speed [rad/s] in the airframe's TOML file"
         table.refuse(what, column=names[0])
     return omega * full_scale
-
-
-def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
-    """The column of a rotor. An empty or impossible cell gets the value before it; an impossible first one the next."""
-    column, t = table.columns[name], table.columns["t"]
-    empty = np.isnan(column)
-    if not empty.any():
-        return column
-    last, cells = last_measured(~empty), int(np.count_nonzero(empty)) - table.impossible.get(name, (0, ""))[0]
-    if cells:
-        filled = f"filled with the value before, for up to {(t - t[last]).max():.3g} s"
-        notes.append(f"{name}: {counted(cells, 'empty cell')} {filled}")
-    return column[last]
 
 
 def _measured(table: Table, notes: list[str]) -> dict[str, np.ndarray]:

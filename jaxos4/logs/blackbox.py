@@ -6,11 +6,11 @@ and INAV.
 
 import contextlib
 import csv
+import dataclasses
 import itertools
 import math
 import re
 import struct
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,7 +60,8 @@ Settings = dict[str, str]
 Columns = dict[str, np.ndarray]
 
 
-class _Log(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Log:
     """A blackbox log: its columns `raw` and its `settings`; our `columns` and their `names` in the log; `notes`.
 
     - `header`: the row of the CSV's header; `None` for a log that was not decoded.
@@ -68,26 +69,19 @@ class _Log(NamedTuple):
     """
 
     path: LogPath
-    header: int | None
     settings: Settings
     raw: Columns
-    columns: Columns
-    names: dict[str, str]
-    notes: list[str]
-    converted: dict[str, tuple[str, float]]
+    header: int | None = None
+    converted: dict[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    columns: Columns = dataclasses.field(default_factory=dict)
+    names: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def add(self, names: dict[str, str], factor: float) -> None:
         """Add columns, by the log's names of them. `factor`: of raw values."""
         for column, name in names.items():
             self.names[column], unit = self.converted.get(name, (name, factor))
             self.columns[column] = self.raw[name] * unit
-
-    def vector(self, name: str, count: int) -> np.ndarray | None:
-        """The fields `name[0]`, ..., shape (rows, count), if all were logged and they change."""
-        names = items(name, count)
-        if not self.raw.keys() >= set(names) or not any(np.ptp(_finite(self.raw[each])) for each in names):
-            return None
-        return np.column_stack([self.raw[each] for each in names])
 
     def setting(self, name: str, least: float, most: float) -> float | None:
         """A setting, or the last of several, if it is a number within these limits. 0x: the bits of a float."""
@@ -112,7 +106,7 @@ def read_blackbox(path: LogPath) -> tuple[Table, tuple[str, ...]]:
         logged = {name: column for name, column in columns.items() if not np.isnan(column).all()}
         converted = {own: (name, unit) for name, (own, unit) in _CONVERTED.items() if name in logged}
         raw = logged | {own: logged[name] for own, (name, _) in converted.items()}
-        log = _Log(path, skip + 1, settings, raw, {}, {}, [], converted)
+        log = _Log(path, settings, raw, skip + 1, converted)
     raw, first_row = log.raw, None if log.header is None else log.header + 1
     if "time" not in raw:
         refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
@@ -163,33 +157,16 @@ def _settings_above(path: LogPath) -> tuple[Settings, int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _sessions(path: LogPath) -> list[tuple[Settings, bytes]]:
-    """The settings and the frames of each session. A header ends before a line without `H `, or that is not text."""
-    content, found = read_bytes(path, 1 << 29), []  # more than an hour of flight
-    places = [match.start() for match in re.finditer(_MAGIC, content)]
-    for at, end in itertools.pairwise([*places, len(content)]):
-        settings: Settings = {}
-        while content.startswith(b"H ", at, end):
-            stop = content.find(b"\n", at, min(at + _LONGEST_HEADER[1], end))
-            line = content[at:stop]
-            if stop < 0 or not line.isascii():
-                break
-            name, _, value = line[2:].decode().partition(":")
-            settings.setdefault(name.strip(), value.strip())
-            at = stop + 1
-        found.append((settings, content[at:end]))
-    return found
-
-
 def _decoded(path: LogPath, *, between: float = 1.0) -> _Log:
     """A `.bbl` or `.BFL` file: all sessions, with a time `between` [s] them. Raises `InputError`."""
     notes: list[str] = []
     found: list[tuple[Settings, Columns]] = []
-    every = _sessions(path)
-    for number, (settings, frames) in enumerate(every, start=1):
-        columns, remark = _session(settings, frames)
+    content = read_bytes(path, 1 << 29)  # more than an hour of flight
+    places = [match.start() for match in re.finditer(_MAGIC, content)]
+    for number, (begin, end) in enumerate(itertools.pairwise([*places, len(content)]), start=1):
+        settings, columns, remark = _session(content[begin:end])
         if remark:
-            notes.append((f"session {number}: " if len(every) > 1 else "") + remark)
+            notes.append((f"session {number}: " if len(places) > 1 else "") + remark)
         if columns is not None:
             found.append((settings, columns))
     if not found:
@@ -208,22 +185,34 @@ def _decoded(path: LogPath, *, between: float = 1.0) -> _Log:
         columns["time"] += begin
         begin = columns["time"][-1] + 1e6 * between
     joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
-    return _Log(path, None, longest, joined, {}, {}, notes, {})
+    return _Log(path, longest, joined, notes=notes)
 
 
-def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
-    """The columns of one session with the time from 0, or `None`, and a remark on what is lost."""
+def _session(content: bytes) -> tuple[Settings, Columns | None, str]:
+    """The settings and the columns of one session with the time from 0, or `None`, and a remark on what is lost.
+
+    Its header ends before a line that has no `H `, or is not text.
+    """
+    settings, at = {}, 0
+    while content.startswith(b"H ", at):
+        stop = content.find(b"\n", at, at + _LONGEST_HEADER[1])
+        line = content[at:stop]
+        if stop < 0 or not line.isascii():
+            break
+        name, _, value = line[2:].decode().partition(":")
+        settings.setdefault(name.strip(), value.strip())
+        at = stop + 1
     try:
-        columns, damaged, ended = decode_frames(settings, frames, _RAW)
+        columns, damaged, ended = decode_frames(settings, content[at:], _RAW)
     except BadHeader as error:
-        return None, f"{error}: it is ignored"
+        return settings, None, f"{error}: it is ignored"
     later = in_order(columns["time"])
     if later is None or np.count_nonzero(later) < 2:
-        return None, "holds no frames that can be decoded: it is ignored"
+        return settings, None, "holds no frames that can be decoded: it is ignored"
     damage = f"is damaged in {counted(damaged, 'place')}; what follows up to the next complete frame is ignored"
     end = "has no end: it was cut while it was written, or is corrupt"
     remarks = [damage] * (damaged > 0) + [end] * (not ended)
-    return {name: column[later] for name, column in columns.items()}, "; ".join(remarks)
+    return settings, {name: column[later] for name, column in columns.items()}, "; ".join(remarks)
 
 
 def _add_rates(log: _Log) -> None:
@@ -231,20 +220,16 @@ def _add_rates(log: _Log) -> None:
     if field is None:
         refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
     names = dict(zip(RATE_NAMES, items(field, 3), strict=True))
-    fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
-    log.notes.extend([] if log.settings or names["p"] in log.converted else [f"{field} is taken as deg/s: {fine}"])
-    unit = _gyro_unit(log) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-    log.add(names, unit)
-
-
-def _gyro_unit(log: _Log) -> float:
-    """One count of the gyro [rad/s]: the setting holds deg/s, or, of Baseflight and in exports, rad/us."""
-    for name in _GYRO_SCALES:
+    if not log.settings and names["p"] not in log.converted:
+        fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
+        log.notes.append(f"{field} is taken as deg/s: {fine}")
+    unit = DEGREE  # of one count
+    for name in reversed(_GYRO_SCALES):  # in deg/s, or, of Baseflight and in exports, in rad/us
         if (scale := log.setting(name, 1e-3, 10)) is not None:
-            return scale * DEGREE
-        if (scale := log.setting(name, 1e-11, 1e-6)) is not None:
-            return scale * 1e6
-    return DEGREE
+            unit = scale * DEGREE
+        elif (scale := log.setting(name, 1e-11, 1e-6)) is not None:
+            unit = scale * 1e6
+    log.add(names, unit / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0))
 
 
 def _add_rotors(log: _Log, *, usual: int = 14) -> None:
@@ -294,16 +279,20 @@ def _add_force(log: _Log) -> None:
 
 def _add_attitude(log: _Log) -> None:
     """Roll, pitch and yaw, if the log holds an attitude. That of Indiflight has y to the right and z down."""
-    field, values = next(((f, v) for f, n in _ATTITUDES.items() if (v := log.vector(f, n)) is not None), ("", _NONE))
+    for field, count in _ATTITUDES.items():
+        names = items(field, count)
+        if log.raw.keys() >= {*names} and any(np.ptp(_finite(log.raw[name])) for name in names):
+            break
+    else:
+        return
+    values = np.column_stack([log.raw[name] for name in names])
     if field == "quat":
         angles = euler_angles(values) * HALF_TURN
     elif field == "imuQuaternion":
         vector = values / 0x7FFF
         angles = euler_angles(np.column_stack([np.sqrt(np.maximum(1 - (vector**2).sum(axis=1), 0.0)), vector]))
-    elif field == "attitude":
-        angles = values * DEGREE / 10 * [1, 1, -1]
     else:
-        return
+        angles = values * DEGREE / 10 * [1, 1, -1]
     log.names.update(dict.fromkeys(ANGLE_NAMES, field))
     log.columns.update(zip(ANGLE_NAMES, angles.T, strict=True))
 

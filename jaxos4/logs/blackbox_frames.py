@@ -11,7 +11,6 @@ import itertools
 import re
 from collections.abc import Collection, Iterator
 from operator import itemgetter
-from typing import NamedTuple
 
 import numpy as np
 
@@ -38,14 +37,6 @@ _PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT, _1500, _VBATREF, 
 _CONSTANTS = {_MINTHROTTLE: "minthrottle", _VBATREF: "vbatref", _MINMOTOR: "motorOutput"}
 
 
-class _Kind(NamedTuple):
-    """The fields of one kind of frame: `groups` are (encoding, number of fields)."""
-
-    names: list[str]
-    groups: list[tuple[int, int]]
-    predictors: list[int]
-
-
 class BadHeader(Exception):
     """A header that does not describe frames which can be decoded; the text says why."""
 
@@ -59,7 +50,7 @@ def decode_frames(
     from 0; the number of places where frames are damaged; whether the session has an end.
     """
     stream, values = _Stream(settings, data), array.array("d")
-    names = stream.kinds[_I].names
+    names = stream.names
     places = [stream.time, *(i for i, name in enumerate(names) if name in wanted)]
     for row in map(itemgetter(*places, stream.time), stream.frames()):
         values.extend(row)
@@ -70,29 +61,33 @@ def decode_frames(
     return columns, stream.damaged, stream.ended
 
 
-def _kinds(settings: dict[str, str]) -> dict[int, _Kind]:
-    """The kinds of frames by their letters. Raises `BadHeader`."""
-    kinds: dict[int, _Kind] = {}
+def _fields(settings: dict[str, str]) -> tuple[list[str], dict[int, list[tuple[int, int]]], dict[int, list[int]]]:
+    """The names of the fields of main frames; by kind of frame, (encoding, number of fields) and predictors of fields.
+
+    Raises `BadHeader`.
+    """
+    names, encodings, predictors = [], {}, {}
     for letter in "IPSGH":
-        encodings, predictors = (_numbers(settings.get(f"Field {letter} {what}")) for what in ("encoding", "predictor"))
-        if not encodings:
+        each, predicted = (_numbers(settings.get(f"Field {letter} {what}")) for what in ("encoding", "predictor"))
+        if not each:
             continue
-        names = [name.strip() for name in settings.get(f"Field {letter} name", "").split(",")]
-        same = len(predictors) == len(encodings) <= _MOST_FIELDS and (letter == "P" or len(names) == len(encodings))
-        if not same or (letter == "P" and _I in kinds and len(predictors) != len(kinds[_I].names)):
+        labels = [name.strip() for name in settings.get(f"Field {letter} name", "").split(",")]
+        same = len(predicted) == len(each) <= _MOST_FIELDS and (letter == "P" or len(labels) == len(each))
+        if not same or (letter == "P" and names and len(predicted) != len(names)):
             raise BadHeader(_BAD)
         groups: list[tuple[int, int]] = []
-        for encoding, group in itertools.groupby(encodings):
+        for encoding, group in itertools.groupby(each):
             if encoding not in _TOGETHER:
                 raise BadHeader(f"its frames have an encoding that is not known, {encoding}")
             count, most = len(list(group)), _TOGETHER[encoding]
             groups += [(encoding, min(most, count - done)) for done in range(0, count, most)]
-        if _TAG8_4 in encodings and settings.get("Data version", "2") != "2":
+        if _TAG8_4 in each and settings.get("Data version", "2") != "2":
             raise BadHeader("its frames are of version 1")
-        kinds[ord(letter)] = _Kind(names, groups, predictors)
-    if _I not in kinds or not {_TIME, _ITERATION} <= set(kinds[_I].names):
+        names = labels if letter == "I" else names
+        encodings[ord(letter)], predictors[ord(letter)] = groups, predicted
+    if not {_TIME, _ITERATION} <= set(names):
         raise BadHeader("its header does not describe the frames")
-    return kinds
+    return names, encodings, predictors
 
 
 def _numbers(text: str | None) -> list[int]:
@@ -190,12 +185,12 @@ class _Stream:
     """The frames of a session in order. Raises `BadHeader`."""
 
     def __init__(self, settings: dict[str, str], data: bytes):
-        self.data, self.kinds, self.numbers = data, _kinds(settings), Numbers(data)
+        self.data, self.numbers = data, Numbers(data)
+        self.names, self.encodings, self.predictors = _fields(settings)
         self.damaged, self.ended = 0, False
         self.last: tuple[int, int] | None = None  # iteration and time of the last frame
-        names = self.kinds[_I].names
-        self.time, self.iteration = names.index(_TIME), names.index(_ITERATION)
-        self.motor0 = names.index("motor[0]") if "motor[0]" in names else 0
+        self.time, self.iteration = self.names.index(_TIME), self.names.index(_ITERATION)
+        self.motor0 = self.names.index("motor[0]") if "motor[0]" in self.names else 0
         self.constants = {key: _whole(settings.get(name), 0) for key, name in _CONSTANTS.items()} | {_1500: 1500}
         first, _, last = settings.get("P interval", "").partition("/")
         self.interval = _whole(settings.get("I interval"), 1)
@@ -251,7 +246,7 @@ class _Stream:
     def _complete(self, values: list[int], kind: int, before: list[int], earlier: list[int]) -> None:
         """Add the predictions from the two frames before, in place."""
         constants = self.constants
-        for i, predictor in enumerate(self.kinds[kind].predictors):
+        for i, predictor in enumerate(self.predictors[kind]):
             if predictor in (_PREVIOUS, _INCREMENT):
                 values[i] += before[i] + (self._step(before[i]) if predictor == _INCREMENT else 0)
             elif predictor == _AVERAGE:
@@ -275,9 +270,9 @@ class _Stream:
         values: list[int] = []
         if letter == _E:
             return values if self._event() else None
-        if letter not in self.kinds:
+        if letter not in self.encodings:
             return None
-        for encoding, count in self.kinds[letter].groups:
+        for encoding, count in self.encodings[letter]:
             self.numbers.read(encoding, count, values)
         return values
 

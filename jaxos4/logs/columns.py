@@ -17,7 +17,7 @@ from .values import COLUMNS, PWM, PWM_ZERO, ColumnLimits
 ColumnsGiven = LogPath | Mapping[str, Any] | None
 """A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
 
-PRESETS = {path.stem: path for path in sorted(Path(__file__).with_name("presets").glob("*.toml"))}
+PRESETS: dict[str, Any] = read_toml(Path(__file__).with_name("presets.toml"))
 QUATERNION = ("qw", "qx", "qy", "qz")
 _QUATERNION = ColumnLimits("of a quaternion", -math.inf, math.inf, "")
 _COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
@@ -83,23 +83,17 @@ def column_map(given: ColumnsGiven) -> ColumnMap:
         name, table = "columns", dict(given)
         check_plain(name, table, "correct it")
     else:
-        preset = PRESETS.get(os.fspath(given))
         name = os.fspath(given)
         try:
-            table = read_toml(preset or given)
+            table = dict(PRESETS.get(name) or read_toml(given))
         except FileNotFoundError:
             refuse(name, f"neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}")
         if not table:
             refuse(name, "names no column; a column map has a table [columns]")
-    return _checked(name, table, needed=name not in PRESETS)
-
-
-def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
-    """The map in the table of a file; its presets are not `needed`."""
     columns = table.pop("columns", {})
     settings = {"preset": ("", *PRESETS), "frame": ("FLU", "FRD"), "time": ("stamp", "recorded")}
-    preset, frame, time = given = [table.pop(key, values[0]) for key, values in settings.items()]
-    for (key, values), value in zip(settings.items(), given, strict=True):
+    preset, frame, time = chosen = [table.pop(key, values[0]) for key, values in settings.items()]
+    for (key, values), value in zip(settings.items(), chosen, strict=True):
         if value not in values:
             refuse(name, f"{key} is {quoted(str(value))}; give one of {', '.join(filter(None, values))}")
     if table or not isinstance(columns, dict):
@@ -109,7 +103,8 @@ def _checked(name: str, table: dict[str, Any], *, needed: bool) -> ColumnMap:
     sources = begin.sources | {column: _source(name, column, value) for column, value in columns.items()}
     for column in _TURNED & (columns.keys() if preset else _TURNED) if frame == "FRD" else ():
         sources[column] = sources[column]._replace(factor=-sources[column].factor)
-    return ColumnMap(quoted(name), sources, frozenset(columns) if needed else frozenset(), time == "recorded")
+    needed = () if name in PRESETS else columns
+    return ColumnMap(quoted(name), sources, frozenset(needed), time == "recorded")
 
 
 def _source(name: str, column: str, value: Any) -> ColumnSource:

@@ -1,12 +1,11 @@
 """Compressed parts of a bag, measured before they are decompressed: a small file must not fill memory or disk."""
 
-import bz2
+import pkgutil
 import re
 import struct
-from collections.abc import Iterable, Iterator
-from importlib import import_module
+import sys
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import IO, NoReturn
 
 from ..errors import InputError
 from .table import LogPath, opened, refuse
@@ -16,6 +15,12 @@ MAX_FILE = 1 << 34  # bytes, on the disk, of a file compressed as a whole; a bag
 MAX_TIMES, SMALL = 100, 1 << 29  # such a file may grow so many times, or to so many bytes; bags shrink 2 to 20 times
 MAX_METADATA = 1 << 19  # bytes of metadata.yaml, whose parser takes 14 s for a megabyte; a topic has about a kilobyte
 _STEP = 1 << 20  # bytes that are decompressed at a time
+_ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
+_DECOMPRESSORS = {
+    "bz2": "bz2:BZ2Decompressor",
+    "lz4": "lz4.frame:LZ4FrameDecompressor",
+    "zstd": f"{_ZSTD}:ZstdDecompressor",
+}
 _MCAP, _CHUNK_OF_MCAP, _ATTACHMENT_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, 9, b"\x05"
 
 
@@ -30,24 +35,22 @@ def check_sizes(path: LogPath) -> None:
             continue
         if each.parent == place and not each.is_file():
             refuse(each, "is a pipe or a device in the folder of a bag; remove it")
-        if each.name == "metadata.yaml":
-            _check_metadata(each)
         with opened(each, "rb") as file:
             begin = file.read(8)
-            if begin.startswith(_MCAP):
-                check_parts(path, _mcap_parts(path, file, end=1 << 62))
+            if each.name == "metadata.yaml":
+                _check_metadata(each, begin + file.read(MAX_METADATA))
+            elif begin.startswith(_MCAP):
+                _check_mcap(path, file, end=1 << 62)
             elif begin == b"#ROSBAG ":
                 file.readline()
-                check_parts(path, _ros1_parts(path, file))
+                _check_ros1(path, file)
             else:
                 file.seek(0)
                 _check_whole(each, file)
 
 
-def _check_metadata(path: Path) -> None:
+def _check_metadata(path: Path, content: bytes) -> None:
     """Refuse a text in YAML that is too long or refers to itself: lists of its own lists could have any length."""
-    with opened(path, "rb") as file:
-        content = file.read(MAX_METADATA + 1)
     if len(content) > MAX_METADATA:
         refuse(path, f"has more than {MAX_METADATA:,} bytes; make it anew by `ros2 bag reindex`")
     if re.search(rb"[:,[{-]\s*[*&]\w", content):
@@ -59,9 +62,9 @@ def _check_whole(path: Path, packed: IO[bytes]) -> None:
     most = min(MAX_FILE, max(SMALL, MAX_TIMES * path.stat().st_size))
     end = most + 1
     try:
-        with _zstd().ZstdFile(packed) as file:
+        with pkgutil.resolve_name(f"{_ZSTD}:ZstdFile")(packed) as file:
             if file.read(8).startswith(_MCAP):
-                check_parts(path, _mcap_parts(path, file, end=end))
+                _check_mcap(path, file, end=end)
             too_large = file.seek(end) == end
     except InputError:
         raise
@@ -72,9 +75,24 @@ def _check_whole(path: Path, packed: IO[bytes]) -> None:
         refuse(path, f"{what}; record it again in several files (--max-bag-size)")
 
 
-def check_parts(path: LogPath, parts: Iterable[tuple[str, bytes]]) -> None:
-    """Refuse a bag with a part that grows too much. `parts`: the name of the compression and the content of each."""
-    if any(_exceeds(kind, content) for kind, content in parts):
+def check_part(path: LogPath, kind: str, content: bytes) -> None:
+    """Refuse a part of a bag that has more than `MAX_PART` bytes when it is decompressed.
+
+    `kind`: the name of its compression. A part with another name is not compressed, or its reader refuses it.
+    """
+    if kind not in _DECOMPRESSORS:
+        return
+    made = pkgutil.resolve_name(_DECOMPRESSORS[kind])
+    length, decompressor = 0, made()
+    try:
+        while length <= MAX_PART and (content or not decompressor.needs_input):
+            length += len(decompressor.decompress(content, _STEP))
+            content = b""
+            if decompressor.eof:
+                content, decompressor = decompressor.unused_data or b"", made()
+    except Exception:  # noqa: BLE001 - of a damaged part, a decompressor raises any
+        return
+    if length > MAX_PART:
         _refuse_part(path)
 
 
@@ -82,10 +100,10 @@ def _refuse_part(path: LogPath) -> NoReturn:
     refuse(path, f"holds a part of more than {MAX_PART:,} bytes; record it again in parts of a few megabytes")
 
 
-def _mcap_parts(path: LogPath, file: IO[bytes], *, end: int) -> Iterator[tuple[str, bytes]]:
-    """The compression and the content of each chunk of a file that is open behind its first eight bytes.
+def _check_mcap(path: LogPath, file: IO[bytes], *, end: int) -> None:
+    """Check the records of a file that is open behind its first eight bytes, up to the byte `end`.
 
-    A reader holds each record in memory, except attachments. `end`: nothing is looked at from this byte on.
+    A reader holds each record in memory, except attachments.
     """
     while file.tell() < end and len(head := file.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
@@ -96,11 +114,11 @@ def _mcap_parts(path: LogPath, file: IO[bytes], *, end: int) -> Iterator[tuple[s
             continue
         chunk = file.read(length)
         (size,) = struct.unpack_from("<I", chunk.ljust(32), 28)
-        yield chunk[32 : 32 + size].decode(errors="replace"), chunk[40 + size :]
+        check_part(path, chunk[32 : 32 + size].decode(errors="replace"), chunk[40 + size :])
 
 
-def _ros1_parts(path: LogPath, file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
-    """The compression and the content of each chunk of a bag of ROS 1 that is open behind its first line."""
+def _check_ros1(path: LogPath, file: IO[bytes]) -> None:
+    """Check the chunks of a bag of ROS 1 that is open behind its first line."""
     while len(head := file.read(4)) == 4:
         header = file.read(struct.unpack("<I", head)[0])
         (length,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
@@ -110,40 +128,4 @@ def _ros1_parts(path: LogPath, file: IO[bytes]) -> Iterator[tuple[str, bytes]]:
         if length > MAX_PART:
             _refuse_part(path)
         kind = re.search(rb"compression=(none|bz2|lz4)", header)
-        yield "" if kind is None else kind[1].decode(), file.read(length)
-
-
-def _exceeds(kind: str, content: bytes) -> bool:
-    """Whether a compressed content makes more than `MAX_PART` bytes."""
-    made = _decompressor(kind)
-    if made is None:
-        return False
-    length, decompressor = 0, made()
-    try:
-        while content or not decompressor.needs_input:
-            length += len(decompressor.decompress(content, _STEP))
-            content = b""
-            if length > MAX_PART:
-                return True
-            if decompressor.eof:
-                content, decompressor = decompressor.unused_data or b"", made()
-    except Exception:  # noqa: BLE001 - of a damaged part, a decompressor raises any
-        return False
-    return False
-
-
-def _decompressor(kind: str) -> Any:
-    """The class that decompresses piece by piece; `None`: not compressed, or not known."""
-    if kind == "bz2":
-        return bz2.BZ2Decompressor
-    if kind == "lz4":
-        return import_module("lz4.frame").LZ4FrameDecompressor
-    return _zstd().ZstdDecompressor if kind == "zstd" else None
-
-
-def _zstd() -> Any:
-    """The module that reads Zstandard: Python's own, from 3.14 on."""
-    try:
-        return import_module("compression.zstd")
-    except ImportError:
-        return import_module("backports.zstd")
+        check_part(path, "" if kind is None else kind[1].decode(), file.read(length))

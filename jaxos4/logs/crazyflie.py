@@ -6,7 +6,6 @@ Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 import array
 import re
 import zlib
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,7 +20,7 @@ _MAGIC = b"\xbc"
 _PAIR = re.compile(rb"(..)(..)", re.DOTALL)
 _TYPE = re.compile(rb"(..)([^\0]{0,255})\0(..)", re.DOTALL)
 _NAME = re.compile(rb"([^\0]{0,255})\0")
-_VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
+_VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")  # name, and letter of its type in NumPy
 _SETS = re.compile(rb"(.)(tick\(I\),(?:[\x20-\x27\x2a\x2b\x2d-\x7e]{1,80}\([bBhHiIqQefd]\),){1,255})", re.DOTALL)
 _FULL = 65535.0
 _SOURCES = {
@@ -32,18 +31,13 @@ _SOURCES = {
     **{(name,): ([f"stateEstimate.{name}"], 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")},
     ("voltage",): (["pm.vbat"], 1.0),
 }
-_ROTORS = (
-    ("rpm.m{}", True, RPM),
-    ("motor.m{}", False, 1 / _FULL),
-    ("pwm.m{}_pwm", False, 1 / _FULL),
-)
+_ROTORS = (("rpm.m{}", True, RPM), ("motor.m{}", False, 1 / _FULL), ("pwm.m{}_pwm", False, 1 / _FULL))
 _AGAIN = "copy it again from the card"
 _REMEDY = f"the log is corrupt there: {_AGAIN}, or choose another"
 _DAMAGED = f"it is corrupt; {_AGAIN}"
 
 Types = dict[int, tuple[str, np.dtype]]
 """By the number of a type of events: its name and layout."""
-Events = dict[str, dict[int, Fields]]
 
 
 def read_crazyflie(path: LogPath) -> tuple[Table, tuple[str, ...]]:
@@ -55,7 +49,7 @@ def read_crazyflie(path: LogPath) -> tuple[Table, tuple[str, ...]]:
         refuse(path, "holds no events; a flight needs at least two")
     log = Messages(path, events, _REMEDY, notes, prefixed=False)
     return log.table(
-        {columns: _logged(log, columns, *source) for columns, source in _SOURCES.items()},
+        {columns: log.fastest(columns, [(event, *source) for event in events]) for columns, source in _SOURCES.items()},
         _rotors(log),
         remedies=(
             "add gyro.x, gyro.y and gyro.z to the deck's config.txt",
@@ -73,17 +67,11 @@ CRAZYFLIE = LogFormat(
 )
 
 
-def _logged(
-    log: Messages, columns: Sequence[str], variables: Sequence[str], factor: float | np.ndarray
-) -> Series | None:
-    """The columns that these variables hold, if one event holds them all."""
-    return log.fastest(columns, [(event, variables, factor) for event in log.fields])
-
-
 def _rotors(log: Messages) -> Rotors | None:
     for variable, is_measured, factor in _ROTORS:
         names = [variable.format(i) for i in range(1, 5)]
-        series = _logged(log, SPEED_NAMES if is_measured else COMMAND_NAMES, names, factor)
+        sources = [(event, names, factor) for event in log.fields]  # all four in one event
+        series = log.fastest(SPEED_NAMES if is_measured else COMMAND_NAMES, sources)
         if series is None:
             continue
         series = series if is_measured else Series(series.t, np.clip(series.values, 0.0, 1.0))
@@ -92,15 +80,25 @@ def _rotors(log: Messages) -> Rotors | None:
     return None
 
 
-def _events(path: LogPath, content: bytes, notes: list[str]) -> Events:
+def _events(path: LogPath, content: bytes, notes: list[str]) -> dict[str, dict[int, Fields]]:
     """The events of versions 1 and 2, by the names of their types."""
     types, version, at = _types(path, content)
     valid = len(content) >= at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
-    places, ignored = _places(path, content[: -4 if valid else None], types, at, valid=valid)
+    places, end = {number: array.array("q") for number in types}, len(content) - 4 * valid
+    sizes = {number: layout.itemsize for number, (_, layout) in types.items()}
+    while at + 2 <= end:
+        number = content[at] | content[at + 1] << 8
+        if number not in sizes and (valid or end - at > 4):  # else a wrong checksum
+            refuse(path, f"is corrupt at byte {at}: no event begins there; {_AGAIN}")
+        if at + sizes.get(number, end) > end:
+            break
+        places[number].append(at)
+        at += sizes[number]
     if not valid:
+        ignored = end - at
         cut = f"and its last {ignored} bytes are not a complete event" if ignored else "but ends with a complete event"
         notes.append(f"the log has no valid checksum, {cut}: it was cut while it was written, or is corrupt")
-    found: Events = {}
+    found: dict[str, dict[int, Fields]] = {}
     for number, (name, layout) in types.items():
         if len(places[number]) > 1:
             events = records(content, places[number], layout)
@@ -109,11 +107,11 @@ def _events(path: LogPath, content: bytes, notes: list[str]) -> Events:
     return found
 
 
-def _sets(path: LogPath, content: bytes, notes: list[str]) -> Events:
+def _sets(path: LogPath, content: bytes, notes: list[str]) -> dict[str, dict[int, Fields]]:
     """The one event of the format of 2019: names, then blocks of data sets, each with the inverse of its CRC-32."""
     match = _SETS.match(content)
     found = [] if match is None else [_VARIABLE.fullmatch(text.strip()) for text in match[2].split(b",")[:-1]]
-    fields = [_field(each) for each in found if each]
+    fields = [(each[1].decode(), f"<{each[2].decode()}") for each in found if each]
     if match is None or not len(found) == len(fields) == len(dict(fields)) == match[1][0]:
         refuse(path, f"does not describe its variables: {_DAMAGED}")
     layout, at, good, bad = np.dtype(fields), match.end() + 4, [], 0
@@ -128,11 +126,6 @@ def _sets(path: LogPath, content: bytes, notes: list[str]) -> Events:
     rows = np.frombuffer(b"".join(good), layout)
     sets = {name: rows[name] for name, _ in fields} | {"t": rows["tick"] * 1e-3}
     return {"its data sets": {0: sets}} if rows.size > 1 else {}
-
-
-def _field(variable: re.Match[bytes]) -> tuple[str, str]:
-    """The name and the type of a variable; the letter e means a half float."""
-    return variable[1].decode(), "<f2" if variable[2] == b"e" else f"<{variable[2].decode()}"
 
 
 def _types(path: LogPath, content: bytes, *, most_types: int = 64, most_variables: int = 256) -> tuple[Types, int, int]:
@@ -165,23 +158,8 @@ def _types(path: LogPath, content: bytes, *, most_types: int = 64, most_variable
             if variable is None:
                 shown = quoted(text.decode(errors="replace"))
                 refuse(path, f"has a variable {shown} without a known type: {_DAMAGED}")
-            fields.append(_field(variable))
+            fields.append((variable[1].decode(), f"<{variable[2].decode()}"))
         if number in types or len(dict(fields)) < len(fields):
             refuse(path, f"names an event type or a variable twice: {_DAMAGED}")
         types[number] = quoted(name.decode(errors="replace")), np.dtype(fields)
     return types, version, at
-
-
-def _places(path: LogPath, content: bytes, types: Types, at: int, *, valid: bool) -> tuple[dict[int, array.array], int]:
-    """The position of each event by its type, and the number of bytes after the last complete event."""
-    places, end = {number: array.array("q") for number in types}, len(content)
-    sizes = {number: layout.itemsize for number, (_, layout) in types.items()}
-    while at + 2 <= end:
-        number = content[at] | content[at + 1] << 8
-        if number not in sizes and (valid or end - at > 4):  # else a wrong checksum
-            refuse(path, f"is corrupt at byte {at}: no event begins there; {_AGAIN}")
-        if at + sizes.get(number, end) > end:
-            break
-        places[number].append(at)
-        at += sizes[number]
-    return places, end - at

@@ -117,17 +117,15 @@ def _header(path: LogPath, line: str, known: Collection[str], row: int) -> list[
     if not _readable(line):
         refuse(path, _NOT_UTF8, row=row)
     names = [name.strip() for name in _cells(path, line.rstrip("\n"), row)]
-    separators = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
-    wrong = next((shown for each, shown in separators.items() if len(names) == 1 and each in line.strip()), None)
-    numbers = not any(math.isnan(_float(name)) for name in names if name)
-    what = (
-        "is empty; a flight needs a header row and at least two rows of data" * (not line)
-        or "is empty; the first row must be the header" * (not any(names))
-        or (f"is separated by {wrong}; separate by commas, with points in the numbers" if wrong else "")
-        or "contains numbers instead of the header; write the names of the columns in a first row" * numbers
-    )
-    if what:
-        refuse(path, what, row=row if line else None)
+    if not line:
+        refuse(path, "is empty; a flight needs a header row and at least two rows of data")
+    if not any(names):
+        refuse(path, "is empty; the first row must be the header", row=row)
+    for each, shown in {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}.items():
+        if len(names) == 1 and each in line.strip():
+            refuse(path, f"is separated by {shown}; separate by commas, with points in the numbers", row=row)
+    if not any(math.isnan(_float(name)) for name in names if name):
+        refuse(path, "contains numbers instead of the header; write the names of the columns in a first row", row=row)
     for name in known:
         if names.count(name) > 1:
             refuse(path, f"occurs {names.count(name)} times in the header; keep one of them", row=row, column=name)

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from ..errors import shortened
 from ..flight import ANGLE_NAMES, COMMAND_NAMES, RATE_NAMES, SPEED_NAMES
 from ..rotations import euler_angles
 from .columns import PRESETS, QUATERNION, ColumnMap, column_map
-from .compression import check_parts, check_sizes
+from .compression import check_part, check_sizes
 from .messages import Fields, Messages, Rotors
 from .sampling import Series
 from .table import MAX_ROWS, LogFormat, LogPath, Table, listed, opened, quoted, refuse
@@ -27,19 +27,11 @@ from .table import MAX_ROWS, LogFormat, LogPath, Table, listed, opened, quoted, 
 _ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"rosbag2_bagfile_information:"
 _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it
 _FIELD = re.compile(r"[^.\[\]]+")
-_STAMPS = (("timestamp_sample", 1000), ("timestamp", 1000))  # of PX4, and their unit [ns]
+_STAMPS = ("timestamp_sample", "timestamp")  # of PX4 [us]
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
 _REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
 _LONGEST_DEFINITIONS = 1 << 16  # characters: usual definitions have a few thousand, and their parser is slow
 _NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag record -s mcap`), or convert it"
-
-
-class _Topic(NamedTuple):
-    """The messages of a topic: the times at which they were recorded, their stamps [ns], and the fields of columns."""
-
-    recorded: list[float]
-    stamps: list[int]
-    fields: dict[str, list[float]]
 
 
 def read_ros(path: LogPath, columns: ColumnMap | None = None) -> tuple[Table, tuple[str, ...]]:
@@ -53,8 +45,9 @@ def read_ros(path: LogPath, columns: ColumnMap | None = None) -> tuple[Table, tu
         with _only_tables(path):
             reader.open()
         if getattr(getattr(reader, "metadata", None), "compression_mode", "") == "message":
-            every = (message for store in reader.storages for *_, message in store.messages(store.connections))
-            check_parts(path, (("zstd", message) for message in every))
+            for store in reader.storages:
+                for *_, message in store.messages(store.connections):
+                    check_part(path, "zstd", message)
     try:
         return _read(path, reader, columns)
     finally:
@@ -138,32 +131,47 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
             refuse(path, f"{what}: say in a column map which hold rates and motors, and give that map as `columns`")
         notes.append(f"columns are those of the preset {columns.name}")
     chosen = columns.chosen(path, held, topics)
-    found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
-    log = Messages(path, found, _REMEDY, notes, prefixed=False)
-    return _table(log, columns, chosen)
+    messages = _messages(path, reader, {*chosen.values()}, notes, recorded=columns.recorded)
+    return _table(Messages(path, messages, _REMEDY, notes, prefixed=False), columns, chosen)
 
 
-def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, _Topic]:
-    """The fields at these places, by topic. Raises `InputError`."""
-    found: dict[str, _Topic] = {}
-    for topic, field in sorted(each.split(".", 1) for each in places):
-        found.setdefault(topic, _Topic([], [], {})).fields[field] = []
-    wanted = [each for each in reader.connections if each.topic in found]
-    getters = {
-        topic: [(values.append, _getter(path, topic, f)) for f, values in t.fields.items()]
-        for topic, t in found.items()
-    }
+def _messages(
+    path: LogPath, reader: Any, places: set[str], notes: list[str], *, recorded: bool, clock: float = 0.5
+) -> dict[str, dict[int, Fields]]:
+    """The fields at these places, by topic, as `Messages` holds them. Raises `InputError`.
+
+    Times are stamps if all topics have some of one clock (to `clock` [s]), or else times of the recorder.
+    """
+    getters: dict[str, dict[str, Callable[[Any], float]]] = {}
+    for place in sorted(places):
+        topic, _, field = place.partition(".")
+        getters.setdefault(topic, {})[place] = _getter(path, place, field)
+    logged: dict[str, list[list[float]]] = {topic: [[] for _ in range(2 + len(getters[topic]))] for topic in getters}
+    wanted = [each for each in reader.connections if each.topic in getters]
     with _damage(path):
         decode = _decoder(path, wanted, ros1=type(reader).__module__.startswith("rosbags.rosbag1"))
-        for number, (connection, recorded, content) in enumerate(reader.messages(connections=wanted)):
+        for number, (connection, at, content) in enumerate(reader.messages(connections=wanted)):
             if number > MAX_ROWS:
                 refuse(path, f"has more than {MAX_ROWS:,} messages of these topics; cut it into flights")
-            message, topic = decode(content, connection.msgtype), found[connection.topic]
-            topic.recorded.append(float(recorded))  # in SQLite, a cell can be of any type
-            topic.stamps.append(_stamp(message))
-            for append, get in getters[connection.topic]:
-                append(get(message))
-    return found
+            message, topic = decode(content, connection.msgtype), connection.topic
+            # In SQLite, a time can be of any type.
+            values = float(at), _stamp(message), *(get(message) for get in getters[topic].values())
+            for column, value in zip(logged[topic], values, strict=True):
+                column.append(value)
+    every = {topic: columns for topic, columns in logged.items() if columns[0]}
+    times = [(np.array(at, float), np.array(stamps, float)) for at, stamps, *_ in every.values()]
+    apart = [float(np.median(stamps - at)) for at, stamps in times]
+    stamped = all((stamps > 0).all() for _, stamps in times)
+    if not recorded and not (stamped and np.ptp(apart or [0.0]) < clock * 1e9):
+        notes.append("times are those of the recorder, because not all topics have stamps of one clock")
+        recorded = True
+    begin = min((min(at if recorded else stamps) for at, stamps, *_ in every.values()), default=0)
+    messages = {}
+    for topic, (at, stamps, *columns) in every.items():
+        fields = {place: np.array(x, float) for place, x in zip(getters[topic], columns, strict=True)}
+        t = 1e-9 * np.array([each - begin for each in (at if recorded else stamps)], float)
+        messages[topic] = {0: fields | {"t": t}}
+    return messages
 
 
 def _decoder(path: LogPath, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
@@ -186,10 +194,10 @@ def _decoder(path: LogPath, connections: list[Any], *, ros1: bool) -> Callable[[
     return store.deserialize_ros1 if ros1 else store.deserialize_cdr
 
 
-def _getter(path: LogPath, topic: str, field: str) -> Callable[[Any], float]:
+def _getter(path: LogPath, place: str, field: str) -> Callable[[Any], float]:
     """A function that takes a number out of a message; NaN if an array is shorter. It raises `InputError`."""
     steps = [int(each) if each.isdecimal() and len(each) < 10 else each for each in _FIELD.findall(field)]
-    wrong = functools.partial(refuse, path, column=f"{topic}.{field}", kind="field")
+    wrong = functools.partial(refuse, path, column=place, kind="field")
 
     def get(message: Any) -> float:
         value = message
@@ -215,27 +223,7 @@ def _stamp(message: Any) -> int:
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is not None:
         return stamp.sec * 10**9 + stamp.nanosec
-    return next((t * unit for name, unit in _STAMPS if (t := getattr(message, name, 0))), 0)
-
-
-def _timed(
-    found: dict[str, _Topic], notes: list[str], *, recorded: bool, clock: float = 0.5
-) -> dict[str, dict[int, Fields]]:
-    """The topics as messages, with stamps if all have some of one clock (to `clock` [s]), or times of the recorder."""
-    found = {topic: each for topic, each in found.items() if each.recorded}
-    times = [(np.array(each.recorded, float), np.array(each.stamps, float)) for each in found.values()]
-    apart = [float(np.median(stamps - at)) for at, stamps in times]
-    stamped = all((stamps > 0).all() for _, stamps in times)
-    if not recorded and not (stamped and np.ptp(apart or [0.0]) < clock * 1e9):
-        notes.append("times are those of the recorder, because not all topics have stamps of one clock")
-        recorded = True
-    every = {topic: each.recorded if recorded else each.stamps for topic, each in found.items()}
-    begin = min(map(min, every.values()), default=0)
-    messages = {}
-    for topic, at in every.items():
-        fields = {f"{topic}.{field}": np.array(values, float) for field, values in found[topic].fields.items()}
-        messages[topic] = {0: fields | {"t": 1e-9 * np.array([each - begin for each in at], float)}}
-    return messages
+    return next((1000 * t for name in _STAMPS if (t := getattr(message, name, 0))), 0)
 
 
 def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[Table, tuple[str, ...]]:

@@ -8,7 +8,7 @@ import functools
 import io
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,15 +23,13 @@ from .values import RPM
 
 _MAGIC = b"ULog"
 _MOVING = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
-
-
 _BRIDGE = "px4-ros2", "/fmu/out/"
 """The preset that names the topics of PX4's bridge to ROS 2, which are those of its logs, and how their names begin."""
 _COLUMNS: tuple[Names, ...] = (RATE_NAMES, FORCE_NAMES, ("voltage",))
-_TOPICS = (
-    *("esc_status", "actuator_motors", "actuator_outputs", "vehicle_attitude", "vehicle_local_position"),
-    *("vehicle_status", "vehicle_land_detected"),
-)
+_TOPICS = """
+    esc_status actuator_motors actuator_outputs vehicle_attitude vehicle_local_position vehicle_status
+    vehicle_land_detected
+""".split()
 # Types of MAVLink, of PX4's control allocation and of its state that are no quadrotors. Others can be quadrotors.
 _OTHER_MAV_TYPES = {1, 3, 4, 7, *range(10, 16), *range(19, 26), 29, 35}
 _OTHER_AIRFRAMES, _OTHER_VEHICLES = {1, 2, 3, 4, 5, 6, 8, 10, 11, 12}, {2, 3, 4}
@@ -41,21 +39,15 @@ _BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
 _OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other units
 _REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 
-
-class _Protocol(NamedTuple):
-    """The coding of motors' outputs: idle and full speed, and parameters that hold others within `possible`."""
-
-    name: str
-    ends: tuple[float, float]
-    possible: tuple[float, float] = (0.0, 0.0)
-    parameters: tuple[str, ...] = ()
-
-
-_PWM = _Protocol("PWM", (1000.0, 2000.0), (800.0, 2200.0), ("{bank}_", "PWM_"))
-_UAVCAN = _Protocol("UAVCAN", (1.0, 8191.0), (0.0, 8191.0), ("UAVCAN_EC_",))
-_DSHOT = _Protocol("DShot", (0.0, 1999.0))
+# By the protocol of the motors' outputs: the values at idle and at full speed; parameters that hold other values, and
+# the limits of these.
+_PROTOCOLS: dict[str, tuple[tuple[float, float], tuple[str, ...], tuple[float, float]]] = {
+    "PWM": ((1000.0, 2000.0), ("{bank}_", "PWM_"), (800.0, 2200.0)),
+    "UAVCAN": ((1.0, 8191.0), ("UAVCAN_EC_",), (0.0, 8191.0)),
+    "DShot": ((0.0, 1999.0), (), (0.0, 0.0)),
+}
+_LINKS = {4: "UAVCAN", 5: "DShot"}  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
 _DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TIM0 and so on
-_LINKS = {4: _UAVCAN, 5: _DSHOT}  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
 
 
 def read_ulog(path: LogPath) -> tuple[Table, tuple[str, ...]]:
@@ -235,25 +227,26 @@ def _bank_of_motors(log: Messages) -> tuple[str, list[int]] | None:
 def _limits(log: Messages, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
     """The protocol, and the values of each output at which its motor idles and is at full speed."""
     turning, get = values[values > 1], log.parameters.get
-    least, most = _PWM.possible
+    _, _, (least, most) = _PROTOCOLS["PWM"]
     small, link = (turning < least).any(), _LINKS.get(int(log.latest("esc_status", "esc_connectiontype") or 0))
     timers = {get(f"{bank}_TIM{i}") for i in range(8)}
-    kind = _PWM
-    if bank == "UAVCAN_EC" or (turning > most).any() or (small and link is _UAVCAN):
-        kind = _UAVCAN
-    elif small or link is _DSHOT or get("DSHOT_CONFIG", 0.0) > 0 or timers & {*_DSHOT_TIMERS}:
-        idle = get("DSHOT_MIN", 0.0)
-        kind = _DSHOT._replace(ends=(_DSHOT.ends[1] * idle if 0 <= idle < 0.5 else 0.0, _DSHOT.ends[1]))
+    kind = "PWM"
+    if bank == "UAVCAN_EC" or (turning > most).any() or (small and link == "UAVCAN"):
+        kind = "UAVCAN"
+    elif small or link == "DShot" or get("DSHOT_CONFIG", 0.0) > 0 or timers & {*_DSHOT_TIMERS}:
+        kind = "DShot"
+    ends, parameters, (least, most) = _PROTOCOLS[kind]
+    if kind == "DShot" and 0 <= (idle := get("DSHOT_MIN", 0.0)) < 0.5:
+        ends = ends[1] * idle, ends[1]
 
     def known(end: int, channel: int) -> float:
         """By the output's number, else of the bank, else the default."""
-        names = [f"{name.format(bank=bank)}{('MIN', 'MAX')[end]}" for name in kind.parameters]
+        names = [f"{name.format(bank=bank)}{('MIN', 'MAX')[end]}" for name in parameters]
         every = [get(f"{name}{number}") for name in names for number in (channel + 1, "")]
-        possible = (each for each in every if each is not None and kind.possible[0] <= each <= kind.possible[1])
-        return next(possible, kind.ends[end])
+        return next((each for each in every if each is not None and least <= each <= most), ends[end])
 
     low, high = (np.array([known(end, channel) for channel in channels]) for end in (0, 1))
-    return kind.name, *np.where(low < high, [low, high], np.array(kind.ends)[:, None])
+    return kind, *np.where(low < high, [low, high], np.array(ends)[:, None])
 
 
 def _decoded(path: LogPath) -> Messages:

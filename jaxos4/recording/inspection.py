@@ -14,8 +14,8 @@ from ..logs import Recording
 from .checks import Evidence, Finding, findings, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
 from .prepared import finest
-from .richest import fair_share
-from .stretches import cut, nothing_usable, usable
+from .stretches import cut, nothing_usable, stretches
+from .windows import fair_share
 
 ASSUMED_FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
@@ -73,10 +73,10 @@ class Inspection(msgspec.Struct, frozen=True):
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
     """Describe a log that was read with this airframe and `full_scale=1.0`. Torques are unknown without an airframe."""
     seconds = fair_share([recording], finest(recording.dt, commands=recording.dt * recording.commanded))
-    evidence, stretches = Evidence(recording, airframe, seconds=seconds), []
+    evidence, inspected = Evidence(recording, airframe, seconds=seconds), []
     for stretch in evidence.every:
         excited = {} if stretch.reason else excitation(cut(evidence.recording, stretch), airframe)
-        stretches.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
+        inspected.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
     nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)
     yaw = opposite_yaw(opposite.get("yaw"))
@@ -92,7 +92,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         refusals=refusals,
         findings=(*findings(evidence), *filter(None, (yaw,))),
         notes=recording.notes,
-        stretches=tuple(stretches),
+        stretches=tuple(inspected),
     )
 
 
@@ -120,7 +120,7 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     **Returns:** the text, with comments in place of values that must be weighed or measured, and the missing keys.
     """
     facts, full = recording.facts, ASSUMED_FULL_SCALE if recording.commanded else 1.0
-    flown = usable(recording)
+    flown = [cut(recording, each) for each in stretches(recording) if not each.reason]
     signs, hover = None if facts.too_slow else rotor_signs(flown), _hover(flown)
     forward, left, spins = signs or ((), (), None)
     spins = facts.rotor_spins or spins

@@ -15,16 +15,14 @@ from ..rotations import rotations_to_body
 from .sensor_errors import Ups, white_noise
 
 # Two rotors against the other two: the three ways are roll, pitch and yaw of an X, in an order that depends on the log.
-_PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
+PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
 
 Signs = tuple[float, ...]
-
+Vectors = Float[np.ndarray, "samples 3"]
 
 # An axis is excited weakly or well from these standard deviations of its rate on [rad/s], and weakly only if they
 # exceed this many times the gyro's noise.
 WEAK, GOOD, OVER_NOISE = 0.1, 0.3, 5.0
-
-
 # Delays of the gyro after the motors [s] in which the response is looked for. In motion of one frequency, half a period
 # more would turn the sign.
 COMMANDED = 0.0, 0.048  # lag and delay of rotors
@@ -81,11 +79,6 @@ def excitation(flight: Flight | Recording, airframe: Airframe | None = None) -> 
     return found
 
 
-def torques_of(airframe: Airframe | None) -> Float[np.ndarray, "axes 4"]:
-    """Roll, pitch and yaw torque for the squares of the rotor speeds; in any order and unit without an airframe."""
-    return _PAIRS if airframe is None else np.asarray(airframe.mixer, dtype=float)[:3]
-
-
 def opposite_axes(flown: Sequence[Recording], airframe: Airframe) -> dict[str, float]:
     """The axes about which vehicles turn against the torque that the airframe gives to the rotors, in usable stretches.
 
@@ -126,15 +119,15 @@ def rotor_signs(flown: Sequence[Recording]) -> tuple[Signs, Signs, Signs | None]
     above; `None`: the vehicle hardly yawed). `None`: the flight does not show it, or the rotors are no X.
     """
     commanded = any(each.commanded for each in flown)
-    found = _correlations(flown, _PAIRS, COMMANDED if commanded else MEASURED)
+    found = _correlations(flown, PAIRS, COMMANDED if commanded else MEASURED)
     roll, pitch = (_pair(found[:, :, axis]) for axis in (0, 1))
     if roll is None or pitch is None or roll == pitch:
         return None
     (yaw,) = {0, 1, 2} - {roll, pitch}
-    left = _clear_sign(found[:, roll, 0]) * _PAIRS[roll]
-    forward = -_clear_sign(found[:, pitch, 1]) * _PAIRS[pitch]
+    left = _clear_sign(found[:, roll, 0]) * PAIRS[roll]
+    forward = -_clear_sign(found[:, pitch, 1]) * PAIRS[pitch]
     turn = _clear_sign(found[:, yaw, 2])
-    spins = tuple((-turn * _PAIRS[yaw]).tolist()) if turn else None
+    spins = tuple((-turn * PAIRS[yaw]).tolist()) if turn else None
     return tuple(forward.tolist()), tuple(left.tolist()), spins
 
 
@@ -173,7 +166,7 @@ def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
 
 
 def _pair(found: Float[np.ndarray, "delays pairs"]) -> int | None:
-    """The row of `_PAIRS` that turns the vehicle about an axis, if one of them does clearly."""
+    """The row of `PAIRS` that turns the vehicle about an axis, if one of them does clearly."""
     sizes = np.abs(found).max(axis=0)
     best = int(np.argmax(sizes))
     alone = sizes[best] > CLEAR * np.delete(sizes, best).max()  # False for NaN
@@ -182,7 +175,7 @@ def _pair(found: Float[np.ndarray, "delays pairs"]) -> int | None:
 
 def _response(flown: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
-    _, omega, rates = averages(flown.time, flown.omega, flown.states[:, RATES], held=flown.held)(step)
+    _, omega, rates = averages(flown.time, flown.omega, flown.states[:, RATES], step, held=flown.held)
     acceleration = np.diff(rates, axis=0) / step
     for i, axis in enumerate(excitation(flown).values()):
         if axis.verdict not in ("good", "weak"):
@@ -202,16 +195,12 @@ def _response(flown: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndar
 # s; time constants with which the upright direction is drawn to the specific force. The first forgets errors of the
 # gyro sooner, the second holds in longer turns.
 LEVELS = 2.0, 8.0
-
-
 # s; dead reckoning forgets its velocity with these time constants. Where motion along z has a period of a few seconds,
 # what is forgotten in 2 s looks like thrust: z_drag is 17 % too large. Without attitude, 20 s sum up too many errors.
 FORGETS, FORGETS_WITHOUT_ATTITUDE = 20.0, 2.0
 
 
-def velocity_of(
-    recording: Recording, *, forgets: float | None = None
-) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
+def velocity_of(recording: Recording, *, forgets: float | None = None) -> tuple[Vectors, Ups] | None:
     """The motion of a vehicle through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
@@ -260,7 +249,7 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
     axes = np.asarray(airframe.sensor_axes)
     axes = np.where(np.abs(axes) < 1e-12, 0.0, axes)  # of right angles
 
-    def turned(measured: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
+    def turned(measured: Vectors) -> Vectors:
         # A channel that was not measured is missing along the axes to which it contributes, and not along others.
         return np.column_stack([measured[:, row != 0] @ row[row != 0] for row in axes])
 
@@ -269,13 +258,7 @@ def in_body_axes(recording: Recording, airframe: Airframe | None) -> Recording:
     return recording._replace(states=states, specific_force=None if force is None else turned(force))
 
 
-def _dead_reckoned(
-    rates: Float[np.ndarray, "samples 3"],
-    force: Float[np.ndarray, "samples 3"],
-    up: Float[np.ndarray, "samples 3"],
-    dt: float,
-    forgets: float,
-) -> Float[np.ndarray, "samples 3"]:
+def _dead_reckoned(rates: Vectors, force: Vectors, up: Vectors, dt: float, forgets: float) -> Vectors:
     """The velocity by measurements until each sample. Plain numbers in a loop are ten times faster than arrays."""
     push = force - GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
@@ -290,9 +273,7 @@ def _dead_reckoned(
     return np.array(velocities)
 
 
-def _upright(
-    rates: Float[np.ndarray, "samples 3"], force: Float[np.ndarray, "samples 3"], dt: float, level: float
-) -> Float[np.ndarray, "samples 3"]:
+def _upright(rates: Vectors, force: Vectors, dt: float, level: float) -> Vectors:
     """The upright direction: fixed in the earth, and drawn to the specific force with the time constant `level` [s]."""
     x, y, z, turn, directions = 0.0, 0.0, 1.0, dt / level, []
     drawn = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-3)

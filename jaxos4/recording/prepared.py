@@ -13,19 +13,19 @@ from ..airframe import INERTIAS, Airframe
 from ..errors import InputError, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..logs import Recording
+from ..logs.table import counted
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
-from .richest import fair_share, note_of
 from .sensor_errors import force_level, force_noise, vibrating_rates, without_noise
 from .stretches import Stretch, cut, end_of_tumble, nothing_usable
-from .windows import averaged, concatenate, hold_out, whole_windows
+from .windows import MOST, averaged, concatenate, fair_share, hold_out, whole_windows
 
 HOLDOUT = 0.25
 """The share that is held out by default."""
 _NEARLY = 1.01  # sample times that differ by less than this factor count as equal
-
+_SAME = 1e-6  # durations that differ by less than this share are equal
 
 WINDOW = 0.25  # s
 MIN_SAMPLES = 4  # of a window
@@ -173,26 +173,24 @@ def _cleaned(
     name, facts = recording.name, recording.facts
     if np.isnan(recording.states[:, RATES]).all(axis=0).any():
         raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
-    found = [msgspec.structs.replace(each, cause=f"{name}: {each.cause}") for each in findings(evidence)]
-    judged = [
-        each
-        for each in found
-        if {*each.quantities} & {*INERTIAS} or (each.contradicted and each.quantities != ("attitude",))
-    ]
-    notes = [str(each) for each in found if each not in judged]
     slow = (facts._replace(gyro=None) if predicted else facts).too_slow
     usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
     if slow:
         raise InputError(f"{name}: {slow}.")
+    opposite = opposite_axes(usable, airframe)
+    if refused := refused_note(opposite):
+        raise InputError(f"{name}: {refused}.")
+    notes, judged = [], []
+    for found in filter(None, (*findings(evidence), opposite_yaw(opposite.get("yaw")))):
+        found = msgspec.structs.replace(found, cause=f"{name}: {found.cause}")
+        if {*found.quantities} & {*INERTIAS} or (found.contradicted and found.quantities != ("attitude",)):
+            judged.append(found)
+        else:
+            notes.append(str(found))
     if limited := at_limit(evidence.recording, airframe):
         notes.append(limited)
     if begin is None and (recovered := end_of_tumble(evidence.recording, airframe)) is not None:
         notes.append(f"{name}: tumbles at launch until {recovered:.1f} s (`begin` {recovered:.1f} leaves this out)")
-    opposite = opposite_axes(usable, airframe)
-    if refused := refused_note(opposite):
-        raise InputError(f"{name}: {refused}.")
-    if yaw := opposite_yaw(opposite.get("yaw")):
-        judged.append(msgspec.structs.replace(yaw, cause=f"{name}: {yaw.cause}"))
     return usable, [*notes, *recording.named_notes, *note], judged
 
 
@@ -212,34 +210,34 @@ def _usable(
 ) -> tuple[list[Recording], list[str]]:
     """The usable stretches, or those from `begin` to `end`; notes on the others. `slow`: why the log is too slow."""
     recording = evidence.recording
-    name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
+    name, (first, last), notes = recording.name, recording.time[[0, -1]].tolist(), []
+    parts, refused = evidence.usable, [stretch for stretch in evidence.every if stretch.reason]
     if begin is not None or end is not None:
         given = Stretch(first if begin is None else begin, last if end is None else end)
         with named(name):
             cut(recording, given)
-        return _richest(evidence, [Stretch(max(given.begin, first), min(given.end, last))])
-    usable = evidence.usable
-    refused = sorted((stretch for stretch in evidence.every if stretch.reason), key=lambda stretch: -stretch.length)
-    if not usable:
+        parts = [Stretch(max(given.begin, first), min(given.end, last))]
+    elif not parts:
         remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
         besides = f" Besides, {slow}." if slow else ""
         raise InputError(f"{name}: {nothing_usable(evidence.every)}; {remedy}.{besides}")
-    if not refused:
-        return _richest(evidence, usable)
-    reasons = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in refused[:3])
-    seconds = sum(stretch.length for stretch in usable)
-    note = (
-        f"{name}: {seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {reasons}"
-        f"{'; ...' if len(refused) > 3 else ''}{'' if predicted else ' (`begin` and `end` override)'}"
-    )
-    pieces, notes = _richest(evidence, usable)
-    return pieces, [note, *notes]
-
-
-def _richest(evidence: Evidence, parts: Sequence[Stretch]) -> tuple[list[Recording], list[str]]:
-    """The parts, or if they are too long those that tell the most; and a note on that."""
-    recording, chosen = evidence.recording, evidence.richest(parts)
-    return [cut(recording, each) for each in chosen], note_of(recording.name, chosen, parts)
+    elif refused:
+        longest = sorted(refused, key=lambda stretch: -stretch.length)[:3]
+        reasons = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in longest)
+        notes.append(
+            f"{name}: {sum(part.length for part in parts):.1f} of {last - first:.1f} s are used, in {len(parts)} "
+            f"stretches; not used: {reasons}{'; ...' if len(refused) > 3 else ''}"
+            f"{'' if predicted else ' (`begin` and `end` override)'}"
+        )
+    chosen = evidence.richest(parts)
+    seconds, usable = (sum(each.length for each in every) for every in (chosen, parts))
+    if seconds <= (1 - _SAME) * usable:
+        notes.append(
+            f"{name}: {seconds:.1f} of {usable:.1f} usable s are fitted, because more than {MOST:,} samples take "
+            f"minutes: the {counted(len(chosen), 'part')} whose torques vary the most (a longer `sample_time` fits "
+            "more; `begin` and `end` choose another part)"
+        )
+    return [cut(recording, each) for each in chosen], notes
 
 
 def _sample_times(

@@ -18,10 +18,8 @@ from ..flight import RATES, Flight
 from ..logs import Recording, as_recording
 from ..logs.sampling import runs
 
-ON_GROUND, IDLE = "on the ground", "motors idle"
-# Labels of samples; the last one that applies counts. The reason of a rotor at its limit names the rotor.
-_USABLE, _SHORT, _SATURATED, _LOST, _CRASHED, _IDLE, _GROUND = range(7)
-_REASONS = ("", "less than {:g} s between others", "", "nothing was measured", "an impact", IDLE, ON_GROUND)
+ON_GROUND, IDLE, LOST = "on the ground", "motors idle", "nothing was measured"
+_SATURATED = "rotors"  # this reason then names the rotors
 
 Samples = Bool[np.ndarray, " samples"]
 
@@ -59,40 +57,38 @@ def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> t
         landed |= (time >= begin - dt / 2) & (time <= end + dt / 2)
     ground = _ground(share, dt) | landed
     saturations = _saturations(omega, airframe, dt)
-    labels = np.zeros(time.size, dtype=int)
-    labels[np.any([where.any(axis=1) for where in saturations.values()], axis=0)] = _SATURATED
-    labels[_lost(recording.states, dt)] = _LOST
-    labels[_crashed(rates, force, share, ground, dt)] = _CRASHED
-    labels[ground] = _IDLE
-    labels[landed] = _GROUND
+    reasons = np.full(time.size, "", dtype=object)  # of each sample; the last one that applies counts
+    reasons[np.any([where.any(axis=1) for where in saturations.values()], axis=0)] = _SATURATED
+    reasons[_lost(recording.states, dt)] = LOST
+    reasons[_crashed(rates, force, share, ground, dt)] = "an impact"
+    reasons[ground] = IDLE
+    reasons[landed] = ON_GROUND
     weight = np.full(time.size, np.nan) if force is None else np.linalg.norm(force, axis=1) / STANDARD_GRAVITY
-    for begin, end in runs(labels == _IDLE):
+    for begin, end in runs(reasons == IDLE):
         felt = weight[begin:end][np.isfinite(weight[begin:end])]
         if felt.size and abs(np.median(felt) - 1) < ONE_G:
-            labels[begin:end] = _GROUND
+            reasons[begin:end] = ON_GROUND
     if force is not None:
-        labels[_resting(omega, force, rates, labels == _USABLE, dt) & (labels != _LOST)] = _GROUND
-    for begin, end in runs(labels == _USABLE):
+        reasons[_resting(omega, force, rates, reasons == "", dt) & (reasons != LOST)] = ON_GROUND
+    for begin, end in runs(reasons == ""):
         if time[end - 1] - time[begin] < MIN_STRETCH - dt / 2:
-            labels[begin:end] = _SHORT
-
-    def reason(begin: int, end: int) -> str:
-        if labels[begin] != _SATURATED:
-            return _REASONS[labels[begin]].format(MIN_STRETCH)
-        rotors = {what: np.flatnonzero(where[begin:end].any(axis=0)) + 1 for what, where in saturations.items()}
-        return "; ".join(f"rotor {', '.join(map(str, which))} {what}" for what, which in rotors.items() if which.size)
-
-    edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), labels.size]
-    return tuple(
-        Stretch(float(time[begin]), float(time[end - 1]), reason(begin, end))
-        for begin, end in itertools.pairwise(edges)
-    )
+            reasons[begin:end] = f"less than {MIN_STRETCH:g} s between others"
+    found = []
+    edges = [0, *(np.flatnonzero(reasons[1:] != reasons[:-1]) + 1).tolist(), reasons.size]
+    for begin, end in itertools.pairwise(edges):
+        reason = reasons[begin]
+        if reason == _SATURATED:
+            rotors = {what: np.flatnonzero(where[begin:end].any(axis=0)) + 1 for what, where in saturations.items()}
+            every = (f"rotor {', '.join(map(str, which))} {what}" for what, which in rotors.items() if which.size)
+            reason = "; ".join(every)
+        found.append(Stretch(float(time[begin]), float(time[end - 1]), reason))
+    return tuple(found)
 
 
 def nothing_usable(every: Sequence[Stretch]) -> str:
     """Why none of these stretches can be used, in words: the longest one, with its reason."""
     longest = max(every, key=lambda stretch: stretch.length)
-    no_flight = (ON_GROUND, IDLE, "less than", _REASONS[_LOST])
+    no_flight = (ON_GROUND, IDLE, "less than", LOST)
     grounded = longest.reason in (ON_GROUND, IDLE) and all(each.reason.startswith(no_flight) for each in every)
     never = "the vehicle never flew" if grounded else "no part can be used"
     return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
@@ -123,11 +119,6 @@ def cut(flight: Recording, stretch: Stretch) -> Recording:
             f"{time[0]:.6g} s to {time[-1]:.6g} s."
         )
     return flight.rows(slice(int(inside[0]), int(inside[-1]) + 1))
-
-
-def usable(recording: Recording, airframe: Airframe | None = None) -> list[Recording]:
-    """The usable stretches of a flight, each as a recording."""
-    return [cut(recording, stretch) for stretch in stretches(recording, airframe) if not stretch.reason]
 
 
 # The smallest share of full command at which a vehicle hovers: no vehicle has a thrust of 25 times its weight.

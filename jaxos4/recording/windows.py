@@ -1,18 +1,79 @@
-"""Recordings in windows: averaged to longer samples, concatenated in whole windows, some of them held out."""
+"""The parts of recordings that are fitted: the most informative ones, averaged, in whole windows, some held out."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Float
 
 from ..flight import SIGNALS, Flight, Signal
 from ..logs import Recording, as_recording
 from ..logs.sampling import averages, speeds_within
 from ..logs.table import signals_of
+from .stretches import MIN_STRETCH, Stretch, cut
 
+PIECE = 30.0  # s; shorter pieces would be chosen for their gusts, which biases a fit, and begin with unsettled filters
+MOST = 65_536  # samples of a fit, which takes more than a minute; flights of any length up to it share a program
+_BIN = 0.02  # s; torques that change faster hardly turn a vehicle
+_LEVELS = 2.0  # for each factor of 2; pieces whose torques differ only by chance count as equal
 _SAME = 1e-6  # sample times that differ by less than this share are equal
+
+
+def fair_share(recordings: Sequence[Recording], step: float) -> float:
+    """The longest duration to fit of each recording [s], so that all together have `MOST` samples of `step` [s].
+
+    A fit of all of a long log would take hours, and change only the last digits.
+    """
+    lengths, left = sorted(float(np.ptp(each.time[[0, -1]])) for each in recordings), MOST * step
+    for number, length in enumerate(lengths):
+        if length * (len(lengths) - number) > left:
+            return left / (len(lengths) - number)
+        left -= length
+    return math.inf
+
+
+def richest(
+    recording: Recording, parts: Sequence[Stretch], torques: Float[np.ndarray, "axes 4"], seconds: float
+) -> list[Stretch]:
+    """The pieces of some parts in which the torques vary the most, in the order of time.
+
+    Roll, pitch and yaw choose in turn. The first of equal pieces is chosen.
+
+    **Arguments:**
+
+    - `parts`: usable stretches of the recording.
+    - `torques`: the matrix from squared rotor speeds to the torque about each axis. Only ratios count.
+    - `seconds`: the longest total duration of the pieces [s], of which at least one is chosen. If all parts together
+      are shorter, they are returned.
+    """
+    if sum(part.length for part in parts) <= seconds:
+        return list(parts)
+    longest = max(seconds / math.ceil(seconds / PIECE), MIN_STRETCH)
+    pieces, varied = [], []
+    for part in parts:
+        edges = np.linspace(part.begin, part.end, math.ceil(part.length / longest) + 1).tolist()
+        pieces += [Stretch(begin, end) for begin, end in itertools.pairwise(edges)]
+    for piece in pieces:
+        flown = cut(recording, piece)
+        torque, length = np.square(flown.omega) @ torques.T, max(round(_BIN / flown.dt), 1)
+        whole = torque[: len(torque) // length * length]
+        varied.append(whole.reshape(-1, length, len(torques)).mean(axis=1).std(axis=0))
+    levels = np.rint(_LEVELS * np.log2(np.maximum(varied, np.finfo(float).tiny)))
+    ranks = np.argsort(-levels, axis=0, kind="stable").T.tolist()
+    chosen, left = set(), seconds * (1 + 1e-9)
+    for number in (number for in_turn in zip(*ranks, strict=True) for number in in_turn):
+        if number not in chosen and (not chosen or pieces[number].length <= left):
+            chosen.add(number)
+            left -= pieces[number].length
+    out: list[Stretch] = []
+    for piece in (pieces[number] for number in sorted(chosen)):
+        if out and out[-1].end == piece.begin:
+            out[-1] = Stretch(out[-1].begin, piece.end)
+        else:
+            out.append(piece)
+    return out
 
 
 def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
@@ -20,20 +81,20 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
 
     A length that does not exceed the flight's own sample time leaves its samples as they are.
     """
-    within = speeds_within(flight.time, flight.omega, held=flight.held)
-    columns = flight.columns()
-    average = averages(flight.time, flight.omega, np.column_stack([*columns.values()]), held=flight.held)
-
-    def at(dt: float) -> Recording:
+    columns, found = flight.columns(), []
+    channels = np.column_stack([*columns.values()])
+    for dt in steps:
         if dt <= flight.dt * (1 + _SAME):
-            return flight._replace(within=within(flight.time, flight.dt))
-        time, omega, means = average(dt)
-        signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within(time, dt)}
+            within = speeds_within(flight.time, flight.omega, flight.time, flight.dt, held=flight.held)
+            found.append(flight._replace(within=within))
+            continue
+        time, omega, means = averages(flight.time, flight.omega, channels, dt, held=flight.held)
+        within = speeds_within(flight.time, flight.omega, time, dt, held=flight.held)
+        signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within}
         # A mean of n instants has the same variance in time as a continuous mean over this shorter time.
         averaging_time = dt * math.sqrt(1 - (flight.dt / dt) ** 2)
-        return flight._replace(**signals, time=time, held=True, averaging_time=averaging_time)
-
-    return [at(dt) for dt in steps]
+        found.append(flight._replace(**signals, time=time, held=True, averaging_time=averaging_time))
+    return found
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:
@@ -110,12 +171,6 @@ def hold_out(
     if not held_out.any() or held_out.all():
         return recording, None
     measured = {name: getattr(recording, name) for name, signal in SIGNALS.items() if not signal.is_input}
-    fitted = {name: None if rows is None else _without(rows, held_out) for name, rows in measured.items()}
-    return recording._replace(**fitted), recording._replace(states=_without(recording.states, ~held_out))
-
-
-def _without(rows: np.ndarray, which: Bool[np.ndarray, " samples"]) -> np.ndarray:
-    """The rows of a signal, with NaN in the samples `which`."""
-    kept = rows.copy()
-    kept[which] = np.nan
-    return kept
+    fitted = {name: x if x is None else np.where(held_out[:, None], np.nan, x) for name, x in measured.items()}
+    tested = np.where(held_out[:, None], recording.states, np.nan)
+    return recording._replace(**fitted), recording._replace(states=tested)

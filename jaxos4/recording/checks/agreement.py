@@ -32,11 +32,14 @@ SLOW_GYRO = 0.0202  # s; the longest sample of a gyro whose integral is compared
 
 def wrong_scale(evidence: Evidence) -> Finding | None:
     """The attitude turns more or less than the gyro says. A slow gyro misses turns between its samples."""
-    turns = evidence.turns
-    if turns is None or _gyro_step(evidence) > SLOW_GYRO:
+    turns, steps = evidence.turns, [0.0]
+    for rates, time in ((each.states[:, RATES], each.time) for each in evidence.stretches):
+        measured = (time[np.isfinite(rate)] for rate in rates.T)
+        steps += [float(np.median(np.diff(each))) for each in measured if each.size > 1]
+    if turns is None or max(steps) > SLOW_GYRO:
         return None
-    matrix, error = turns.matrix.value, np.diagonal(turns.matrix.error)
-    clear = np.abs(matrix) > STANDARD_ERRORS * turns.matrix.error  # others only add noise
+    matrix, errors = turns.matrix
+    clear, error = np.abs(matrix) > STANDARD_ERRORS * errors, np.diagonal(errors)  # others only add noise
     scale = np.linalg.norm(np.where(clear | np.eye(3, dtype=bool), matrix, 0.0), axis=1)
     judged = (error < 0.3 * scale) & (turns.explained > FOLLOWS)
     far = np.abs(np.log(np.where(judged, scale, 1.0))) > math.log1p(SCALE)
@@ -61,22 +64,13 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
     which = "" if far.sum() == judged.sum() else f" in {' and '.join(np.array(MOTIONS)[far])}"
     axes = [f"{a} {s:.3f} +- {2 * e:.2g}" for a, s, e, j in zip(MOTIONS, scale, error, judged, strict=True) if j]
     cause = f"the attitude turns {mean:.3g} times as much as the gyro says{which}; {cause}"
-    return Finding(name, cause, ", ".join(axes), remedy, quantities, True)
-
-
-def _gyro_step(evidence: Evidence) -> float:
-    """The longest median time between samples of p, q or r in flight [s]; 0 without any."""
-    steps = [0.0]
-    for flown in evidence.stretches:
-        seen = np.isfinite(flown.states[:, RATES])
-        steps += [float(np.median(np.diff(flown.time[one]))) for one in seen.T if np.count_nonzero(one) > 1]
-    return max(steps)
+    return Finding(name, cause, ", ".join(axes), remedy, quantities)
 
 
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
     """The cause if the attitude is right: the gyro or the time stamps. A measured velocity tells them apart."""
     if evidence.velocity is not None:
-        slope, unlike = float(evidence.velocity.value[0]), VELOCITY_ERROR
+        slope, unlike = float(evidence.velocity[0, 0]), VELOCITY_ERROR
         if abs(slope / scale - 1) < unlike < abs(slope - 1):
             return "the time stamps are wrong, as the velocity changes by as much"
         if abs(slope - 1) < unlike < abs(slope / scale - 1):
@@ -89,7 +83,7 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     turns = evidence.turns
     if turns is None:
         return None
-    matrix, error = turns.matrix.value, STANDARD_ERRORS * turns.matrix.error
+    matrix, error = turns.matrix[0], STANDARD_ERRORS * turns.matrix[1]
     opposite = [axis for axis, m, e in zip(MOTIONS, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
     tilts = matrix[:2, :2]
     follows = float(turns.explained[:2].max())
@@ -108,7 +102,7 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     else:
         cause, size = "roll and pitch of attitude and gyro are exchanged", f"slope {matrix[0, 1]:.2f}"
     remedy = "give both with x forward, y left, z up; angles in the order of docs/logs.md"
-    return Finding("attitude_axes", cause, size, remedy, _ATTITUDE, True)
+    return Finding("attitude_axes", cause, size, remedy, _ATTITUDE)
 
 
 LIKELIER = 6.0  # of chi^2: a clock 20 times less likely to be wrong than another is not named
@@ -170,11 +164,11 @@ def _delays(evidence: Evidence) -> tuple[list[tuple[tuple[int, int, int, int], f
     turns, response = evidence.turns, evidence.response
     delays, differ = [], False
     if turns is not None and turns.explained[:2].max() > FOLLOWS:
-        late, error = float(turns.delay.value), float(turns.delay.error)
+        late, error = turns.delay.tolist()
         delays.append(((-1, 0, 1, 0), late, math.hypot(error, FILTERS)))
         differ |= abs(late) > max(LATE_ATTITUDE, STANDARD_ERRORS * error)
     if response is not None and response.explained[:2].max() > EXPLAINED[0]:
-        gyro, _, between = zip(response.delays.value.tolist(), response.delays.error.tolist(), strict=True)
+        gyro, _, between = response.delays.T.tolist()
         answered = ANSWERED * (1 - float(response.explained[:2].mean()))
         late, usual = _beyond(gyro[0], answered), DAMPING
         if response.lag:  # commands: the rotors' own lag and delay are unknown
@@ -203,7 +197,7 @@ def velocity_axes(evidence: Evidence) -> Finding | None:
     slopes = evidence.velocity
     if slopes is None:
         return None
-    (along, across), errors = slopes.value, STANDARD_ERRORS * slopes.error
+    (along, across), errors = slopes[0], STANDARD_ERRORS * slopes[1]
     angle, scale = math.atan2(across, along), math.hypot(along, across)
     turned = abs(angle) > ANGLE and abs(across) > errors[1] and scale > errors.max()
     if not turned and abs(scale - 1) <= max(VELOCITY_ERROR, errors[0]):
@@ -223,5 +217,4 @@ def velocity_axes(evidence: Evidence) -> Finding | None:
         f"{scale:.2f} times as much, turned by {math.degrees(angle):.0f} degrees",
         "give the velocity along the earth's axes that the attitude refers to, in m/s",
         ("thrust", "attitude", "damping"),
-        True,
     )

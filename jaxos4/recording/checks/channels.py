@@ -32,13 +32,12 @@ def uneven_time(evidence: Evidence) -> Finding | None:
         size,
         "write the flight to a CSV and read it with `jaxos4.recording.read_recording`, which resamples it",
         (*INERTIAS, "thrust", "motors", "damping", "attitude"),
-        True,
     )
 
 
 def impossible_values(evidence: Evidence) -> Finding | None:
     """Single values far from all others."""
-    found = evidence.plausible.impossible
+    _, found, _ = evidence.plausible
     if not found:
         return None
     return Finding(
@@ -56,7 +55,7 @@ MANY_CLIPPED = 0.1  # share of clipped values above which a channel cannot be us
 
 def clipped_values(evidence: Evidence) -> Finding | None:
     """Values at the end of a sensor's range."""
-    found = evidence.plausible.clipped
+    _, _, found = evidence.plausible
     if not found:
         return None
     each = [f"{n}: {count} ({percent(share)}) at {end:.4g} {UNITS[n]}" for n, (count, share, end) in found.items()]
@@ -87,7 +86,6 @@ def constant_force(evidence: Evidence) -> Finding | None:
         f"{measured[0]:.4g} m/s^2 in all {measured.size} samples",
         "log what the accelerometer measures, or leave its columns out",
         ("thrust", *INERTIAS),
-        True,
     )
 
 
@@ -121,7 +119,6 @@ def rare_motors(evidence: Evidence) -> Finding | None:
         f"new values every {1e3 * evidence.motor_step:.0f} ms",
         "log motors at 100 Hz or more, on board",
         ("damping",),
-        True,
     )
 
 

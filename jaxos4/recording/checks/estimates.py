@@ -19,23 +19,16 @@ _STEP, _SPAN, _SHIFTS = 0.01, 0.1, np.arange(-50, 51)
 
 Pair = tuple[np.ndarray, np.ndarray]
 
+Measured = Float[np.ndarray, "2 ..."]
+"""Numbers that follow from the log, and then their standard errors."""
 
-class Measured(msgspec.Struct, frozen=True):
-    """Numbers that follow from the log, and their standard errors, of the same shape."""
 
-    value: Float[np.ndarray, "..."]
-    error: Float[np.ndarray, "..."]
-
-    @classmethod
-    def of(cls, sums: Inexact[np.ndarray, "batches ..."], fit: Callable[[np.ndarray], np.ndarray]) -> "Measured":
-        """Fits the sum of all batches. Errors are by the jackknife, which leaves out one batch at a time."""
-        whole = sums.sum(axis=0)
-        without = np.array([fit(whole - batch) for batch in sums])
-        share = (len(sums) - 1) / len(sums)
-        return cls(np.asarray(fit(whole)), np.sqrt(share * np.square(without - without.mean(axis=0)).sum(axis=0)))
-
-    def __getitem__(self, which: int | slice) -> "Measured":
-        return Measured(np.asarray(self.value[which]), np.asarray(self.error[which]))
+def jackknife(sums: Inexact[np.ndarray, "batches ..."], fit: Callable[[np.ndarray], np.ndarray]) -> Measured:
+    """Fits the sum of all batches. Standard errors follow from fits that leave out one batch at a time."""
+    whole = sums.sum(axis=0)
+    without = np.array([fit(whole - batch) for batch in sums])
+    share = (len(sums) - 1) / len(sums)
+    return np.stack([fit(whole), np.sqrt(share * np.square(without - without.mean(axis=0)).sum(axis=0))])
 
 
 def batched(products: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "batches ..."]:
@@ -47,12 +40,12 @@ class Turns(msgspec.Struct, frozen=True):
     """The turns of the attitude: `matrix` times the turns of the gyro, `delay` later.
 
     - `matrix`: the identity if both agree. Rows are the axes of the attitude, columns the axes of the gyro.
-    - `delay`: the delay of the attitude behind the gyro [s].
+    - `delay`: the delay of the attitude behind the gyro [s]. Both are `Measured`: values, and standard errors.
     - `explained`: by axis of the attitude, the share of its turns that the gyro explains.
     """
 
-    matrix: Measured
-    delay: Measured
+    matrix: Float[np.ndarray, "2 3 3"]
+    delay: Float[np.ndarray, "2"]
     explained: Float[np.ndarray, "3"]
 
 
@@ -74,9 +67,8 @@ def attitude_turns(stretches: Sequence[Recording]) -> Turns | None:
         matrix, delay, _ = _fit(products)
         return np.append(matrix, delay)
 
-    found = Measured.of(sums, fit)
-    matrix = Measured(found.value[:9].reshape(3, 3), found.error[:9].reshape(3, 3))
-    return Turns(matrix, found[9], _fit(sums.sum(axis=0))[2])
+    found = jackknife(sums, fit)
+    return Turns(found[:, :9].reshape(2, 3, 3), found[:, 9], _fit(sums.sum(axis=0))[2])
 
 
 def scaled_angles(stretches: Sequence[Recording], turns: Turns) -> float:
@@ -87,10 +79,10 @@ def scaled_angles(stretches: Sequence[Recording], turns: Turns) -> float:
     **Returns:** how much better the gyro agrees with the scaled angles than with the scaled rates, in standard errors;
     negative if worse, 0 if unknown.
     """
-    scale = np.diagonal(turns.matrix.value)
+    scale = np.diagonal(turns.matrix[0])
     if (scale <= 0).any():
         return 0.0
-    better, shift = [], round(float(turns.delay.value) / _STEP)
+    better, shift = [], round(float(turns.delay[0]) / _STEP)
     for (as_logged, gyro), (scaled, _) in zip(_turned(stretches), _turned(stretches, scale), strict=True):
         first, last = max(shift, 0), len(gyro) + min(shift, 0)
         gyro = gyro[first - shift : last - shift]
@@ -234,7 +226,7 @@ def _slopes(
             continue
         own = max(step, flown.dt)
         columns = np.hstack([states[:, :3], flown.specific_force, states[:, 3:]])
-        _, _, means = averages(flown.time, flown.omega, columns, held=flown.held)(own)
+        _, _, means = averages(flown.time, flown.omega, columns, own, held=flown.held)
         given, found = vectors(*np.split(means, 3, axis=1), own)
         known = np.isfinite(given).all(axis=1) & np.isfinite(found).all(axis=1)
         if known.any():
@@ -243,4 +235,4 @@ def _slopes(
     products = np.concatenate([np.empty((0, 3)), *every])
     if len(products) < 4 * BATCHES or products[:, 2].sum() <= 0:
         return None
-    return Measured.of(batched(products), lambda sums: sums[:2] / sums[2])
+    return jackknife(batched(products), lambda sums: sums[:2] / sums[2])

@@ -16,10 +16,10 @@ from ...airframe import GRAVITY, Airframe
 from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
-from ...logs.values import Plausible, plausible
-from ..motion import in_body_axes, torques_of
-from ..richest import richest
+from ...logs.values import Clipped, Impossible, plausible
+from ..motion import PAIRS, in_body_axes
 from ..stretches import MARGIN, MIN_STRETCH, Stretch, cut, stretches
+from ..windows import richest
 from .estimates import Measured, Turns, attitude_turns, tilt_slopes, velocity_slopes
 from .response import Response, rotor_response
 
@@ -41,7 +41,7 @@ class Finding(msgspec.Struct, frozen=True):
     size: str
     remedy: str
     quantities: tuple[str, ...]
-    contradicted: bool
+    contradicted: bool = True
 
     def __str__(self) -> str:
         return f"{self.cause} ({self.size}); {self.remedy}"
@@ -75,14 +75,14 @@ class Evidence:
         self.logged, self.airframe, self.seconds = recording, airframe, seconds
 
     @functools.cached_property
-    def plausible(self) -> Plausible:
+    def plausible(self) -> tuple[Recording, Impossible, Clipped]:
         """The recording without faulty values, along the sensors' axes, and these values."""
         return plausible(self.logged)
 
     @functools.cached_property
     def recording(self) -> Recording:
         """The recording without faulty values, along the body's axes."""
-        return in_body_axes(self.plausible.recording, self.airframe)
+        return in_body_axes(self.plausible[0], self.airframe)
 
     @functools.cached_property
     def every(self) -> tuple[Stretch, ...]:
@@ -96,7 +96,8 @@ class Evidence:
 
     def richest(self, parts: Sequence[Stretch]) -> list[Stretch]:
         """The most informative pieces of some parts, of at most `seconds` together."""
-        return richest(self.recording, parts, torques_of(self.airframe), self.seconds)
+        torques = PAIRS if self.airframe is None else np.asarray(self.airframe.mixer, dtype=float)[:3]
+        return richest(self.recording, parts, torques, self.seconds)
 
     @functools.cached_property
     def stretches(self) -> tuple[Recording, ...]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..._custom_types import Numeric
 from ...airframe import GRAVITY, INERTIAS, YAW
 from ...rotations import angles_of, rotation
-from .estimates import BATCHES, Measured, batched
+from .estimates import BATCHES, Measured, batched, jackknife
 from .evidence import EXPLAINED, STANDARD_ERRORS, Evidence, Finding
 
 ANGLE = 0.14  # rad about the vertical axis; 20 degrees change inertias by 8 %, 8 degrees by 1 %
@@ -45,7 +45,7 @@ def turned_about_vertical(evidence: Evidence) -> Finding | None:
     if quantities != ("attitude",):
         turn = rotation(np.array([0.0, 0.0, angle[0]]))
         remedy = f"{_rotation_for(evidence, turn)}: counter-clockwise seen from above"
-    return Finding("mounting", cause, ways, remedy, quantities, True)
+    return Finding("mounting", cause, ways, remedy, quantities)
 
 
 def _rotation_for(evidence: Evidence, turn: Float[Numeric, "3 3"]) -> str:
@@ -68,7 +68,6 @@ def opposite_yaw(correlation: float | None) -> Finding | None:
         "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
         "all four signs",
         (YAW.inertia,),
-        True,
     )
 
 
@@ -81,9 +80,8 @@ def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     response = evidence.response
     if response is None or response.explained[:2].sum() < EXPLAINED[0]:
         return None
-    sizes = np.hypot(*response.turning.value)
-    (a, b), (c, d) = response.turning.value / sizes
-    errors = response.turning.error / sizes
+    turning, errors = response.turning / np.hypot(*response.turning[0])
+    (a, b), (c, d) = turning
     apart = abs(math.remainder(math.atan2(-c, a) - math.atan2(b, d), math.tau))
     across = math.hypot(errors[0, 1], errors[1, 0])
     if not apart < max(SAME_ANGLE, STANDARD_ERRORS * across) or across > UNCERTAIN:
@@ -96,8 +94,9 @@ def _by_attitude(evidence: Evidence) -> tuple[float, float] | None:
     turns = evidence.turns
     if turns is None:
         return None
-    (a, b), (c, d) = turns.matrix.value[:2, :2]
-    size, error = math.sqrt(abs(a * d - b * c)), math.hypot(turns.matrix.error[0, 1], turns.matrix.error[1, 0])
+    matrix, errors = turns.matrix[:, :2, :2]
+    (a, b), (c, d) = matrix
+    size, error = math.sqrt(abs(a * d - b * c)), math.hypot(errors[0, 1], errors[1, 0])
     if a * d < b * c or error >= size:
         return None
     return math.atan2(c - b, a + d), error / (2 * size)
@@ -110,7 +109,7 @@ def earth_axes(evidence: Evidence) -> Finding | None:
     """Specific force along the axes of the earth: its horizontal part follows the tilt."""
     if evidence.tilt is None:
         return None
-    slope, error = float(evidence.tilt.value[0]), float(evidence.tilt.error[0])
+    slope, error = evidence.tilt[:, 0].tolist()
     if slope < max(ALONG_EARTH, STANDARD_ERRORS * error):
         return None
     return Finding(
@@ -120,7 +119,6 @@ def earth_axes(evidence: Evidence) -> Finding | None:
         "axes of the earth, 0 or less along those of the body",
         "log the accelerometer along the body's axes, or turn it by the attitude",
         ("thrust", *INERTIAS),
-        True,
     )
 
 
@@ -158,7 +156,6 @@ def thrust_direction(evidence: Evidence) -> Finding | None:
         f"{math.degrees(tilt):.0f} degrees, along {along}" + ("" if rest is None else ", at rest before take-off"),
         f"log x forward, y left, z up, or {_rotation_for(evidence, level)}: the angle about z is not known",
         ("thrust", *INERTIAS),
-        True,
     )
 
 
@@ -236,9 +233,9 @@ def different_thrust(every: Sequence[Evidence]) -> Finding | None:
         ratios = [ratio for evidence in every if (ratio := _thrust_ratio(evidence)) is not None]
     if len(ratios) < 2:
         return None
-    least, most = (choose(ratios, key=lambda ratio: float(ratio.value)) for choose in (min, max))
-    apart = float(most.value / least.value) - 1
-    error = STANDARD_ERRORS * np.hypot(least.error / least.value, most.error / most.value)
+    least, most = (choose(ratios, key=lambda ratio: float(ratio[0])) for choose in (min, max))
+    apart = float(most[0] / least[0]) - 1
+    error = STANDARD_ERRORS * np.hypot(least[1] / least[0], most[1] / most[0])
     commanded = any(evidence.logged.commanded for evidence in every)
     if apart < max(VEHICLES, error):
         return None
@@ -265,4 +262,4 @@ def _thrust_ratio(evidence: Evidence) -> Measured | None:
     both = np.concatenate(every)
     if len(both) < BATCHES or both.mean(axis=0).min() <= 0:
         return None
-    return Measured.of(batched(both), lambda sums: sums[0] / sums[1])
+    return jackknife(batched(both), lambda sums: sums[0] / sums[1])

@@ -22,10 +22,9 @@ from ...logs import Recording
 from ..motion import velocity_of
 from ..sensor_errors import spectra
 from ..windows import averaged
-from .estimates import BATCHES, Measured, interpolated, peak
+from .estimates import BATCHES, Measured, interpolated, jackknife, peak
 
 Signals = Float[np.ndarray, "samples _signals"]
-
 
 STEP = 0.012  # s; samples of the gyro; shorter ones would show only the start of a filter's response
 LONGEST = 0.034  # s; the longest step
@@ -37,12 +36,9 @@ PASSES = 4  # of the fit of gains and of the noise model in turn
 FORCE_STEP = 0.004  # s; samples of the accelerometer
 SPECTRUM = 2.0  # s; duration of the samples of one spectrum
 BAND = 2.0, 15.0  # Hz; below are wind and height control; above, the rotors' lag and the gyro's noise leave little
-FORGETS = 2.0
-"""Angle and velocity, on which damping and inflow act, are forgotten with this time constant [s]."""
-GAP = 0.05
-"""The longest gap that is interpolated [s]."""
-SECONDS = 6.0
-"""The shortest flight whose response is measured [s]."""
+FORGETS = 2.0  # s; angle and velocity, on which damping and inflow act, are forgotten with this time constant
+GAP = 0.05  # s; the longest gap that is interpolated
+SECONDS = 6.0  # s; the shortest flight whose response is measured
 
 
 class Response(msgspec.Struct, frozen=True):
@@ -53,18 +49,17 @@ class Response(msgspec.Struct, frozen=True):
     - `explained`: the shares that the rotors explain: of the squared errors with which roll and pitch rate are
       predicted, and of the power of the vertical force. NaN: not measured.
     - `lag`: lag of the rotors [s]; 0 if their speeds were measured.
+
+    The first two are `Measured`: values, and standard errors.
     """
 
-    turning: Measured
-    delays: Measured
+    turning: Float[np.ndarray, "2 2 2"]
+    delays: Float[np.ndarray, "2 3"]
     explained: Float[np.ndarray, "3"]
     lag: float
 
 
-def rotor_response(
-    stretches: Sequence[Recording],
-    airframe: Airframe,
-) -> Response | None:
+def rotor_response(stretches: Sequence[Recording], airframe: Airframe) -> Response | None:
     """Compare gyro and accelerometer with the rotors. `None`: the flight is too short, too slow, or has no gyro."""
     if sum(float(np.ptp(each.time)) for each in stretches) < SECONDS:
         return None
@@ -78,14 +73,11 @@ def rotor_response(
     lag = max(lags, key=lambda lag: float(-np.log1p(-np.nan_to_num(answers[lag][2])).sum()))
     if np.isnan(answers[lag][1]):
         return None
-    found = Measured.of(turns[lag], lambda products: np.append(*_answer(products, flown[0].dt)[:2]))
-    turning, late = Measured(found.value[:4].reshape(2, 2), found.error[:4].reshape(2, 2)), found[4:]
+    found = jackknife(turns[lag], lambda products: np.append(*_answer(products, flown[0].dt)[:2]))
+    turning, late = found[:, :4].reshape(2, 2, 2), found[:, 4:]
     felt, share = _felt([averaged(each, [max(FORCE_STEP, step)])[0] for each in stretches], airframe, lag)
-    between = Measured(late.value - felt.value, np.hypot(late.error, felt.error))
-    value, error = (
-        np.concatenate([getattr(one, name) for one in (late, felt, between)]) for name in ("value", "error")
-    )
-    return Response(turning, Measured(value, error), np.append(answers[lag][2], share), lag)
+    between = np.stack([late[0] - felt[0], np.hypot(late[1], felt[1])])
+    return Response(turning, np.hstack([late, felt, between]), np.append(answers[lag][2], share), lag)
 
 
 def _delays(step: float) -> tuple[int, int]:
@@ -197,7 +189,7 @@ def _forgetting(values: Signals, share: float) -> Signals:
 
 def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float) -> tuple[Measured, float]:
     """The delay of the accelerometer after the rotors [s], and the share of the vertical force that they explain."""
-    unknown = Measured(np.full(1, np.nan), np.full(1, np.nan)), math.nan
+    unknown = np.full((2, 1), np.nan), math.nan
     step, (low, high) = flown[0].dt, BAND
     every = [each for one in flown for each in _spectra(one, airframe, lag)]
     if len(every) < 2:
@@ -226,7 +218,7 @@ def _felt(flown: Sequence[Recording], airframe: Airframe, lag: float) -> tuple[M
         best, after = peak(shares(products))
         return np.array([delays[best] + 1e-3 * after])
 
-    return Measured.of(sums, fit), float(shares(sums.sum(axis=0)).max())
+    return jackknife(sums, fit), float(shares(sums.sum(axis=0)).max())
 
 
 def _spectra(flown: Recording, airframe: Airframe, lag: float) -> list[Complex[np.ndarray, "3 frequencies"]]:
