@@ -12,8 +12,7 @@ from ..comparison import ComparedQuantity, Comparison
 from ..identification.verdict import ADVICE, RESERVED, STATUSES, headline
 from ..logs.table import counted
 from .page import Section, folded, picture, table, text, write_page
-from .panels import Band, Figure, Line, Panel, Scale, across
-from .style import BOUND_DASHES, FAINT, INK, Style, style
+from .panels import BOUND_DASHES, FAINT, INK, Band, Figure, Line, Panel, Scale, Style, across, style
 from .text import DASH, Listing, plain, say, span, with_unit
 
 

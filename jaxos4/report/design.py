@@ -8,8 +8,7 @@ from rich.console import Console
 
 from .._files import write_file
 from ..design import Design
-from .panels import Figure, Line, Panel, Scale
-from .style import styles
+from .panels import Figure, Line, Panel, Scale, styles
 from .svg import as_file
 from .text import Listing, plain
 

@@ -15,8 +15,23 @@ from ..flight import STATE_NAMES
 from ..identification.results import Constant, Identification, SampleTime
 from ..models.state import CASCADE_ORDER
 from ..results import NINETY_FIVE
-from .panels import Band, Figure, Line, Mark, Panel, Scale, Words, across, spread
-from .style import BOUND_DASHES, FAINT, GRID, INK, Style, style
+from .panels import (
+    BOUND_DASHES,
+    FAINT,
+    GRID,
+    INK,
+    Band,
+    Figure,
+    Line,
+    Mark,
+    Panel,
+    Scale,
+    Style,
+    Words,
+    across,
+    spread,
+    style,
+)
 
 _FAR = (2, 10, 100, 1000, 10000, 100000)  # ticks of brackets that were left far behind, in half-widths
 _EVERYWHERE = (-math.inf, math.inf)  # from one end of an axis to the other

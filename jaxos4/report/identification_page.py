@@ -18,7 +18,7 @@ from . import identification_figures as figures
 from .identification_signals import BAND, identified_signals
 from .identification_text import next_lines, notes_of, quantity_rows, share, warning_lines, why_no_value
 from .page import Section, picture, signals, table, template, text, write_page
-from .style import Style, styles
+from .panels import Style, styles
 from .text import DASH, plain, span
 
 # The page shows these entries of the provenance in a place of their own.

@@ -11,8 +11,7 @@ from ..logs import Recording
 from ..logs.sampling import filled
 from ..recording.inspection import Inspection
 from . import timeline
-from .panels import Band, Figure, Line, Panel, Scale
-from .style import BOUND_DASHES, style
+from .panels import BOUND_DASHES, Band, Figure, Line, Panel, Scale, style
 
 _SAMPLES = 5000  # of each signal at most; a page then has less than 600 kB
 _SEGMENT = 1.0  # s; spectra are means of segments of this length

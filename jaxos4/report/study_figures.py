@@ -6,9 +6,8 @@ import numpy as np
 import xarray as xr
 
 from ..study import metrics
-from .panels import Figure, Line, Panel, Scale, across, spread
+from .panels import BOUND_DASHES, Figure, Line, Panel, Scale, Style, across, spread, styles
 from .study_tables import bounds, error_unit, names, positive_scales, scale_labels, shown_level
-from .style import BOUND_DASHES, Style, styles
 from .text import plain
 
 _WIDEST, _NARROWEST = 4.0, 1.4  # line widths [px] of the first and the last estimator, so that none hides another
