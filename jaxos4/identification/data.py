@@ -26,23 +26,17 @@ def silent(stage: str) -> None:
     """Ignores progress."""
 
 
-class Clock(NamedTuple):
-    """For each sample, the number of its log and its time in that log [s]."""
-
-    log: Int[np.ndarray, " samples"] = np.zeros(0, int)
-    time: Float[np.ndarray, " samples"] = np.zeros(0)
-
-
 class HeldOut(NamedTuple):
     """Measurements that are not fitted.
 
     - `problem`: the flight and its model.
-    - `recording`, `clock`: name and times of another recording; `None`: a part of the fitted recordings was held out.
+    - `recording`: the name of another recording; `None`: a part of the fitted recordings was held out.
+    - `time`: of each sample of another vehicle's recording in its log [s].
     """
 
     problem: ShootingProblem
     recording: str | None = None
-    clock: Clock = Clock()
+    time: Float[np.ndarray, " samples"] = np.zeros(0)
 
 
 class Provenance(msgspec.Struct, frozen=True, kw_only=True):
@@ -85,8 +79,8 @@ class Data(Generic[L]):
 
     - `likelihood`: the likelihood with its bracket; padded for a vehicle.
     - `problem`: the flight and its model.
-    - `clock`: log and time of each sample for a vehicle; empty for an OS4.
-    - `provenance`: data, settings and versions. `seconds`: duration of a vehicle's fitted measurements [s].
+    - `provenance`: data, settings and versions.
+    - `log`, `time`: of each sample for a vehicle, the number of its log and its time in that log [s].
     - `held_out`: the measurements that are not fitted, if any.
     - `findings`: faults of the logs that concern moments of inertia, or contradict another quantity.
     - `log_step`: the longest sample of the logs [s].
@@ -97,9 +91,9 @@ class Data(Generic[L]):
 
     likelihood: L
     problem: ShootingProblem
-    clock: Clock
     provenance: Provenance
-    seconds: float = 0.0
+    log: Int[np.ndarray, " samples"] = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    time: Float[np.ndarray, " samples"] = dataclasses.field(default_factory=lambda: np.zeros(0))
     held_out: HeldOut | None = None
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0

@@ -55,7 +55,7 @@ def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAns
     `profile`: the factors of the profile, by parameter.
     """
     names, units, values = optimum.unknowns.names, optimum.unknowns.units, optimum.values
-    problem, logs = optimum.data.problem, optimum.data.clock.log
+    problem, logs = optimum.data.problem, optimum.data.log
     notes, jackknife, longer = dict.fromkeys(optimum.nominal, _NOMINAL_NOTE), np.ones(values.size), np.ones(values.size)
     if has_answer(optimum.estimate.result):
         free = np.flatnonzero(~np.isin(names, [*optimum.nominal, *optimum.negative]))

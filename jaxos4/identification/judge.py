@@ -292,9 +292,11 @@ def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tupl
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
     position = position_of(np.asarray(problem.flight.states, float))
     start = np.zeros(0, int) if predicted is None else predicted.start
-    clock = data.clock if other is None or other.recording is None else other.clock
     signals = omega, states[:, RATES], states[:, :0], disturbance, position
-    traces = Traces(data.clock.time, data.clock.log, *signals, clock.time[start], clock.log[start])
+    starts = data.time[start], data.log[start]
+    if other is not None and other.recording is not None:  # its log comes after the fitted ones
+        starts = other.time[start], np.full(start.size, len(data.provenance.flights or ()))
+    traces = Traces(data.time, data.log, *signals, *starts)
     torques = omega**2 @ np.asarray(answer.problem.model.airframe.mixer)[:3].T
     crossed = residual_correlations(innovation, torques)
     if (parts := optimum.estimate.parts) is not None:

@@ -26,7 +26,7 @@ from ..networks.file import load_network
 from ..noise import SENSOR_SIGMA
 from ..recording.checks import KINEMATIC, self_checks
 from ..shooting import ShootingProblem, Unknowns
-from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, class_name, name_and_class, versions
+from .data import Data, HeldOut, Progress, Provenance, airframe_name, class_name, name_and_class, versions
 
 Intervals = Bracket | Mapping[str, Any] | None
 """A bracket, or `[lower, upper]` by parameter name; the model's default for all others."""
@@ -113,7 +113,7 @@ def prepare_os4(
         **versions(problem),
     )
     findings = self_checks(recording, model.airframe, checks=KINEMATIC)
-    data = Data(problem, problem, Clock(), provenance, held_out=held_out, findings=findings)
+    data = Data(problem, problem, provenance, held_out=held_out, findings=findings)
     return data, name, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
 
 

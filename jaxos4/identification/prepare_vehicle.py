@@ -20,7 +20,7 @@ from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.sensor_errors import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_capacity
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, MEANS, input_innovations, lagged
-from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions
+from .data import Data, HeldOut, Provenance, airframe_name, versions
 from .prepare_os4 import Intervals, bracket_of
 
 SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
@@ -90,18 +90,20 @@ def _data(
 ) -> Data[InnovationsProblem]:
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
-    if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
-        value, error = prepared.level  # the flight shows the accelerometer's error along z
-        bracket = {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
     powered = any(VOLTAGE in TERMS[term].needs for term in terms)
-    if powered and voltage is not None and SAG in model.parameter_names and not isinstance(bracket, Bracket):
+    own: dict[str, Any] = {}
+    if prepared.level is not None and VERTICAL_BIAS in model.parameter_names:
+        value, error = prepared.level  # the flight shows the accelerometer's error along z
+        own[VERTICAL_BIAS] = [value - error, value + error]
+    if powered and voltage is not None and SAG in model.parameter_names:
         unseen = max(map(unseen_sag, recordings))  # a logged voltage contains the rest
         center, half_width = (float(each[model.parameter_names.index(SAG)]) for each in (model.alpha, model.half_width))
-        bracket = {SAG: [unseen * (center - half_width), unseen * (center + half_width)], **(bracket or {})}
-    if airframe.guesses_drag and not isinstance(bracket, Bracket):
-        name, center = YAW.inverse, 1 / float(airframe.inertia[2])
-        bracket = {name: [-GUESS_REACH * center, (2 + GUESS_REACH) * center], **(bracket or {})}
-    unknowns = Unknowns.of(model, bracket_of(bracket, model))
+        own[SAG] = [unseen * (center - half_width), unseen * (center + half_width)]
+    if airframe.guesses_drag:
+        center = 1 / float(airframe.inertia[2])
+        own[YAW.inverse] = [-GUESS_REACH * center, (2 + GUESS_REACH) * center]
+    given = bracket if isinstance(bracket, Bracket) else own | dict(bracket or {})
+    unknowns = Unknowns.of(model, bracket_of(given, model))
     shooting = _problem(model, prepared.fitted, windows=prepared.windows, unknowns=unknowns)
     measured = np.count_nonzero(~np.isnan(shooting.recorded()))
     if measured <= unknowns.count:
@@ -127,14 +129,14 @@ def _data(
         likelihood=_innovations(shooting, prepared, finest),
         problem=shooting,
         provenance=provenance,
-        seconds=prepared.seconds[0],
         held_out=held_out,
         findings=prepared.findings,
         log_step=prepared.log_step,
         motor_step=prepared.motor_step,
         vibrates=prepared.vibrates,
         follows_commands=COMMANDS in prepared.available,
-        clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),
+        log=np.asarray(prepared.recordings)[number],
+        time=prepared.time,
     )
 
 
@@ -215,8 +217,7 @@ def _held_out(
     if validate is not None:
         other = _prepare_other(validate, float(prepared.fitted.dt), model)
         own = dataclasses.replace(model, recordings=other.recordings)
-        clock = Clock(np.full(other.time.size, len(recordings)), other.time)
-        held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, clock), other.seconds[0]
+        held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, other.time), other.seconds[0]
         name, remedy, notes = validate.name, "give another flight", (*notes, *other.notes, *map(str, other.findings))
     elif prepared.tested is not None:
         held_out = HeldOut(dataclasses.replace(fitted, flight=prepared.tested))
