@@ -11,28 +11,25 @@ from ..results import NINETY_FIVE
 from .answers import Answer, drag_error
 from .intervals import PRIOR_NOTE
 from .issues_of_values import MEASURE
-from .results import Constant, ParameterEstimate, PredictionSkill, RigidBody
+from .results import OS4Identification, ParameterEstimate, PredictionSkill, VehicleIdentification
 from .verdict import MAX_PRIOR, PREDICTIONS, RIGID_BODY, Quantity
 
 
-def vehicle_quantities(
-    answer: Answer,
-    table: dict[str, ParameterEstimate],
-    constants: dict[str, Constant],
-    skill: PredictionSkill | None,
-    still: Sequence[str],
-) -> dict[str, Quantity]:
+def vehicle_quantities(answer: Answer, found: VehicleIdentification, still: Sequence[str]) -> dict[str, Quantity]:
     """Moments of inertia, the quantities of the terms, and predictions.
 
-    **Arguments:** `table`, `constants`: of the answer. `skill`: of its predictions. `still`: axes without predictions.
+    `found`: the answer's parameters, moments of inertia and skill. `still`: axes without predictions.
     """
-    model, own, found = answer.problem.model, answer.problem.unknowns, {}
+    model, own, quantities = answer.problem.model, answer.problem.unknowns, dict[str, Quantity]()
+    table, constants = found.parameters, found.rigid_body.constants
     shares = dict(zip(own.names, np.square(answer.bound / np.asarray(own.half_width)).tolist(), strict=True))
     half_widths = dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))
     for axis in AXES:
         row, alpha = constants.get(axis.inertia), axis.inverse
         if row is None:
-            found[axis.inertia] = Quantity(missing=f"the flights say too little about {alpha}; fly more {axis.motion}")
+            quantities[axis.inertia] = Quantity(
+                missing=f"the flights say too little about {alpha}; fly more {axis.motion}"
+            )
         else:
             half, condition = NINETY_FIVE * row.std, f", {row.note}" if row.note else ""
             value = f"{row.estimate:.4g} +- {half:.2g} {row.unit} (95 %){condition}"
@@ -42,7 +39,7 @@ def vehicle_quantities(
                 remedy = MEASURE
             elif shares.get(SAG, 0.0) > MAX_PRIOR and VOLTAGE_EXPONENT not in own.names:
                 remedy = f"log rotor speeds, or the battery's voltage at 10 Hz or more, or {remedy}"
-            found[axis.inertia] = Quantity(value, half / row.estimate, reservations=notes, remedy=remedy)
+            quantities[axis.inertia] = Quantity(value, half / row.estimate, reservations=notes, remedy=remedy)
     for quantity, names in model.quantities.items():
         unseen = [name for name in names if name in answer.fixed and answer.fixed[name].note == PRIOR_NOTE]
         which = f"the flights say less about {', '.join(unseen)} than the bracket; fly with more motion"
@@ -51,8 +48,8 @@ def vehicle_quantities(
         wide = tuple(_too_wide(rows, half_widths))
         missing = which if not rows else "; ".join(wide) if len(wide) == len(rows) else ""
         axes = {axis.inertia for axis in AXES for name in names if name.startswith(axis.motion) and axis != YAW}
-        found[quantity] = Quantity("", 0.0, missing, (*reservations, *wide), requires=tuple(sorted(axes)))
-    return found | {PREDICTIONS: prediction_horizons(skill, still)}
+        quantities[quantity] = Quantity("", 0.0, missing, (*reservations, *wide), requires=tuple(sorted(axes)))
+    return quantities | {PREDICTIONS: prediction_horizons(found.skill, still)}
 
 
 def _too_wide(rows: dict[str, ParameterEstimate], half_widths: dict[str, float]) -> Iterator[str]:
@@ -110,11 +107,11 @@ def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> 
     return Quantity(reach + worse, reservations=unseen)
 
 
-def os4_quantities(table: dict[str, ParameterEstimate], body: RigidBody) -> dict[str, Quantity]:
+def os4_quantities(found: OS4Identification) -> dict[str, Quantity]:
     """The alphas of an OS4, and its rigid body."""
-    found = {}
-    for name, row in table.items():
+    quantities = {}
+    for name, row in found.parameters.items():
         notes = tuple(filter(None, row.note.split("; ")))
-        found[name] = Quantity(missing=row.note) if row.estimate is None else Quantity(reservations=notes)
-    found[RIGID_BODY] = Quantity(missing="" if body.constants else "the alphas are not known well enough")
-    return found
+        quantities[name] = Quantity(missing=row.note) if row.estimate is None else Quantity(reservations=notes)
+    unknown = "" if found.rigid_body.constants else "the alphas are not known well enough"
+    return quantities | {RIGID_BODY: Quantity(missing=unknown)}
