@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from ..airframe import AXES, INERTIAS
 from ..errors import percent
-from ..results import NINETY_FIVE
 from .results import Identification
 from .verdict import IDENTIFIED, MISSING, RESERVED, UNCERTAIN, pooled_status
 
@@ -58,7 +57,7 @@ def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:
 def spreads_of(found: Identification) -> dict[str, float]:
     """The relative half-width of the 95 % interval of each moment of inertia of a result."""
     constants = found.rigid_body.constants if found.is_vehicle else {}
-    return {name: NINETY_FIVE * row.std / abs(row.estimate) for name, row in constants.items() if row.estimate}
+    return {name: row.half_width / abs(row.estimate) for name, row in constants.items() if row.estimate}
 
 
 def _more(motion: str, spread: float, seconds: float) -> str:

@@ -12,7 +12,7 @@ from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
 from ..analysis.traces import Traces
 from ..estimate import Estimate
-from ..results import NO_ANSWER
+from ..results import NINETY_FIVE, NO_ANSWER
 from ..shooting import ShootingProblem
 from .data import Provenance
 from .verdict import Issue, Verdict
@@ -65,6 +65,16 @@ class Constant(msgspec.Struct, frozen=True):
     std: NotNegative
     unit: str
     note: str | msgspec.UnsetType = msgspec.UNSET
+
+    @property
+    def half_width(self) -> float:
+        """Half the width of the 95 % interval."""
+        return NINETY_FIVE * self.std
+
+    @property
+    def ci95(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        return self.estimate - self.half_width, self.estimate + self.half_width
 
 
 class RigidBody(msgspec.Struct, frozen=True):

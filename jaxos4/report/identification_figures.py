@@ -161,9 +161,9 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
     bars: list[Mark] = []
     for row, (name, given) in enumerate(zip(INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
         if name in constants:
-            value, half = constants[name].estimate, NINETY_FIVE * constants[name].std
+            value, (low, high) = constants[name].estimate, constants[name].ci95
             bars += [Band((0, value), 2 * [row - 0.25], 2 * [row + 0.25], look.color, 0.35)]
-            bars += [across([row], [value - half], [value + half], color=look.color, width=2.2, name=_ALL)]
+            bars += [across([row], [low], [high], color=look.color, width=2.2, name=_ALL)]
             bars += [Line([value], [row], look.color, 0, marker=look.marker)]
         else:
             bars += [Words(0, row, "not identified")]
@@ -233,12 +233,12 @@ def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: 
     x = Scale("log", (0.8 * times[0], 1.25 * times[-1]), {time: f"{time:.3g}" for time in times}, "sample time [ms]")
     for name in INERTIAS:
         rows = {1e3 * each.sample_time: each.constants[name] for each in answers if name in each.constants}
-        at, values = list(rows), np.array([row.estimate for row in rows.values()])
-        half = NINETY_FIVE * np.array([row.std for row in rows.values()])
+        at, values = list(rows), [row.estimate for row in rows.values()]
+        low, high = zip(*(row.ci95 for row in rows.values()), strict=True) if rows else ((), ())
         kept = [row.estimate for time, row in rows.items() if math.isclose(time, 1e3 * chosen)]
         marks = [Line(_EVERYWHERE, 2 * [each], FAINT, 1.2, BOUND_DASHES[2]) for each in kept]
         marks += [Line(at, values, look.color, dash=look.dash, marker=look.marker, name="estimate, 95 %")]
-        marks += [spread(at, values - half, values + half, color=look.color)]
+        marks += [spread(at, low, high, color=look.color)]
         marks += [Line(2 * [1e3 * chosen], _EVERYWHERE, width=1.2, dash=BOUND_DASHES[1], name="chosen")]
         title, y = (f"{name} [kg m²]", Scale()) if rows else (f"{name}: not identified", Scale(ticks={}))
         panels.append(Panel(title, marks, x, y))

@@ -21,7 +21,6 @@ from ..identification.verdict import (
     reason_lines,
     statuses_of,
 )
-from ..results import NINETY_FIVE
 from .text import DASH, Listing, plain, say
 
 _WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
@@ -167,13 +166,13 @@ def _fit(found: OS4Identification) -> Lines:
 
 def why_no_value(row: Constant) -> str:
     """Why a constant of a rigid body is not among the physical quantities."""
-    return "below noise" if abs(row.estimate) <= NINETY_FIVE * row.std else "impossible"
+    return "below noise" if abs(row.estimate) <= row.half_width else "impossible"
 
 
 def _inertias(found: Identification) -> Lines:
     body = found.rigid_body
     inertias = [
-        f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
+        f"{name} {row.estimate:.4g} +- {row.half_width:.2g}{f' ({row.note})' if row.note else ''}"
         if name in possible(body)
         else f"{name} {why_no_value(row)}"
         for name, row in body.constants.items()
