@@ -8,7 +8,7 @@ from rich.console import Console
 
 from .._files import write_file
 from ..design import Design
-from .panels import Figure, Line, Panel, Scale, styles
+from .panels import EVERYWHERE, Figure, Line, Panel, Scale, styles
 from .svg import as_file
 from .text import Listing, plain
 
@@ -81,7 +81,7 @@ def write_design_figure(path: str | os.PathLike[str], found: Design, accuracy: f
     x = Scale("log", label="flight [s]") if in_percent else Scale(label="time [s]")
     for i, (name, unit) in enumerate(zip(task.names[: task.scale.size], task.units, strict=False)):
         line, meaning = (100 * accuracy, "wanted") if in_percent else (float(task.scale[i]), "bracket")
-        marks = [Line((-math.inf, math.inf), (line, line), width=1.2, name=meaning)]
+        marks = [Line(EVERYWHERE, (line, line), width=1.2, name=meaning)]
         for kind, one in every.items():
             if one.history is None:
                 seconds = np.geomspace(designed.period, 10 * designed.duration, 50)

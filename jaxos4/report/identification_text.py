@@ -23,6 +23,7 @@ from ..identification.verdict import (
 )
 from .text import DASH, Listing, plain, say
 
+_LATE = 0.005  # s; a `rotor_delay` below minus this means that motors are recorded late
 _WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
@@ -92,7 +93,10 @@ def warning_lines(found: Identification) -> list[str]:
 
 def notes_of(found: Identification) -> list[str]:
     """The notes on the data, and the clock of the motors if it is not the gyro's."""
-    return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
+    notes, delay = list(found.provenance.notes), found.parameters.get("rotor_delay")
+    if delay is not None and delay.estimate is not None and delay.estimate <= -_LATE:
+        notes.append(f"motors are recorded {-1e3 * delay.estimate:.0f} ms late (rotor_delay)")
+    return notes
 
 
 def _failure(found: Identification) -> Lines:

@@ -23,7 +23,7 @@ from ..recording.prepared import prepare
 from ..recording.stretches import Stretch, cut
 from . import timeline
 from .page import Section, picture, signals, table, text, write_page
-from .panels import BOUND_DASHES, Band, Figure, Line, Panel, Scale, style
+from .panels import BOUND_DASHES, EVERYWHERE, Band, Figure, Line, Panel, Scale, style
 from .text import Listing, plain
 
 _LONGEST = 60  # parts in the table at most, the longest
@@ -303,7 +303,7 @@ def motors(flown: Sequence[Recording], full: float) -> Figure:
         at, steps, color = np.repeat(edges, 2)[1:-1], np.repeat(share, 2), style(i).color
         marks = [Band(at, np.zeros(at.size), steps, color), Line(at, steps, color, 1.4)]
         if top == full:
-            marks.append(Line((full, full), (-np.inf, np.inf), dash=BOUND_DASHES[2], name="full speed"))
+            marks.append(Line((full, full), EVERYWHERE, dash=BOUND_DASHES[2], name="full speed"))
         panels.append(Panel(f"motor {i + 1}: time [%]", marks, x, y, 270, 190))
     return Figure("motors", panels, columns=4)
 

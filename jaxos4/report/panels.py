@@ -63,6 +63,7 @@ def style(place: int) -> Style:
 
 
 _LINEAR = 2.0  # a "symlog" scale is linear from -2 to 2
+EVERYWHERE = (-math.inf, math.inf)  # from one end of an axis to the other
 _LEAST = 1e-290  # smaller numbers are 0 in a figure
 Values = Sequence[float] | Num[np.ndarray, " _points"]
 
