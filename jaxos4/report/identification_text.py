@@ -260,7 +260,7 @@ def share(value: float | None) -> str:
 def print_information(console: Console, found: FlightInformation) -> None:
     """Prints a row for each parameter: its bound, and whether it is identifiable."""
     if not found.fitted:
-        console.print("note: no fit; all numbers below hold at the bracket's centre")
+        say(console, "note: no fit; all numbers below hold at the bracket's centre")
     rows = []
     for name, row in found.parameters.items():
         bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
@@ -268,9 +268,10 @@ def print_information(console: Console, found: FlightInformation) -> None:
         rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit, row.note))
     numbers = ("bound", "others known", "of bracket", "noise limit")
     Listing(("parameter", "unit", *numbers, "note"), rows, numbers).print_on(console)
-    console.print(
+    say(
+        console,
         "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
         "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
         "identifiable; noise limit: the largest noise, in multiples of the noise that was found, at which the "
-        "airframe's value can be distinguished from 0."
+        "airframe's value can be distinguished from 0.",
     )

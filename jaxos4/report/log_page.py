@@ -24,7 +24,7 @@ from ..recording.stretches import Stretch, cut
 from . import timeline
 from .page import Section, picture, signals, table, text, write_page
 from .panels import BOUND_DASHES, EVERYWHERE, Band, Figure, Line, Panel, Scale, style
-from .text import Listing, plain
+from .text import Listing, plain, say
 
 _LONGEST = 60  # parts in the table at most, the longest
 _USUAL = 0.9  # of the time the rotors turn at speeds in the band of the spectra
@@ -41,16 +41,17 @@ _UNITS = {names: UNITS[names.split()[0]] for names in _TOGETHER} | {"rotor1 roto
 
 def print_inspection(console: Console, found: Inspection, label: str, *, most: int = 14) -> None:
     """Prints the channels of a log, the findings of its checks, and the `most` longest parts. `label`: its format."""
-    console.print(
+    say(
+        console,
         f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
         f"one every {1e3 * found.sample_time:.4g} ms",
         soft_wrap=True,
     )
     for refusal in found.refusals:
-        console.print(f"cannot identify a vehicle: {refusal}.", soft_wrap=True)
+        say(console, f"cannot identify a vehicle: {refusal}.", soft_wrap=True)
     for each in found.findings:
         verb = "contradicts" if each.contradicted else "concerns"
-        console.print(f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
+        say(console, f"{verb} {', '.join(each.quantities)}: {each}.", soft_wrap=True)
     for names, unit in _UNITS.items():
         measured = {name: found.channels[name] for name in names.split() if name in found.channels}
         if not measured:
@@ -61,15 +62,15 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
         gaps = f", at most {1e3 * gap:.3g} ms apart" if gap > 1.5 * found.sample_time else ""
         commands = "rotor1" in names and 0 < largest <= 1
         size = f"up to {largest:.3g} {_COMMANDS if commands else unit}"
-        console.print(f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
+        say(console, f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
     for note in found.notes:
-        console.print(f"note: {note}")
+        say(console, f"note: {note}")
     rows = _part_rows(found, most)
     headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
     Listing(headings, rows, numbers).print_on(console)
     if len(found.stretches) > len(rows):
-        console.print(f"and {len(found.stretches) - len(rows)} shorter parts")
-    console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
+        say(console, f"and {len(found.stretches) - len(rows)} shorter parts")
+    say(console, "roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
 
 
 def _part_rows(found: Inspection, most: int) -> list[tuple[str, ...]]:
