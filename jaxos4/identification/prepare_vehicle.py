@@ -215,7 +215,13 @@ def _held_out(
     name, notes, seconds = recordings[0].name, prepared.notes, prepared.seconds[1]
     remedy = "give `holdout` 0 or `validate`"
     if validate is not None:
-        other = _prepare_other(validate, float(prepared.fitted.dt), model)
+        (other,) = prepare(
+            [validate], model.airframe, sample_time=float(prepared.fitted.dt), holdout=0.0, predicted=True
+        )
+        for term in model.terms:
+            if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
+                lacks = f"`validate` lacks measurements that the term {term} needs"
+                raise InputError(f"{validate.name}: {lacks}; give `terms` without it.")
         own = dataclasses.replace(model, recordings=other.recordings)
         held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, other.time), other.seconds[0]
         name, remedy, notes = validate.name, "give another flight", (*notes, *other.notes, *map(str, other.findings))
@@ -230,17 +236,6 @@ def _held_out(
             f"{name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
         ) from None
     return held_out, seconds, notes
-
-
-def _prepare_other(validate: Recording, sample_time: float, model: FlightModel) -> Prepared:
-    """The recording to predict, with the sample time [s] of those that are fitted."""
-    (other,) = prepare([validate], model.airframe, sample_time=sample_time, holdout=0.0, predicted=True)
-    for term in model.terms:
-        if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
-            raise InputError(
-                f"{validate.name}: `validate` lacks measurements that the term {term} needs; give `terms` without it."
-            )
-    return other
 
 
 def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tuple[str, ...]:

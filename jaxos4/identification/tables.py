@@ -53,7 +53,11 @@ def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
     A quantity that was not estimated is not in the table, nor is one that `possible` leaves out.
     """
     constants = found.rigid_body.constants if found.is_vehicle else possible(found.rigid_body)
-    judged = _judged() if found.is_vehicle else {name: name for name in found.parameters}
+    # The name of the verdict on each parameter.
+    judged = {name: name for name in found.parameters}
+    if found.is_vehicle:
+        terms = [term for term in TERMS.values() if term.verdict]
+        judged = {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}
     rows = [(name, each, name if found.is_vehicle else RIGID_BODY, each.ci95) for name, each in constants.items()]
     rows += [
         (name.replace("_", " "), Constant(each.estimate, each.std, each.unit), judged[name], each.ci95)
@@ -89,12 +93,6 @@ def centers_of_mass(found: Identification) -> list[CenterOfMass]:
     with np.errstate(all="ignore"):  # numbers that no vehicle has may overflow
         every = center_of_mass(tuple(found.parameters), np.array(values), np.array(found.covariance), found.airframe)
     return [each for each in every if np.isfinite([each.value, each.std]).all()]
-
-
-def _judged() -> dict[str, str]:
-    """The name of the verdict on each parameter of a vehicle's terms."""
-    terms = [term for term in TERMS.values() if term.verdict]
-    return {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}
 
 
 def dataframe(found: Identification) -> "pd.DataFrame":
