@@ -1,7 +1,7 @@
 """`Data`: flights and their likelihood, prepared for a search, with their provenance."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from .._custom_types import Positive
 from .._version import __version__
-from ..airframe import PRESETS, Airframe
+from ..airframe import PRESETS
 from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS
@@ -72,6 +72,21 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
     device: str
     precision: str
 
+    @classmethod
+    def of(cls, problem: ShootingProblem, notes: Sequence[str], **own: Any) -> "Provenance":
+        """The provenance of a flight that is fitted, with the fields of its own kind. An airframe may be "custom"."""
+        airframe, flight = problem.model.airframe, problem.flight
+        return cls(
+            airframe=next((name for name, preset in PRESETS.items() if preset is airframe), "custom"),
+            sample_time=float(flight.dt),
+            notes=list(notes),
+            version=__version__,
+            jax=jax.__version__,
+            device=jax.devices()[0].device_kind,
+            precision=str(flight.time.dtype),
+            **own,
+        )
+
 
 @dataclasses.dataclass(frozen=True)
 class Data(Generic[L]):
@@ -110,21 +125,6 @@ class Data(Generic[L]):
     def capacity(self) -> int:
         """The number of samples of a padded flight: checks at all sample times share their programs."""
         return self.likelihood.flight.time.shape[0]
-
-
-def versions(problem: ShootingProblem) -> dict[str, Any]:
-    """Versions, device and precision."""
-    return {
-        "version": __version__,
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-        "precision": str(problem.flight.time.dtype),
-    }
-
-
-def airframe_name(airframe: Airframe) -> str:
-    """The name of a preset, or "custom"."""
-    return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")
 
 
 def class_name(instance: object, kinds: Mapping[str, type]) -> str:

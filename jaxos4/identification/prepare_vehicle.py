@@ -20,7 +20,7 @@ from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.sensor_errors import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_capacity
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, MEANS, input_innovations, lagged
-from .data import Data, HeldOut, Provenance, airframe_name, versions
+from .data import Data, HeldOut, Provenance
 from .prepare_os4 import Intervals, bracket_of
 
 SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
@@ -111,19 +111,15 @@ def _data(
             f"{recordings[0].name}: {measured} measurements for {unknowns.count} unknowns; give a longer flight."
         )
     held_out, tested_seconds, notes = _held_out(recordings, validate, prepared, shooting, model)
-    stretch = prepared.fitted.stretch
-    number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
-    provenance = Provenance(
+    provenance = Provenance.of(
+        shooting,
+        notes,
         flights=[recording.name for recording in recordings],
         validate=None if validate is None else validate.name,
-        airframe=airframe_name(airframe),
         terms=list(terms),
-        sample_time=float(prepared.fitted.dt),
         fitted_seconds=prepared.seconds[0],
         tested_seconds=tested_seconds,
         battery_voltage=voltage if powered and voltage is not None else msgspec.UNSET,
-        notes=list(notes),
-        **versions(shooting),
     )
     return Data(
         likelihood=_innovations(shooting, prepared, finest),
@@ -135,7 +131,7 @@ def _data(
         motor_step=prepared.motor_step,
         vibrates=prepared.vibrates,
         follows_commands=COMMANDS in prepared.available,
-        log=np.asarray(prepared.recordings)[number],
+        log=np.asarray(prepared.recordings)[prepared.fitted.stretch_numbers],
         time=prepared.time,
     )
 
@@ -189,9 +185,8 @@ def _input_innovations(
     flight, columns = shooting.flight, shooting.columns
     if flight.within is None:
         return None
-    dt, (samples,), mixer = float(flight.dt), flight.time.shape, np.asarray(shooting.model.airframe.mixer)
-    inputs = np.square(np.asarray(flight.within)) @ mixer.T
-    stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
+    dt, (samples,), stretch = float(flight.dt), flight.time.shape, np.asarray(flight.stretch_numbers)
+    inputs = np.square(np.asarray(flight.within)) @ np.asarray(shooting.model.airframe.mixer).T
     counts = LAGGED_COUNTS if is_lagged else COUNTS
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
