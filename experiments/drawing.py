@@ -13,7 +13,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocat
 
 from jaxos4._files import write_file
 from jaxos4.report.matplotlib_figures import drawing, rendered
-from jaxos4.report.style import Style
+from jaxos4.report.panels import Style
 
 
 def grid(panels: int, *, columns: int, width: float = 9.0, height: float = 2.1) -> tuple[Figure, list[Axes]]:

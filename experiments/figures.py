@@ -17,8 +17,8 @@ from experiments.drawing import draw_spread, grid, legend, line, log_axis, name_
 from experiments.shared import load_results
 from jaxos4.report import study_figures
 from jaxos4.report.matplotlib_figures import as_matplotlib
+from jaxos4.report.panels import FAINT, INK, PAPER, styles
 from jaxos4.report.study_tables import error_unit
-from jaxos4.report.style import FAINT, INK, PAPER, styles
 from jaxos4.report.text import plain
 from jaxos4.results import NINETY_FIVE
 from jaxos4.study import metrics, read_results

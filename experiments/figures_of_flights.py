@@ -10,7 +10,7 @@ from experiments.benchmarks.contenders import is_ours
 from experiments.drawing import grid, legend, line, log_axis, name_axis
 from experiments.fits import INERTIAS, THRUST, summary
 from experiments.monte_carlo import Row, groups
-from jaxos4.report.style import BOUND_DASHES, FAINT, INK, styles
+from jaxos4.report.panels import BOUND_DASHES, FAINT, INK, styles
 from jaxos4.results import NINETY_FIVE
 
 FARTHEST = 60.0  # %; what lies beyond is drawn at the edge

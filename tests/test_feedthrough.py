@@ -324,7 +324,7 @@ def test_commands_in_short_samples_have_innovations_of_earlier_samples(logged):
     every = prepare_vehicle(as_recordings(fly_standard(loop, duration=16.0, seed=0)), CINERAT, jaxos4.VehicleSettings())
     for data in every:
         is_short = logged == "commands" and data.provenance.sample_time <= 0.005
-        first, second = np.asarray(data.likelihood.input_innovations)[: data.clock.time.size, :2, 0].T
+        first, second = np.asarray(data.likelihood.input_innovations)[: data.time.size, :2, 0].T
         assert first.any()
         assert bool(data.likelihood.lagged) == is_short == (second[1:] == first[:-1]).all()
 

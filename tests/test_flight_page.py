@@ -28,8 +28,7 @@ from jaxos4.report import write_flight_page
 from jaxos4.report.identification_figures import frequency_responses, inertias_by_sample_time, vehicle
 from jaxos4.report.identification_page import verdict
 from jaxos4.report.identification_signals import identified_signals, prediction_band
-from jaxos4.report.panels import Band, Line, Words
-from jaxos4.report.style import styles
+from jaxos4.report.panels import Band, Line, Words, styles
 
 EVIL = "</script><script>alert(1)</script>"
 

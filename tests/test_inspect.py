@@ -1,6 +1,7 @@
 """`jaxos4 inspect` as a user types it: logs of each format, and the airframe that a log knows of."""
 
 import base64
+import io
 import json
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from hypothesis import given, settings, strategies as st
 from pages import stands_alone, words
 from px4_logs import everything
 from recorded_logs import VEHICLE, blackbox_csv
+from rich.console import Console
 from sign_flights import flown, turned
 
 import jaxos4
@@ -21,9 +23,8 @@ from jaxos4.flight import RATES
 from jaxos4.logs import LogFacts
 from jaxos4.recording.inspection import ASSUMED_FULL_SCALE, airframe_draft, inspect_log
 from jaxos4.recording.motion import rotor_signs
-from jaxos4.report import write_log_page
-from jaxos4.report.log_figures import amplitude_density, logged
-from jaxos4.report.log_page import fitted
+from jaxos4.report import print_inspection, write_log_page
+from jaxos4.report.log_page import amplitude_density, fitted, logged
 from jaxos4.report.timeline import thinned
 
 EVIL = "</script><script>alert(1)</script>"
@@ -50,6 +51,12 @@ def test_each_format_is_inspected(kind, run, tmp_path):
     (part,) = report["parts"]
     assert part["usable"]
     assert part["excitation"]["roll"]["verdict"] == "good"
+
+
+def test_any_console_shows_the_units_in_brackets():
+    text = io.StringIO()
+    print_inspection(Console(file=text, width=80), inspect_log(flown(CRAZYFLIE, 0), CRAZYFLIE), "CSV")
+    assert "rate [rad/s]" in " ".join(text.getvalue().split())
 
 
 def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):

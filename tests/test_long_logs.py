@@ -14,7 +14,7 @@ from jaxos4.recording.inspection import inspect_log
 from jaxos4.recording.prepared import finest, prepare
 from jaxos4.recording.stretches import Stretch
 from jaxos4.recording.windows import fair_share, richest
-from jaxos4.report.log_figures import logged, spectra
+from jaxos4.report.log_page import logged, spectra
 
 DT, HOVER = 0.01, float(CRAZYFLIE.hover_speed)
 ROLL, PITCH, YAW = np.sign(np.asarray(CRAZYFLIE.mixer)[:3])

@@ -20,8 +20,7 @@ from jaxos4.identification.results import Constant, RigidBody
 from jaxos4.report import write_flight_page
 from jaxos4.report.identification_figures import correlation_matrix, frequency_responses, priors, residual_figure
 from jaxos4.report.identification_signals import identified_signals
-from jaxos4.report.panels import Line, Words
-from jaxos4.report.style import styles
+from jaxos4.report.panels import Line, Words, styles
 
 LOOK = styles(["ibss"])["ibss"]
 

@@ -20,8 +20,8 @@ from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 from jaxos4.estimators import ESTIMATORS as REGISTRY
 from jaxos4.report import error_csv, error_table, study_figures, study_page, write_report
 from jaxos4.report.matplotlib_figures import as_pdf
+from jaxos4.report.panels import styles
 from jaxos4.report.study_tables import scenario_tables, scenarios
-from jaxos4.report.style import styles
 from jaxos4.report.text import DASH, plain, with_unit
 from jaxos4.study import metrics, read_results
 

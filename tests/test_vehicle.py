@@ -12,7 +12,7 @@ from lanes import names
 
 import jaxos4
 from jaxos4.identification import intervals
-from jaxos4.identification.data import Clock, Data
+from jaxos4.identification.data import Data
 from jaxos4.identification.fit import sample_time_of
 from jaxos4.identification.intervals import at_lowest, corrected
 from jaxos4.identification.judge import judge_vehicle
@@ -80,8 +80,8 @@ def data_of(problem):
     """The data of one recording."""
     nothing = dict.fromkeys(("airframe", "version", "jax", "device", "precision"), "")
     samples = problem.flight.time.size
-    clock = Clock(np.zeros(samples, int), PERIOD * np.arange(samples))
-    return Data(problem, problem.problem, clock, Provenance(sample_time=PERIOD, **nothing))
+    log, time = np.zeros(samples, int), PERIOD * np.arange(samples)
+    return Data(problem, problem.problem, Provenance(sample_time=PERIOD, **nothing), log, time)
 
 
 def fitted(problem, **options):

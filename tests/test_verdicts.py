@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
+from synthetic_identification import identified_vehicle
 
 import jaxos4
 from experiments.verdicts.faults import scaled, thinned
@@ -14,14 +15,13 @@ from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification import verdict
-from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.answers import prediction_horizons, vehicle_constants, vehicle_quantities
 from jaxos4.identification.intervals import consequences, corrected
 from jaxos4.identification.issues import few_parts, issues_of_log, stronger_or_weaker
 from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.judge import judge_vehicle
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
-from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
-from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
+from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill, RigidBody
 from jaxos4.identification.search import search
 from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, reason_lines, result_of, verdicts_of
 from jaxos4.models.os4 import CorrectedOS4
@@ -259,7 +259,8 @@ def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
     table = dict.fromkeys(("alpha3", "alpha6", "alpha8", "thrust_gain", "rotor_delay"), row)
     constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy", "Iz")}
-    found = vehicle_quantities(fitted, table, constants, None, [])
+    found = identified_vehicle(parameters=table, rigid_body=RigidBody(constants), skill=None)
+    found = vehicle_quantities(fitted, found, [])
     wider = [each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations if "wider" in each]
     assert wider == [
         "Ix is 2.5 times the guess; check `mass` and `rotor_positions`, or give a wider `bracket`",

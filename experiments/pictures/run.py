@@ -18,7 +18,7 @@ from jaxos4.estimators.solver import before_search
 from jaxos4.identification.verdict import ADVICE
 from jaxos4.report.identification_figures import vehicle
 from jaxos4.report.matplotlib_figures import draw, drawing, rendered
-from jaxos4.report.style import style
+from jaxos4.report.panels import style
 from jaxos4.results import NINETY_FIVE
 
 BLUE, ORANGE, INK, GREY = "#0072b2", "#d55e00", "#1b1e23", "#b9bec6"

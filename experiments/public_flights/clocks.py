@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.forecast.measured import Measured
+from jaxos4.forecast.flight_prediction import Measured
 from jaxos4.recording import Recording
 from jaxos4.rotations import deviation
 

@@ -12,9 +12,8 @@ from typer.models import OptionInfo
 from ..errors import InputError, TrainingError, printable
 from . import options
 from ._jax import NO_CACHE, platform_fault, prepare
-from .estimate import estimate, train
+from .estimate import estimate, identifiability, inspect, train
 from .identified import export, predict
-from .information import identifiability, inspect
 from .new_flights import design, simulate
 from .studies import compare, report, study
 

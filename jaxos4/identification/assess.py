@@ -1,6 +1,5 @@
 """`jaxos4.assess`: which parameters a flight of an OS4 can identify."""
 
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -12,6 +11,7 @@ from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..logs import Recording, as_recordings
 from ..models.abstract import AbstractModel
+from .data import Progress, silent
 from .fit import fit_os4
 from .prepare_os4 import Intervals, OS4Settings, bracket_of, os4_problem
 
@@ -71,7 +71,7 @@ def assess(
     channels: str | None = None,
     initial_state: str = "free",
     window: float | None = None,
-    progress: Callable[[str], None] = lambda stage: None,
+    progress: Progress = silent,
 ) -> FlightInformation:
     """Estimate a flight's noise levels, and find the parameters that it can identify. Arguments as in `identify`.
 

@@ -1,7 +1,7 @@
 """`Data`: flights and their likelihood, prepared for a search, with their provenance."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from .._custom_types import Positive
 from .._version import __version__
-from ..airframe import PRESETS, Airframe
+from ..airframe import PRESETS
 from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS
@@ -26,23 +26,17 @@ def silent(stage: str) -> None:
     """Ignores progress."""
 
 
-class Clock(NamedTuple):
-    """For each sample, the number of its log and its time in that log [s]."""
-
-    log: Int[np.ndarray, " samples"] = np.zeros(0, int)
-    time: Float[np.ndarray, " samples"] = np.zeros(0)
-
-
 class HeldOut(NamedTuple):
     """Measurements that are not fitted.
 
     - `problem`: the flight and its model.
-    - `recording`, `clock`: name and times of another recording; `None`: a part of the fitted recordings was held out.
+    - `recording`: the name of another recording; `None`: a part of the fitted recordings was held out.
+    - `time`: of each sample of another vehicle's recording in its log [s].
     """
 
     problem: ShootingProblem
     recording: str | None = None
-    clock: Clock = Clock()
+    time: Float[np.ndarray, " samples"] = np.zeros(0)
 
 
 class Provenance(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,6 +72,21 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
     device: str
     precision: str
 
+    @classmethod
+    def of(cls, problem: ShootingProblem, notes: Sequence[str], **own: Any) -> "Provenance":
+        """The provenance of a flight that is fitted, with the fields of its own kind. An airframe may be "custom"."""
+        airframe, flight = problem.model.airframe, problem.flight
+        return cls(
+            airframe=next((name for name, preset in PRESETS.items() if preset is airframe), "custom"),
+            sample_time=float(flight.dt),
+            notes=list(notes),
+            version=__version__,
+            jax=jax.__version__,
+            device=jax.devices()[0].device_kind,
+            precision=str(flight.time.dtype),
+            **own,
+        )
+
 
 @dataclasses.dataclass(frozen=True)
 class Data(Generic[L]):
@@ -85,8 +94,8 @@ class Data(Generic[L]):
 
     - `likelihood`: the likelihood with its bracket; padded for a vehicle.
     - `problem`: the flight and its model.
-    - `clock`: log and time of each sample for a vehicle; empty for an OS4.
-    - `provenance`: data, settings and versions. `seconds`: duration of a vehicle's fitted measurements [s].
+    - `provenance`: data, settings and versions.
+    - `log`, `time`: of each sample for a vehicle, the number of its log and its time in that log [s].
     - `held_out`: the measurements that are not fitted, if any.
     - `findings`: faults of the logs that concern moments of inertia, or contradict another quantity.
     - `log_step`: the longest sample of the logs [s].
@@ -97,9 +106,9 @@ class Data(Generic[L]):
 
     likelihood: L
     problem: ShootingProblem
-    clock: Clock
     provenance: Provenance
-    seconds: float = 0.0
+    log: Int[np.ndarray, " samples"] = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    time: Float[np.ndarray, " samples"] = dataclasses.field(default_factory=lambda: np.zeros(0))
     held_out: HeldOut | None = None
     findings: tuple[Finding, ...] = ()
     log_step: float = 0.0
@@ -116,21 +125,6 @@ class Data(Generic[L]):
     def capacity(self) -> int:
         """The number of samples of a padded flight: checks at all sample times share their programs."""
         return self.likelihood.flight.time.shape[0]
-
-
-def versions(problem: ShootingProblem) -> dict[str, Any]:
-    """Versions, device and precision."""
-    return {
-        "version": __version__,
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-        "precision": str(problem.flight.time.dtype),
-    }
-
-
-def airframe_name(airframe: Airframe) -> str:
-    """The name of a preset, or "custom"."""
-    return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")
 
 
 def class_name(instance: object, kinds: Mapping[str, type]) -> str:

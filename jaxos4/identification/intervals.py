@@ -25,13 +25,12 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
 from ..results import NINETY_FIVE, has_answer, result_names
-from .answers import VehicleAnswer
+from .answers import PRIOR_NOTE, VehicleAnswer
 from .data import Progress, silent
 from .results import Constant, FixedParameter
 from .search import LOWER, Optimum, deviations, disturbances_of, search
 from .verdict import Move
 
-PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
 _NOMINAL_NOTE = "at the usual value, which these flights do not contradict"
 
 
@@ -55,7 +54,7 @@ def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAns
     `profile`: the factors of the profile, by parameter.
     """
     names, units, values = optimum.unknowns.names, optimum.unknowns.units, optimum.values
-    problem, logs = optimum.data.problem, optimum.data.clock.log
+    problem, logs = optimum.data.problem, optimum.data.log
     notes, jackknife, longer = dict.fromkeys(optimum.nominal, _NOMINAL_NOTE), np.ones(values.size), np.ones(values.size)
     if has_answer(optimum.estimate.result):
         free = np.flatnonzero(~np.isin(names, [*optimum.nominal, *optimum.negative]))

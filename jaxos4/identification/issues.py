@@ -100,7 +100,7 @@ def issues_of_vehicle(
     return [
         *(() if optimum.is_lowest else [Issue("max_sweeps", *_NOT_LOWEST, dict.fromkeys(quantities))]),
         *issues_of_log(data.findings),
-        *few_parts(data.seconds),
+        *few_parts(data.provenance.fitted_seconds or 0.0),
         *(
             Issue("unidentifiable", weak[x.motion], f"fly more {x.motion}, or in calmer air", {x.inertia: None})
             for x in AXES

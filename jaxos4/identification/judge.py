@@ -36,13 +36,14 @@ from .answers import (
     OS4Answer,
     VehicleAnswer,
     dominated,
+    os4_quantities,
     parameter_table,
     shared_fields,
     vehicle_constants,
+    vehicle_quantities,
 )
 from .data import Data, HeldOut, Progress, class_name, silent
 from .issues import issues_of_log, issues_of_os4, issues_of_vehicle
-from .quantities import os4_quantities, vehicle_quantities
 from .results import (
     ChannelFit,
     Constant,
@@ -88,7 +89,7 @@ def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name:
     )
     # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
     issues = issues_of_os4(data, found, found.fit if estimator.shoots else {})
-    verdicts = verdicts_of(os4_quantities(found.parameters, found.rigid_body), issues)
+    verdicts = verdicts_of(os4_quantities(found), issues)
     # Only the alphas were requested. An alpha that the flight does not show is no fault of the answer.
     wrong = [name for name in found.parameters if verdicts[name].status == CONTRADICTED]
     result = result_of(verdicts, issues, search, wrong if search == "successful" else found.parameters)
@@ -201,7 +202,7 @@ def judge_vehicle(
         correlations=correlations,
         response=response,
     )
-    quantities = vehicle_quantities(answer, table, body.constants, achieved, still)
+    quantities = vehicle_quantities(answer, found, still)
     issues = issues_of_vehicle(answer, found, response, sample_times=sample_times, quantities=quantities, still=still)
     verdicts = verdicts_of(quantities, issues)
     result = result_of(verdicts, issues, search, REQUIRED)
@@ -291,9 +292,11 @@ def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tupl
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
     position = position_of(np.asarray(problem.flight.states, float))
     start = np.zeros(0, int) if predicted is None else predicted.start
-    clock = data.clock if other is None or other.recording is None else other.clock
     signals = omega, states[:, RATES], states[:, :0], disturbance, position
-    traces = Traces(data.clock.time, data.clock.log, *signals, clock.time[start], clock.log[start])
+    starts = data.time[start], data.log[start]
+    if other is not None and other.recording is not None:  # its log comes after the fitted ones
+        starts = other.time[start], np.full(start.size, len(data.provenance.flights or ()))
+    traces = Traces(data.time, data.log, *signals, *starts)
     torques = omega**2 @ np.asarray(answer.problem.model.airframe.mixer)[:3].T
     crossed = residual_correlations(innovation, torques)
     if (parts := optimum.estimate.parts) is not None:

@@ -5,13 +5,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from ..airframe import AXES, INERTIAS
 from ..errors import percent
-from ..results import NINETY_FIVE
 from .results import Identification
-from .verdict import IDENTIFIED, MISSING, RESERVED, UNCERTAIN, pooled_status
+from .verdict import IDENTIFIED, MISSING, ONLY_KNOWN_TO, RESERVED, UNCERTAIN, pooled_status
 
 _ROUND = 5.0  # s; flights are not planned more precisely
 _MOST = 300.0  # s, about one battery: beyond it a stronger motion is the better advice
-_UNCERTAIN = "it is known to"
 _REPEAT = "nothing is missing; repeat the flight and compare the results with `jaxos4 compare`"
 
 
@@ -29,7 +27,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
     motions, known, flown, advised = [], [], set(), {}
     for axis in AXES:
         spread, fitted = spreads.get(axis.inertia, 0.0), counted.get(axis.inertia, [])
-        whys = [why for each in fitted for why in each.verdicts[axis.inertia].reasons if why.startswith(_UNCERTAIN)]
+        whys = [why for each in fitted for why in each.verdicts[axis.inertia].reasons if why.startswith(ONLY_KNOWN_TO)]
         helps = not whys or any("fly" in why for why in whys)  # no flight measures a drag coefficient
         if fitted and helps and UNCERTAIN < spread < math.inf:
             every = (each.provenance.fitted_seconds for each in fitted)
@@ -58,7 +56,7 @@ def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:
 def spreads_of(found: Identification) -> dict[str, float]:
     """The relative half-width of the 95 % interval of each moment of inertia of a result."""
     constants = found.rigid_body.constants if found.is_vehicle else {}
-    return {name: NINETY_FIVE * row.std / abs(row.estimate) for name, row in constants.items() if row.estimate}
+    return {name: row.half_width / abs(row.estimate) for name, row in constants.items() if row.estimate}
 
 
 def _more(motion: str, spread: float, seconds: float) -> str:
@@ -83,7 +81,7 @@ def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
         yield from (each.remedy for each in issues if any(each.cause in said for said in verdict.reasons))
         for said in verdict.reasons:
             cause, _, remedy = said.rpartition("; ")
-            if cause and not cause.startswith(_UNCERTAIN) and not any(each.cause in said for each in issues):
+            if cause and not cause.startswith(ONLY_KNOWN_TO) and not any(each.cause in said for each in issues):
                 yield remedy
             elif verdict.status == MISSING and not found.is_vehicle and not issues:
                 yield "fly what `jaxos4 design` proposes"

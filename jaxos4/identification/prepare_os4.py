@@ -26,7 +26,7 @@ from ..networks.file import load_network
 from ..noise import SENSOR_SIGMA
 from ..recording.checks import KINEMATIC, self_checks
 from ..shooting import ShootingProblem, Unknowns
-from .data import Clock, Data, HeldOut, Progress, Provenance, airframe_name, class_name, name_and_class, versions
+from .data import Data, HeldOut, Progress, Provenance, class_name, name_and_class
 
 Intervals = Bracket | Mapping[str, Any] | None
 """A bracket, or `[lower, upper]` by parameter name; the model's default for all others."""
@@ -100,20 +100,18 @@ def prepare_os4(
                 f"{validate.name}: nothing was measured among the {problem.channels} channels; give another flight."
             )
         held_out, notes = HeldOut(other, validate.name), notes + validate.named_notes
-    provenance = Provenance(
+    provenance = Provenance.of(
+        problem,
+        notes,
         flight=recording.name,
-        airframe=airframe_name(model.airframe),
         channels=problem.channels,
         initial_state=settings.initial_state,
         windows=problem.windows,
         samples=int(problem.flight.time.shape[0]),
-        sample_time=float(problem.flight.dt),
         network=msgspec.UNSET if trained is None else network_provenance(network, trained),
-        notes=list(notes),
-        **versions(problem),
     )
     findings = self_checks(recording, model.airframe, checks=KINEMATIC)
-    data = Data(problem, problem, Clock(), provenance, held_out=held_out, findings=findings)
+    data = Data(problem, problem, provenance, held_out=held_out, findings=findings)
     return data, name, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
 
 

@@ -20,7 +20,7 @@ from ..recording.prepared import HOLDOUT, Prepared, prepare
 from ..recording.sensor_errors import unseen_sag
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_capacity
 from ..shooting.feedthrough import COUNTS, FEEDTHROUGHS, LAGGED_COUNTS, MEANS, input_innovations, lagged
-from .data import Clock, Data, HeldOut, Provenance, airframe_name, versions
+from .data import Data, HeldOut, Provenance
 from .prepare_os4 import Intervals, bracket_of
 
 SEGMENTS = 16  # parts of a flight, filtered in parallel; their disagreement shows errors of the model
@@ -90,18 +90,20 @@ def _data(
 ) -> Data[InnovationsProblem]:
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
-    if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
-        value, error = prepared.level  # the flight shows the accelerometer's error along z
-        bracket = {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
     powered = any(VOLTAGE in TERMS[term].needs for term in terms)
-    if powered and voltage is not None and SAG in model.parameter_names and not isinstance(bracket, Bracket):
+    own: dict[str, Any] = {}
+    if prepared.level is not None and VERTICAL_BIAS in model.parameter_names:
+        value, error = prepared.level  # the flight shows the accelerometer's error along z
+        own[VERTICAL_BIAS] = [value - error, value + error]
+    if powered and voltage is not None and SAG in model.parameter_names:
         unseen = max(map(unseen_sag, recordings))  # a logged voltage contains the rest
         center, half_width = (float(each[model.parameter_names.index(SAG)]) for each in (model.alpha, model.half_width))
-        bracket = {SAG: [unseen * (center - half_width), unseen * (center + half_width)], **(bracket or {})}
-    if airframe.guesses_drag and not isinstance(bracket, Bracket):
-        name, center = YAW.inverse, 1 / float(airframe.inertia[2])
-        bracket = {name: [-GUESS_REACH * center, (2 + GUESS_REACH) * center], **(bracket or {})}
-    unknowns = Unknowns.of(model, bracket_of(bracket, model))
+        own[SAG] = [unseen * (center - half_width), unseen * (center + half_width)]
+    if airframe.guesses_drag:
+        center = 1 / float(airframe.inertia[2])
+        own[YAW.inverse] = [-GUESS_REACH * center, (2 + GUESS_REACH) * center]
+    given = bracket if isinstance(bracket, Bracket) else own | dict(bracket or {})
+    unknowns = Unknowns.of(model, bracket_of(given, model))
     shooting = _problem(model, prepared.fitted, windows=prepared.windows, unknowns=unknowns)
     measured = np.count_nonzero(~np.isnan(shooting.recorded()))
     if measured <= unknowns.count:
@@ -109,32 +111,28 @@ def _data(
             f"{recordings[0].name}: {measured} measurements for {unknowns.count} unknowns; give a longer flight."
         )
     held_out, tested_seconds, notes = _held_out(recordings, validate, prepared, shooting, model)
-    stretch = prepared.fitted.stretch
-    number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
-    provenance = Provenance(
+    provenance = Provenance.of(
+        shooting,
+        notes,
         flights=[recording.name for recording in recordings],
         validate=None if validate is None else validate.name,
-        airframe=airframe_name(airframe),
         terms=list(terms),
-        sample_time=float(prepared.fitted.dt),
         fitted_seconds=prepared.seconds[0],
         tested_seconds=tested_seconds,
         battery_voltage=voltage if powered and voltage is not None else msgspec.UNSET,
-        notes=list(notes),
-        **versions(shooting),
     )
     return Data(
         likelihood=_innovations(shooting, prepared, finest),
         problem=shooting,
         provenance=provenance,
-        seconds=prepared.seconds[0],
         held_out=held_out,
         findings=prepared.findings,
         log_step=prepared.log_step,
         motor_step=prepared.motor_step,
         vibrates=prepared.vibrates,
         follows_commands=COMMANDS in prepared.available,
-        clock=Clock(np.asarray(prepared.recordings)[number], prepared.time),
+        log=np.asarray(prepared.recordings)[prepared.fitted.stretch_numbers],
+        time=prepared.time,
     )
 
 
@@ -187,9 +185,8 @@ def _input_innovations(
     flight, columns = shooting.flight, shooting.columns
     if flight.within is None:
         return None
-    dt, (samples,), mixer = float(flight.dt), flight.time.shape, np.asarray(shooting.model.airframe.mixer)
-    inputs = np.square(np.asarray(flight.within)) @ mixer.T
-    stretch = np.zeros(samples, int) if flight.stretch is None else np.asarray(flight.stretch)
+    dt, (samples,), stretch = float(flight.dt), flight.time.shape, np.asarray(flight.stretch_numbers)
+    inputs = np.square(np.asarray(flight.within)) @ np.asarray(shooting.model.airframe.mixer).T
     counts = LAGGED_COUNTS if is_lagged else COUNTS
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
@@ -213,10 +210,15 @@ def _held_out(
     name, notes, seconds = recordings[0].name, prepared.notes, prepared.seconds[1]
     remedy = "give `holdout` 0 or `validate`"
     if validate is not None:
-        other = _prepare_other(validate, float(prepared.fitted.dt), model)
+        (other,) = prepare(
+            [validate], model.airframe, sample_time=float(prepared.fitted.dt), holdout=0.0, predicted=True
+        )
+        for term in model.terms:
+            if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
+                lacks = f"`validate` lacks measurements that the term {term} needs"
+                raise InputError(f"{validate.name}: {lacks}; give `terms` without it.")
         own = dataclasses.replace(model, recordings=other.recordings)
-        clock = Clock(np.full(other.time.size, len(recordings)), other.time)
-        held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, clock), other.seconds[0]
+        held_out, seconds = HeldOut(_problem(own, other.fitted), validate.name, other.time), other.seconds[0]
         name, remedy, notes = validate.name, "give another flight", (*notes, *other.notes, *map(str, other.findings))
     elif prepared.tested is not None:
         held_out = HeldOut(dataclasses.replace(fitted, flight=prepared.tested))
@@ -229,17 +231,6 @@ def _held_out(
             f"{name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
         ) from None
     return held_out, seconds, notes
-
-
-def _prepare_other(validate: Recording, sample_time: float, model: FlightModel) -> Prepared:
-    """The recording to predict, with the sample time [s] of those that are fitted."""
-    (other,) = prepare([validate], model.airframe, sample_time=sample_time, holdout=0.0, predicted=True)
-    for term in model.terms:
-        if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
-            raise InputError(
-                f"{validate.name}: `validate` lacks measurements that the term {term} needs; give `terms` without it."
-            )
-    return other
 
 
 def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ from ..airframe import MOTIONS, YAW
 from ..analysis.inertia import CenterOfMass, center_of_mass
 from ..errors import InputError
 from ..models.terms import TERMS
-from ..results import NINETY_FIVE
 from .results import Constant, Identification, RigidBody, VehicleIdentification
 from .verdict import RIGID_BODY, Verdict
 
@@ -53,30 +52,29 @@ def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
 
     A quantity that was not estimated is not in the table, nor is one that `possible` leaves out.
     """
-
-    def row(name: str, unit: str, value: float, std: float, judged: str, condition: str = "", ci95=None):
-        half = NINETY_FIVE * std
-        interval = ci95 or (value - half, value + half)
-        return PhysicalQuantity(name, unit, value, std, interval, condition, judged, found.verdicts.get(judged))
-
     constants = found.rigid_body.constants if found.is_vehicle else possible(found.rigid_body)
-    rows = [
-        row(name, each.unit, each.estimate, each.std, name if found.is_vehicle else RIGID_BODY, each.note or "")
-        for name, each in constants.items()
-    ]
-    judged = _judged() if found.is_vehicle else {name: name for name in found.parameters}
+    # The name of the verdict on each parameter.
+    judged = {name: name for name in found.parameters}
+    if found.is_vehicle:
+        terms = [term for term in TERMS.values() if term.verdict]
+        judged = {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}
+    rows = [(name, each, name if found.is_vehicle else RIGID_BODY, each.ci95) for name, each in constants.items()]
     rows += [
-        row(name.replace("_", " "), each.unit, each.estimate, each.std, judged[name], "", each.ci95)
+        (name.replace("_", " "), Constant(each.estimate, each.std, each.unit), judged[name], each.ci95)
         for name, each in found.parameters.items()
         if judged.get(name, CENTER) != CENTER and each.estimate is not None and each.std is not None
     ]
+    for each in centers_of_mass(found) if found.is_vehicle else ():
+        center = Constant(1e3 * each.value, 1e3 * each.std, "mm", "if rotors are alike")
+        rows.append((f"{CENTER} {each.axis}", center, CENTER, center.ci95))
     if found.is_vehicle:
-        rows += [
-            row(f"{CENTER} {each.axis}", "mm", 1e3 * each.value, 1e3 * each.std, CENTER, "if rotors are alike")
-            for each in centers_of_mass(found)
-        ]
-        rows.sort(key=lambda each: _ORDER.index(each.judged) if each.judged in _ORDER else -1)
-    return rows
+        rows.sort(key=lambda row: _ORDER.index(row[2]) if row[2] in _ORDER else -1)
+    return [
+        PhysicalQuantity(
+            name, x.unit, x.estimate, x.std, ends or x.ci95, x.note or "", verdict, found.verdicts.get(verdict)
+        )
+        for name, x, verdict, ends in rows
+    ]
 
 
 def possible(body: RigidBody) -> dict[str, Constant]:
@@ -84,7 +82,7 @@ def possible(body: RigidBody) -> dict[str, Constant]:
     vehicle = body.constants.get(YAW.inertia)
     most = {} if vehicle is None else {"J_R": vehicle.estimate}
     every = ((name, row, most.get(name, np.inf)) for name, row in body.constants.items())
-    return {name: row for name, row, limit in every if NINETY_FIVE * row.std < row.estimate <= limit}
+    return {name: row for name, row, limit in every if row.half_width < row.estimate <= limit}
 
 
 def centers_of_mass(found: Identification) -> list[CenterOfMass]:
@@ -97,19 +95,11 @@ def centers_of_mass(found: Identification) -> list[CenterOfMass]:
     return [each for each in every if np.isfinite([each.value, each.std]).all()]
 
 
-def _judged() -> dict[str, str]:
-    """The name of the verdict on each parameter of a vehicle's terms."""
-    terms = [term for term in TERMS.values() if term.verdict]
-    return {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}
-
-
 def dataframe(found: Identification) -> "pd.DataFrame":
     """See `Identification.to_dataframe`."""
     rows: dict[str, tuple[Any, ...]] = {}
     for name, row in found.rigid_body.constants.items():
-        half = NINETY_FIVE * row.std
-        ends = row.estimate - half, row.estimate + half
-        rows[name] = ("constant", row.unit, row.estimate, row.std, *ends, None, row.note or "")
+        rows[name] = ("constant", row.unit, row.estimate, row.std, *row.ci95, None, row.note or "")
     for name, row in found.parameters.items():
         rows[name] = ("parameter", row.unit, row.estimate, row.std, *(row.ci95 or _NONE), row.bound, row.note)
     for name, row in found.held.items() if isinstance(found, VehicleIdentification) else ():

@@ -38,6 +38,7 @@ MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
 # Relative half-widths of a 95 % interval above which a moment of inertia has a reservation, or is not identified. With
 # intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
 UNCERTAIN, TOO_UNCERTAIN = 0.1, 0.4
+ONLY_KNOWN_TO = "it is known to"  # begins the reason of a long interval
 MAX_PRIOR = 0.25  # share of the information about a parameter that its bracket may give without a reservation
 SIGNIFICANT = 3.0  # standard deviations that exceed chance
 IMPROBABLE = 1e-3  # a smaller probability exceeds chance
@@ -161,7 +162,7 @@ def verdicts_of(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> 
         causes[RESERVED] += quantity.reservations
         if quantity.missing and not causes[MISSING]:
             causes[MISSING].append(quantity.missing)
-        known = f"it is known to {100 * quantity.spread:.0f} % only; {quantity.remedy}"
+        known = f"{ONLY_KNOWN_TO} {100 * quantity.spread:.0f} % only; {quantity.remedy}"
         if quantity.spread > TOO_UNCERTAIN:
             causes[MISSING].append(known)
         elif quantity.spread > UNCERTAIN:

@@ -10,7 +10,7 @@ from .identification_text import (
     print_information as print_information,
 )
 from .log_page import print_inspection as print_inspection, write_log_page as write_log_page
-from .plots import Plots as Plots
+from .matplotlib_figures import Plots as Plots
 from .prediction import (
     print_prediction as print_prediction,
     write_prediction as write_prediction,

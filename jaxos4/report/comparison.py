@@ -12,8 +12,7 @@ from ..comparison import ComparedQuantity, Comparison
 from ..identification.verdict import ADVICE, RESERVED, STATUSES, headline
 from ..logs.table import counted
 from .page import Section, folded, picture, table, text, write_page
-from .panels import Band, Figure, Line, Panel, Scale, across
-from .style import BOUND_DASHES, FAINT, INK, Style, style
+from .panels import BOUND_DASHES, EVERYWHERE, FAINT, INK, Band, Figure, Line, Panel, Scale, Style, across, style
 from .text import DASH, Listing, plain, say, span, with_unit
 
 
@@ -102,12 +101,12 @@ def forest(found: Comparison, look: Style) -> Figure:
         low, high = min(ends), max(ends)
         room = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-300)
         # Answers that do not count may reach far; the figure shows twice the room of those that do.
-        x, everywhere, marks = Scale(ends=(low - room / 2, high + room / 2)), (-math.inf, math.inf), []
+        x, marks = Scale(ends=(low - room / 2, high + room / 2)), []
         if math.isfinite(each.value):
             marks += [Band(each.ci95, 2 * [-math.inf], 2 * [math.inf], look.color, 0.18, name="pooled, 95 %")]
-            marks += [Line(2 * [each.value], everywhere, look.color, 1.4)]
+            marks += [Line(2 * [each.value], EVERYWHERE, look.color, 1.4)]
         if low - room / 2 < each.reference < high + room / 2:
-            marks += [Line(2 * [each.reference], everywhere, width=1.2, dash=BOUND_DASHES[2], name="airframe's file")]
+            marks += [Line(2 * [each.reference], EVERYWHERE, width=1.2, dash=BOUND_DASHES[2], name="airframe's file")]
         for place, (row, used) in enumerate(zip(each.answers, each.used, strict=True)):
             if row is not None:
                 color, name = (INK, "95 % interval") if used else (FAINT, "refused by a verdict: does not count")

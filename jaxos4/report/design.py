@@ -8,10 +8,9 @@ from rich.console import Console
 
 from .._files import write_file
 from ..design import Design
-from .panels import Figure, Line, Panel, Scale
-from .style import styles
+from .panels import EVERYWHERE, Figure, Line, Panel, Scale, styles
 from .svg import as_file
-from .text import Listing, plain
+from .text import Listing, plain, say
 
 _WIDTH, _HEIGHT = 270.0, 190.0  # of a panel [px]
 # By the kind of design: what a missing bound means, what the geometric mean is taken of, what the other inputs share
@@ -43,27 +42,27 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
         bounds = [one.bounds[i] for one in every.values()]
         rows.append((name, unit, *(plain(factor * x, 2) if x < task.unexcited[i] else "-" for x in bounds)))
     Listing(("parameter", "unit", *every), rows, right=tuple(every)).print_on(console)
-    console.print(f"the smallest possible standard deviation; -: {unexcited}.")
+    say(console, f"the smallest possible standard deviation; -: {unexcited}.")
     gains, count = [], task.scale.size
     for name in found.standard:
         ratio, excited = found.gain(name)
         some = "" if excited == count else f" ({excited} of {count})"
         gains.append(f"{plain(ratio, 2)} x {name}{some}" if excited else f"{name} excites nothing")
-    console.print(f"geometric mean of the bounds {targets}: {'; '.join(gains)}; {compared}.")
+    say(console, f"geometric mean of the bounds {targets}: {'; '.join(gains)}; {compared}.")
     uses = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.designed.uses.items())
-    console.print(f"largest share of each limit, of {task.vehicles} vehicles from the bracket: {uses}.")
+    say(console, f"largest share of each limit, of {task.vehicles} vehicles from the bracket: {uses}.")
     designed = found.designed
     times = designed.shortest(accuracy * task.scale)
     longest = float(np.max(times))
     if task.kind == "references":
         after = ", ".join(f"{name} after {x:.3g} s" for name, x in zip(task.names, times, strict=False))
         so = f"So fly at least {longest:.3g} s; the references repeat every {designed.period:.3g} s."
-        console.print(f"known to {100 * accuracy:g} %: {after}. {so}")
+        say(console, f"known to {100 * accuracy:g} %: {after}. {so}")
         return
     repeats, how = longest / designed.duration, "not by this input"
     if repeats < 1e4:
         how = f"the first {longest:.2f} s are enough" if repeats <= 1 else f"fly it {math.ceil(repeats)} times"
-    console.print(f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}.")
+    say(console, f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}.")
 
 
 def write_design_figure(path: str | os.PathLike[str], found: Design, accuracy: float) -> None:
@@ -82,7 +81,7 @@ def write_design_figure(path: str | os.PathLike[str], found: Design, accuracy: f
     x = Scale("log", label="flight [s]") if in_percent else Scale(label="time [s]")
     for i, (name, unit) in enumerate(zip(task.names[: task.scale.size], task.units, strict=False)):
         line, meaning = (100 * accuracy, "wanted") if in_percent else (float(task.scale[i]), "bracket")
-        marks = [Line((-math.inf, math.inf), (line, line), width=1.2, name=meaning)]
+        marks = [Line(EVERYWHERE, (line, line), width=1.2, name=meaning)]
         for kind, one in every.items():
             if one.history is None:
                 seconds = np.geomspace(designed.period, 10 * designed.duration, 50)

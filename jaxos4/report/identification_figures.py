@@ -15,11 +15,26 @@ from ..flight import STATE_NAMES
 from ..identification.results import Constant, Identification, SampleTime
 from ..models.state import CASCADE_ORDER
 from ..results import NINETY_FIVE
-from .panels import Band, Figure, Line, Mark, Panel, Scale, Words, across, spread
-from .style import BOUND_DASHES, FAINT, GRID, INK, Style, style
+from .panels import (
+    BOUND_DASHES,
+    EVERYWHERE,
+    FAINT,
+    GRID,
+    INK,
+    Band,
+    Figure,
+    Line,
+    Mark,
+    Panel,
+    Scale,
+    Style,
+    Words,
+    across,
+    spread,
+    style,
+)
 
 _FAR = (2, 10, 100, 1000, 10000, 100000)  # ticks of brackets that were left far behind, in half-widths
-_EVERYWHERE = (-math.inf, math.inf)  # from one end of an axis to the other
 _ALL = "95 % interval"
 
 
@@ -63,8 +78,8 @@ def residual_figure(found: Correlations) -> Figure:
             ("with the torques", float(np.max(found.torque_bound[i])), torques, found.with_torque[i]),
         ):
             reach = 1.15 * min(max(float(np.abs(values).max(initial=0.0)), bound, 0.05), 1.0)
-            chance = Band(_EVERYWHERE, 2 * [-bound], 2 * [bound], name="95 % by chance")
-            axis = Line(_EVERYWHERE, (0, 0), width=0.9)
+            chance = Band(EVERYWHERE, 2 * [-bound], 2 * [bound], name="95 % by chance")
+            axis = Line(EVERYWHERE, (0, 0), width=0.9)
             y = Scale(ends=(-reach, reach))
             panels.append(Panel(f"{name}: {title}", [chance, axis, *marks], x, y, 430, 150))
     return Figure("residuals", panels, columns=2)
@@ -146,9 +161,9 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
     bars: list[Mark] = []
     for row, (name, given) in enumerate(zip(INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
         if name in constants:
-            value, half = constants[name].estimate, NINETY_FIVE * constants[name].std
+            value, (low, high) = constants[name].estimate, constants[name].ci95
             bars += [Band((0, value), 2 * [row - 0.25], 2 * [row + 0.25], look.color, 0.35)]
-            bars += [across([row], [value - half], [value + half], color=look.color, width=2.2, name=_ALL)]
+            bars += [across([row], [low], [high], color=look.color, width=2.2, name=_ALL)]
             bars += [Line([value], [row], look.color, 0, marker=look.marker)]
         else:
             bars += [Words(0, row, "not identified")]
@@ -191,7 +206,7 @@ def _response(
             one.frequency, np.where(one.clear, band[0], np.nan), np.where(one.clear, band[1], np.nan), look.color, 0.25
         ),
         Line(one.frequency, np.where(one.clear, values, np.nan), look.color, name="measured / modelled"),
-        Line(_EVERYWHERE, 2 * [model], width=1.2, dash=BOUND_DASHES[2], name="model"),
+        Line(EVERYWHERE, 2 * [model], width=1.2, dash=BOUND_DASHES[2], name="model"),
     ]
 
 
@@ -218,13 +233,13 @@ def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: 
     x = Scale("log", (0.8 * times[0], 1.25 * times[-1]), {time: f"{time:.3g}" for time in times}, "sample time [ms]")
     for name in INERTIAS:
         rows = {1e3 * each.sample_time: each.constants[name] for each in answers if name in each.constants}
-        at, values = list(rows), np.array([row.estimate for row in rows.values()])
-        half = NINETY_FIVE * np.array([row.std for row in rows.values()])
+        at, values = list(rows), [row.estimate for row in rows.values()]
+        low, high = zip(*(row.ci95 for row in rows.values()), strict=True) if rows else ((), ())
         kept = [row.estimate for time, row in rows.items() if math.isclose(time, 1e3 * chosen)]
-        marks = [Line(_EVERYWHERE, 2 * [each], FAINT, 1.2, BOUND_DASHES[2]) for each in kept]
+        marks = [Line(EVERYWHERE, 2 * [each], FAINT, 1.2, BOUND_DASHES[2]) for each in kept]
         marks += [Line(at, values, look.color, dash=look.dash, marker=look.marker, name="estimate, 95 %")]
-        marks += [spread(at, values - half, values + half, color=look.color)]
-        marks += [Line(2 * [1e3 * chosen], _EVERYWHERE, width=1.2, dash=BOUND_DASHES[1], name="chosen")]
+        marks += [spread(at, low, high, color=look.color)]
+        marks += [Line(2 * [1e3 * chosen], EVERYWHERE, width=1.2, dash=BOUND_DASHES[1], name="chosen")]
         title, y = (f"{name} [kg m²]", Scale()) if rows else (f"{name}: not identified", Scale(ticks={}))
         panels.append(Panel(title, marks, x, y))
     return Figure("sample-times", panels)

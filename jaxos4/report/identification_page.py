@@ -18,7 +18,7 @@ from . import identification_figures as figures
 from .identification_signals import BAND, identified_signals
 from .identification_text import next_lines, notes_of, quantity_rows, share, warning_lines, why_no_value
 from .page import Section, picture, signals, table, template, text, write_page
-from .style import Style, styles
+from .panels import Style, styles
 from .text import DASH, plain, span
 
 # The page shows these entries of the provenance in a place of their own.
@@ -265,10 +265,8 @@ def quantities(found: Identification) -> list[tuple[str, ...]]:
     listed = {row[0] for row in rows}
     for name, row in {} if found.is_vehicle else found.rigid_body.constants.items():
         if name not in listed:  # a J_R of -3 kg m^2 would be read as a value
-            half = NINETY_FIVE * row.std
-            rows.append(
-                (name, DASH, f"{row.estimate - half:.4g} to {row.estimate + half:.4g}", row.unit, why_no_value(row))
-            )
+            low, high = row.ci95
+            rows.append((name, DASH, f"{low:.4g} to {high:.4g}", row.unit, why_no_value(row)))
     for name in INERTIAS:
         if name in found.verdicts and name not in listed:
             rows.append((name, DASH, "", "kg m^2", found.verdicts[name].status))

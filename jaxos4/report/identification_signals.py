@@ -13,7 +13,7 @@ from ..errors import printable
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..identification.results import Identification, VehicleIdentification
 from ..models.state import CASCADE_ORDER
-from .style import BOUND_DASHES, Style, style
+from .panels import BOUND_DASHES, Style, style
 from .timeline import TimeAxis, line, panel, signals, spans, view
 
 BAND = 0.95

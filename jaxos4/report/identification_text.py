@@ -21,9 +21,9 @@ from ..identification.verdict import (
     reason_lines,
     statuses_of,
 )
-from ..results import NINETY_FIVE
 from .text import DASH, Listing, plain, say
 
+_LATE = 0.005  # s; a `rotor_delay` below minus this means that motors are recorded late
 _WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
@@ -93,7 +93,10 @@ def warning_lines(found: Identification) -> list[str]:
 
 def notes_of(found: Identification) -> list[str]:
     """The notes on the data, and the clock of the motors if it is not the gyro's."""
-    return [*found.provenance.notes, *[f"{found.motor_clock} (rotor_delay)"] * bool(found.motor_clock)]
+    notes, delay = list(found.provenance.notes), found.parameters.get("rotor_delay")
+    if delay is not None and delay.estimate is not None and delay.estimate <= -_LATE:
+        notes.append(f"motors are recorded {-1e3 * delay.estimate:.0f} ms late (rotor_delay)")
+    return notes
 
 
 def _failure(found: Identification) -> Lines:
@@ -167,13 +170,13 @@ def _fit(found: OS4Identification) -> Lines:
 
 def why_no_value(row: Constant) -> str:
     """Why a constant of a rigid body is not among the physical quantities."""
-    return "below noise" if abs(row.estimate) <= NINETY_FIVE * row.std else "impossible"
+    return "below noise" if abs(row.estimate) <= row.half_width else "impossible"
 
 
 def _inertias(found: Identification) -> Lines:
     body = found.rigid_body
     inertias = [
-        f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
+        f"{name} {row.estimate:.4g} +- {row.half_width:.2g}{f' ({row.note})' if row.note else ''}"
         if name in possible(body)
         else f"{name} {why_no_value(row)}"
         for name, row in body.constants.items()
@@ -257,7 +260,7 @@ def share(value: float | None) -> str:
 def print_information(console: Console, found: FlightInformation) -> None:
     """Prints a row for each parameter: its bound, and whether it is identifiable."""
     if not found.fitted:
-        console.print("note: no fit; all numbers below hold at the bracket's centre")
+        say(console, "note: no fit; all numbers below hold at the bracket's centre")
     rows = []
     for name, row in found.parameters.items():
         bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
@@ -265,9 +268,10 @@ def print_information(console: Console, found: FlightInformation) -> None:
         rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit, row.note))
     numbers = ("bound", "others known", "of bracket", "noise limit")
     Listing(("parameter", "unit", *numbers, "note"), rows, numbers).print_on(console)
-    console.print(
+    say(
+        console,
         "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
         "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
         "identifiable; noise limit: the largest noise, in multiples of the noise that was found, at which the "
-        "airframe's value can be distinguished from 0."
+        "airframe's value can be distinguished from 0.",
     )

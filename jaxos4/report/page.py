@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 from markupsafe import Markup, escape
 
 from .._files import templates, write_file
-from .panels import Figure, Line
-from .style import Style
+from .panels import Figure, Line, Style
 from .svg import inline, swatch
 from .text import WORDED
 

@@ -9,8 +9,7 @@ from .._files import write_file
 from ..forecast import QUANTITIES, FlightPrediction
 from ..rotations import euler_angles
 from .page import Section, picture, table, text, write_page
-from .panels import Band, Figure, Line, Panel, Scale
-from .style import BOUND_DASHES, FAINT, INK, style
+from .panels import BOUND_DASHES, FAINT, INK, Band, Figure, Line, Panel, Scale, style
 from .svg import as_file
 from .text import Listing, plain, say
 

@@ -6,13 +6,11 @@ import numpy as np
 import xarray as xr
 
 from ..study import metrics
-from .panels import Figure, Line, Panel, Scale, across, spread
+from .panels import BOUND_DASHES, EVERYWHERE, Figure, Line, Panel, Scale, Style, across, spread, styles
 from .study_tables import bounds, error_unit, names, positive_scales, scale_labels, shown_level
-from .style import BOUND_DASHES, Style, styles
 from .text import plain
 
 _WIDEST, _NARROWEST = 4.0, 1.4  # line widths [px] of the first and the last estimator, so that none hides another
-_EVERYWHERE = (-np.inf, np.inf)
 
 
 def intervals(data: xr.Dataset) -> Figure | None:
@@ -28,7 +26,7 @@ def intervals(data: xr.Dataset) -> Figure | None:
     scale = Scale(ends=(len(parameters) - 0.4, -0.6), ticks=dict(enumerate(parameters)), lines=False)
     height = 90 + len(parameters) * (14 + 6 * len(estimators))
     for i, title in enumerate(scale_labels(data)):
-        marks = [Line((0, 0), (-np.inf, np.inf), width=1.5)]
+        marks = [Line((0, 0), EVERYWHERE, width=1.5)]
         for j, (name, look) in enumerate(styles(estimators).items()):
             y = places + 0.6 * (j - (len(estimators) - 1) / 2) / len(estimators)
             x, reach = (each.isel(scale=i, estimator=j).values for each in (error, half))
@@ -69,7 +67,7 @@ def efficiency(data: xr.Dataset) -> Figure | None:
     scales, panels = data["scale"].values, []
     values, low, high = (found[each].values for each in ("efficiency", "low", "high"))
     for place, name in enumerate(names(data, "parameter")):
-        marks = [Line(_EVERYWHERE, (1, 1), width=1.5)]
+        marks = [Line(EVERYWHERE, (1, 1), width=1.5)]
         for i, look in _looks(data):
             x, at = dodged(scales, i, data.sizes["estimator"]), (place, i)
             marks += [_line(data, i, look, x, values[at])]
@@ -112,7 +110,7 @@ def overview(data: xr.Dataset) -> Figure | None:
         return None
     none = 0.5  # the place on the logarithmic axis for an estimator without rollouts
     spent, count = np.maximum(rollouts, none), data.sizes["estimator"]
-    by_noise = [Line(_EVERYWHERE, (1, 1), width=1.5)]
+    by_noise = [Line(EVERYWHERE, (1, 1), width=1.5)]
     by_rollouts = list(by_noise)
     for i, look in _looks(data):
         at, name = np.flatnonzero(known[:, i]), names(data, "estimator")[i]

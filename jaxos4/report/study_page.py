@@ -10,10 +10,9 @@ from .._files import check_writable, write_file
 from ..logs.table import counted
 from . import study_tables
 from .page import Section, folded, picture, table, text, write_page
-from .panels import Figure
+from .panels import Figure, styles
 from .study_figures import FIGURES, draw
 from .study_tables import names, scenarios
-from .style import styles
 from .svg import as_file
 
 MOST_DRAWN = 12

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup, escape
 
-from .panels import Band, Figure, Line, Mark, Panel, Scale, Words
-from .style import FAINT, GRID, INK, PAPER
+from .panels import FAINT, GRID, INK, PAPER, Band, Figure, Line, Mark, Panel, Scale, Words
 
 _THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)"}
 _LETTERS, _LINE = 12.0, 18.0  # the size of letters, and the height of a line of text [px]

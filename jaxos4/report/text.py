@@ -83,9 +83,9 @@ def with_unit(name: str, unit: str) -> str:
     return name if unit == "1" else f"{name} [{unit}]"
 
 
-def say(console: Console, line: str, style: str | None = None) -> None:
-    """Prints a line as it is: no markup, and no colours but those of `style`."""
-    console.print(line, style=style, markup=False, highlight=False)
+def say(console: Console, line: str, style: str | None = None, *, soft_wrap: bool = False) -> None:
+    """Prints a line as it is: no markup, and no colours but those of `style`. `soft_wrap`: the terminal breaks it."""
+    console.print(line, style=style, markup=False, highlight=False, soft_wrap=soft_wrap)
 
 
 def print_whole(console: Console, table: RenderableType) -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .style import Style
+from .panels import Style
 
 _LEVELS = 65_000  # of a packed number, which takes two bytes
 

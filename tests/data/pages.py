@@ -41,7 +41,7 @@ def stands_alone(text):
 def without_matplotlib(patch):
     """Lets every import of matplotlib fail, and of the modules that need it, as if none had been imported before."""
     loaded = [name for name in sys.modules if name.startswith("matplotlib.")]
-    for name in ("matplotlib", "jaxos4.report.plots", "jaxos4.report.matplotlib_figures", *loaded):
+    for name in ("matplotlib", "jaxos4.report.matplotlib_figures", *loaded):
         patch.setitem(sys.modules, name, None)
 
 
