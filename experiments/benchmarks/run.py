@@ -115,7 +115,7 @@ def growth(
         plan += [("unknowns", 20, same | {"known": False}, {})]
     rows = []
     for axis, size, flown, options in plan:
-        contender = Contender("jaxos4_fit:fit", options={"estimator": estimator, **options})
+        contender = Contender("ours:fit", options={"estimator": estimator, **options})
         racers = line_up({f"{axis} {size}": contender}, make_case(**flown), 1, skipped)
         found = race(racers, repeats if flown["flights"] <= MANY else 1)
         rows += [{"axis": axis, "size": size, **row} for row in found.values()]
@@ -144,7 +144,7 @@ def networks(steps: int, simulations: int, flights: int, skipped: list[str]) -> 
 
 def roofline(shot_rows: dict[str, Any], skipped: list[str]) -> dict[str, Any]:
     """The peak of the machine, the operations of one step, and the share of the peak that our shots reach."""
-    racers = line_up({"roofline": Contender("roofline:roofline")}, make_case(1, 10), 1, skipped)
+    racers = line_up({"roofline": Contender("ours:roofline")}, make_case(1, 10), 1, skipped)
     found: dict[str, Any] = {}
     for racer in racers.values():
         found = {name: float(value) for name, value in racer.answer.items()}
