@@ -151,7 +151,7 @@ def flights_of(
     return flown
 
 
-def sines(*, duration: float, dt: float, key: jax.Array) -> jaxos4.closed_loop.References:
+def sines(*, duration: float, dt: float, key: jax.Array) -> jaxos4.excitation.References:
     """References of a soft flight: the tones of the standard multisine, with frequencies and phases of the flight."""
     tones = np.array([*STANDARD_TONES, VERTICAL_TONES])
     spread, phases = jax.random.uniform(key, (2, *tones.shape))
