@@ -5,7 +5,6 @@ The moments of inertia of two flights of one vehicle should differ by chance alo
 
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from experiments.monte_carlo import (
     Column,
     Row,
     check_names,
+    groups,
     interval,
     print_rows,
     print_table,
@@ -30,7 +30,7 @@ from experiments.sample_times.run import VEHICLE as CINERAT
 from experiments.shared import End, Estimators, Flights, Out, Report, flight_files
 from experiments.verdicts.faults import thinned
 from jaxos4.estimators import ESTIMATORS
-from jaxos4.recording import Recording, read_recording
+from jaxos4.recording import read_recording
 from jaxos4.results import NINETY_FIVE
 
 CRAZYFLIE = jaxos4.load_airframe("crazyflie")
@@ -47,14 +47,17 @@ STEP = 0.01  # s; of the slower logs
 HORIZONS = (5, 10, 20, 30, 50)  # steps ahead, of a table
 AHEAD = 0.25  # s
 BOOTSTRAPS, SEEDS = 2000, 3
-SHOWN = {name: f"{name} [1e-5 kg m^2]" for name in ("Ix", "Iy")}
+COMPARED = ("Ix", "Iy")
+INTERVALS: dict[str, Column] = {
+    f"{name} [1e-5 kg m^2]": lambda row, n=name: interval(row["constants"].get(n), 1e5) for name in COMPARED
+}
 
 
 def disagreements(rows: dict[str, Row]) -> dict[str, dict[tuple[str, str], float]]:
     """For Ix and Iy, and each pair of flights that have them: their difference over its standard deviation."""
     table: dict[str, dict[tuple[str, str], float]] = {}
     for (one, first), (other, second) in itertools.combinations(rows.items(), 2):
-        for name in SHOWN:
+        for name in COMPARED:
             a, b = (row["constants"].get(name) for row in (first, second))
             if a and b:
                 z = abs(a["estimate"] - b["estimate"]) / (a["std"] ** 2 + b["std"] ** 2) ** 0.5
@@ -68,7 +71,7 @@ def agreement(rows: dict[str, Row]) -> Row:
     Two draws of one flight are no pair. `None`: no pair.
     """
     names, found = [name for name, row in rows.items() if row["constants"]], disagreements(rows)
-    pairs = [(*pair, z <= NINETY_FIVE) for name in SHOWN for pair, z in found.get(name, {}).items()]
+    pairs = [(*pair, z <= NINETY_FIVE) for name in COMPARED for pair, z in found.get(name, {}).items()]
     if not pairs:
         return {"flights": names, "pairs": 0, "share": None, "ci95": None}
     first, second = (np.array([names.index(pair[k]) for pair in pairs]) for k in (0, 1))
@@ -95,7 +98,7 @@ def real_flight(
     end: End = None,
     names: list[str] = ARPL_FLIGHTS,
     estimators: Estimators = ("filter-error", "ibss"),
-    out: Report = None,
+    out: Out = None,
 ) -> None:
     """Do flights of a real Crazyflie agree on its moments of inertia, and how well is the rest of a flight predicted?
 
@@ -108,36 +111,33 @@ def real_flight(
     """
     check_names("estimators", estimators, ESTIMATORS)
     paths = flight_files(flights, [f"arpl_crazyflie_{name}.csv" for name in names])
-    recordings = {name: read_recording(path, ARPL) for name, path in zip(names, paths, strict=True)}
-    groups = {name: [recording] for name, recording in recordings.items()}
-    if len(groups) > 1:
-        groups["all"] = list(recordings.values())
-    report: Row = {"version": jaxos4.__version__, "authors": AUTHORS, "estimators": {}}
-    for estimator in estimators:
-        rows = {}
-        for name, group in groups.items():
-            found = jaxos4.identify(group, ARPL, settings=jaxos4.VehicleSettings(end=end), estimator=estimator)
-            print(f"{estimator}, {name}: {found.seconds:.0f} s", flush=True)
-            rows[name] = found.to_dict()
-            rows[name]["ahead"] = skill_ahead(rows[name]["skill"])
-        z = {name: {", ".join(p): x for p, x in pairs.items()} for name, pairs in disagreements(rows).items()}
-        report["estimators"][estimator] = {"flights": rows, "z": z}
-        write_report(out, report)
+    flown = {name: [read_recording(path, ARPL)] for name, path in zip(names, paths, strict=True)}
+    if len(flown) > 1:
+        flown["all"] = [recording for (recording,) in flown.values()]
+
+    def row_of(estimator: str, flight: str) -> Row:
+        settings = jaxos4.VehicleSettings(end=end)
+        found = jaxos4.identify(flown[flight], ARPL, settings=settings, estimator=estimator)
+        print(f"{estimator}, {flight}: {found.seconds:.0f} s", flush=True)
+        row = found.to_dict()
+        return row | {"ahead": skill_ahead(row["skill"])}
+
+    settings = {"authors": AUTHORS, "names": list(names), "end": end}
+    rows = study(out, settings, product(estimator=estimators, flight=flown), row_of)
     columns: dict[str, Column] = {name: name for name in ("estimator", "flight", "result")}
-    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
+    columns |= INTERVALS
     for rate in "pq":
         columns[f"skill {rate}"] = lambda row, r=rate: (
             "{:.2f} +- {:.2f}".format(*row["ahead"][r]) if r in row["ahead"] else ""
         )
-    every = report["estimators"].items()
-    lines = [{"estimator": e, "flight": f} | row for e, found in every for f, row in found["flights"].items()]
-    print_rows(f"moments of inertia with 95 % intervals, and the skill {AHEAD:g} s ahead", lines, columns)
-    for estimator, found in every:
-        worst = ", ".join(f"{name} {max(pairs.values()):.2g}" for name, pairs in found["z"].items())
+    print_rows(f"moments of inertia with 95 % intervals, and the skill {AHEAD:g} s ahead", rows, columns)
+    for (estimator,), some in groups(rows, "estimator").items():
+        apart = disagreements({row["flight"]: row for row in some})
+        worst = ", ".join(f"{name} {max(pairs.values()):.2g}" for name, pairs in apart.items())
         print(f"{estimator}: the largest disagreement of two flights (z): {worst or 'no pair'}")
 
 
-def alone(recordings: list[Recording], end: float | None) -> Row:
+def alone(recordings: list[jaxos4.Recording], end: float | None) -> Row:
     """The result, the doubts and the moments of inertia of these recordings; or why they are refused."""
     row, found = identified(recordings, CRAZYFLIE, settings=jaxos4.VehicleSettings(sample_time=STEP, end=end))
     if found is None:
@@ -202,7 +202,7 @@ def public_flights(
         report["alone"]["all together"] = alone([recordings[name] for name in compared], end)
     write_report(out, report)
     columns: dict[str, Column] = {"flight": "flight", "result": "result"}
-    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
+    columns |= INTERVALS
     columns |= {"results": lambda row: "; ".join(row["doubts"])}
     rows = ({"flight": name} | row for name, row in report["alone"].items())
     print_rows("each flight alone, 95 % intervals", rows, columns, width=180)
@@ -238,7 +238,7 @@ def print_shares(report: Row) -> None:
     print_table(title, ("flight", "rate", *headings), rows, width=180)
 
 
-def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End = None, out: Report = None) -> None:
+def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End = None, out: Out = None) -> None:
     """What does a radio do to an identification? A flight that was logged on board, with fewer of its commands.
 
     A radio brings each command as it was at one moment. The flight is one of `real_flight`, logged at 1 kHz. It is
@@ -246,17 +246,17 @@ def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End 
     """
     (path,) = flight_files(flights, ["arpl_crazyflie_rollpitch.csv"])
     recording, settings = read_recording(path, CRAZYFLIE), jaxos4.VehicleSettings(sample_time=STEP, end=end)
-    report: dict[int, Any] = {}
-    for n in every:
+
+    def row_of(n: int) -> Row:
         found = jaxos4.identify([thinned(recording, float(n))], CRAZYFLIE, settings=settings).to_dict()
-        report[n] = {name: found[name] for name in ("result", "doubts", "verdicts", "parameters", "constants")}
-        write_report(out, report)
+        return {name: found[name] for name in ("result", "doubts", "verdicts", "parameters", "constants")}
+
+    rows = study(out, {"end": end}, product(n=every), row_of)
     columns: dict[str, Column] = {"one command of": "n"}
     for name in ("roll_damping", "pitch_damping"):
         columns[f"{name.replace('_', ' ')} [1/s]"] = lambda row, name=name: interval(row["parameters"].get(name), 1.0)
-    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
-    columns |= {f"verdict of {name}": lambda row, name=name: row["verdicts"][name]["status"] for name in SHOWN}
-    rows = ({"n": n} | row for n, row in report.items())
+    columns |= INTERVALS
+    columns |= {f"verdict of {name}": lambda row, name=name: row["verdicts"][name]["status"] for name in COMPARED}
     print_rows("thinned commands, 95 % intervals", rows, columns, width=180)
 
 

@@ -19,7 +19,7 @@ def test_real_flight(shared_flights, tmp_path):
         tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
     )
     plot(tmp_path, "real_flight")
-    (row,) = report["estimators"]["filter-error"]["flights"].values()
+    (row,) = report["rows"]
     assert all(0.8e-5 < row["constants"][name]["estimate"] < 2.2e-5 for name in ("Ix", "Iy"))
     assert all(value > 0 for value, _ in row["ahead"].values())
 
@@ -161,7 +161,7 @@ def test_the_order_of_a_disturbance_decides_on_the_thrust():
 
 
 def test_commands_that_are_too_rare_are_named(shared_flights, tmp_path):
-    (row,) = result_of(tmp_path, "public_flights", "radio", flights=shared_flights, every=[40]).values()
+    (row,) = result_of(tmp_path, "public_flights", "radio", flights=shared_flights, every=[40])["rows"]
     assert row["result"] != "successful"
     assert any("damping" in doubt["cause"] and "too rarely" in doubt["cause"] for doubt in row["doubts"])
 
