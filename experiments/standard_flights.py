@@ -38,6 +38,7 @@ from experiments.shared import (
     flight_keys,
     identify,
     measure,
+    monte_carlo_error,
     standard_problem,
 )
 from jaxos4.estimators import ESTIMATORS, make_estimator
@@ -48,11 +49,6 @@ from jaxos4.results import NINETY_FIVE
 CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
 COVERED: dict[str, Column] = {"95 % intervals that hold [%]": lambda row: 100 * np.mean(row["covered"])}
 SECONDS: dict[str, Column] = {"s": lambda row: row["flights"] * row["seconds"]}
-
-
-def accuracy(flights: int) -> str:
-    """The Monte-Carlo error of a root mean square, for the title of a table."""
-    return f"Monte-Carlo error {1 / np.sqrt(2 * flights):.2g}"
 
 
 def efficiency(
@@ -81,7 +77,7 @@ def efficiency(
     settings = {"flights": flights, "seed": seed, "scale": scale}
     rows = study(out, settings, product(case=cases or every), row_of, rows="cases")
     columns = {"case": "case", **EFFICIENCY, **COVERED, **ENDED, **SECONDS}
-    print_rows(f"RMSE / bound, {flights} flights, noise {scale:g}, {accuracy(flights)}", rows, columns)
+    print_rows(f"RMSE / bound, {flights} flights, noise {scale:g}, {monte_carlo_error(flights)}", rows, columns)
 
 
 def coverage(
@@ -215,7 +211,7 @@ def defaults(flights: Count = 64, seed: Seed = 7, settings: list[str] = (), out:
     trials = ({"setting": s, "model": fit.model, "scale": fit.scale} for s, some in chosen.items() for fit in some)
     rows = study(out, {"flights": flights, "seed": seed}, trials, row_of)
     columns = {"setting": "setting", "model": "model", "noise": "scale", **SPAN, **COVERED, "gap": "gap", **ENDED}
-    print_rows(f"{flights} flights, {accuracy(flights)}", rows, columns)
+    print_rows(f"{flights} flights, {monte_carlo_error(flights)}", rows, columns)
 
 
 def long_flight(

@@ -23,6 +23,7 @@ from experiments.shared import (
     fit_noisy,
     identify,
     measure,
+    monte_carlo_error,
     run_studies,
     save_results,
     span,
@@ -149,8 +150,8 @@ def rollout_budget(
         "RMSE / bound": lambda case: span(rms.sel(case)),
         "rollouts": lambda case: float(spent.sel(case)),
     }
-    accuracy = f"Monte-Carlo error {1 / np.sqrt(2 * study.flights):.2g}"
-    print_rows(f"accuracy by limit, {study.flights} flights, {accuracy}", cases, columns)
+    title = f"accuracy by limit, {study.flights} flights, {monte_carlo_error(study.flights)}"
+    print_rows(title, cases, columns)
 
 
 def p_values(exact: jaxos4.ShootingProblem, found: jaxos4.Estimate, states: jax.Array) -> np.ndarray:

@@ -103,18 +103,15 @@ def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> Row:
 
 def print_cases(title: str, rows: list[Row]) -> None:
     """One line for each estimator, strength of gusts and moment of inertia; one without numbers if none has any."""
-    lines: list[tuple[str, ...]] = [
-        (
-            *(f"{gust:g}", references, estimator, name, str(row["flights"]), plus_minus(row)),
-            *(f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}", plus_minus(row, "efficiency", 1.0)),
-            *(plus_minus(row, "covered"), results_of(some)),
-        )
-        for (gust, references, estimator), some in groups(rows, "gust", "references", "estimator").items()
-        for name, row in summary(some).items()
-    ]
-    for about, some in groups(rows, "gust", "references", "estimator").items():
-        if not summary(some):
-            lines.append((f"{about[0]:g}", *about[1:], *[""] * 7, results_of(some)))
+    lines: list[tuple[str, ...]] = []
+    for (gust, *about), some in groups(rows, "gust", "references", "estimator").items():
+        begin, results, found = (f"{gust:g}", *about), results_of(some), summary(some)
+        for name, row in found.items():
+            sizes = plus_minus(row), f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}"
+            shares = plus_minus(row, "efficiency", 1.0), plus_minus(row, "covered")
+            lines.append((*begin, name, str(row["flights"]), *sizes, *shares, results))
+        if not found:
+            lines.append((*begin, *[""] * 7, results))
     figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
     print_table(title, ("gust", "references", "estimator", "", *figures), lines)
 
