@@ -7,22 +7,20 @@ fits best is found, and the columns of the motion capture are moved by it.
 import numpy as np
 
 import jaxos4
-from jaxos4.flight import STATE_NAMES
+from jaxos4.flight import RATES
 from jaxos4.forecast.measured import Measured
 from jaxos4.recording import Recording
 from jaxos4.rotations import deviation
 
 # Half of the time over which turns are compared, and the largest lag [samples]; an error of more medians is an outlier.
 HALF, MOST, OUTLIER = 5, 6, 3.0
-GYRO = [STATE_NAMES.index(name) for name in "pqr"]
-CAPTURED = [i for i in range(len(STATE_NAMES)) if i not in GYRO]
 
 
 def capture_lag(recording: Recording) -> float:
     """How late the motion capture is recorded, compared with the gyro [s]: by the rates of roll and pitch."""
     attitude = Measured.of(jaxos4.Flight(recording.time, recording.omega, recording.states)).states[:, 6:10]
     seen = np.stack(deviation(attitude[: -2 * HALF].T, attitude[2 * HALF :].T), axis=1)[:, :2]
-    rates = np.nan_to_num(recording.states[:, GYRO[:2]])
+    rates = np.nan_to_num(recording.states[:, RATES[:2]])
     turned = np.cumsum((rates[1:] + rates[:-1]) / 2, axis=0) * recording.dt
     turned = np.concatenate([np.zeros((1, 2)), turned])
     turned = turned[2 * HALF :] - turned[: -2 * HALF]
@@ -39,6 +37,6 @@ def capture_lag(recording: Recording) -> float:
 def aligned(recording: Recording) -> Recording:
     """The recording with position, velocity and attitude on the clock of the gyro."""
     states, time = recording.states.copy(), recording.time + capture_lag(recording)
-    for column in CAPTURED:
+    for column in np.setdiff1d(np.arange(states.shape[1]), RATES):
         states[:, column] = np.interp(time, recording.time, recording.states[:, column])
     return recording._replace(states=states)
