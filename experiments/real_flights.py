@@ -6,8 +6,6 @@ The moments of inertia of two flights of one vehicle should differ by chance alo
 import itertools
 from pathlib import Path
 
-import numpy as np
-
 import jaxos4
 from experiments.fits import INERTIAS, constants, identified
 from experiments.monte_carlo import (
@@ -46,7 +44,7 @@ AIRFRAMES |= {"cinerat/cinerat_281.csv": CINERAT}
 STEP = 0.01  # s; of the slower logs
 HORIZONS = (5, 10, 20, 30, 50)  # steps ahead, of a table
 AHEAD = 0.25  # s
-BOOTSTRAPS, SEEDS = 2000, 3
+SEEDS = 3  # of networks
 COMPARED = ("Ix", "Iy")
 INTERVALS: dict[str, Column] = {
     f"{name} [1e-5 kg m^2]": lambda row, n=name: interval(row["constants"].get(n), 1e5) for name in COMPARED
@@ -63,25 +61,6 @@ def disagreements(rows: dict[str, Row]) -> dict[str, dict[tuple[str, str], float
                 z = abs(a["estimate"] - b["estimate"]) / (a["std"] ** 2 + b["std"] ** 2) ** 0.5
                 table.setdefault(name, {})[one, other] = z
     return table
-
-
-def agreement(rows: dict[str, Row]) -> Row:
-    """The share of pairs whose difference is inside its 95 %, over Ix and Iy, with a bootstrap by flight.
-
-    Two draws of one flight are no pair. `None`: no pair.
-    """
-    names, found = [name for name, row in rows.items() if row["constants"]], disagreements(rows)
-    pairs = [(*pair, z <= NINETY_FIVE) for name in COMPARED for pair, z in found.get(name, {}).items()]
-    if not pairs:
-        return {"flights": names, "pairs": 0, "share": None, "ci95": None}
-    first, second = (np.array([names.index(pair[k]) for pair in pairs]) for k in (0, 1))
-    inside = np.array([pair[2] for pair in pairs])
-    draws = np.random.default_rng(0).integers(len(names), size=(BOOTSTRAPS, len(names)))
-    times = (draws[:, :, None] == np.arange(len(names))).sum(axis=1)  # that a flight was drawn
-    weights = times[:, first] * times[:, second]
-    weights = weights[weights.any(axis=1)]
-    ends = np.quantile(weights @ inside / weights.sum(axis=1), [0.025, 0.975])
-    return {"flights": names, "pairs": len(pairs), "share": float(inside.mean()), "ci95": ends.tolist()}
 
 
 def skill_ahead(skill: Row | None) -> dict[str, tuple[float, float]]:
@@ -137,26 +116,17 @@ def real_flight(
         print(f"{estimator}: the largest disagreement of two flights (z): {worst or 'no pair'}")
 
 
-def alone(recordings: list[jaxos4.Recording], end: float | None) -> Row:
-    """The result, the doubts and the moments of inertia of these recordings; or why they are refused."""
-    row, found = identified(recordings, CRAZYFLIE, settings=jaxos4.VehicleSettings(sample_time=STEP, end=end))
-    if found is None:
-        return row | {"constants": {}}
-    return row | {"doubts": [issue.cause for issue in found.issues], "constants": constants(found)}
-
-
 def public_flights(
     flights: Flights = None,
     fitted: list[str] = FITTED,
     predicted: list[str] = PREDICTED,
-    compared: list[str] = (*FITTED, *PREDICTED),
     end: End = None,
     batches: int = 300,
     gusts: list[float] = (0.0, 2.0, 4.0, 8.0),
     simulations: int = 5,
     out: Report = None,
 ) -> None:
-    """Public flights of a Crazyflie 2.1 (NanoBench): identified alone and together, and predicted whole.
+    """Public flights of a Crazyflie 2.1 (NanoBench): some are identified together, and others predicted whole.
 
     The motion capture is moved to the clock of the gyro first (`clocks.py`). The flights `fitted` are identified
     together, and those `predicted` are predicted: position, velocity, attitude and body rates, 50 steps of 10 ms ahead,
@@ -164,13 +134,10 @@ def public_flights(
     of constant velocity and rates, of a regression that is fitted to the first half of the flight that it predicts, and
     of a small network for the rates that is trained on the identified flights, in so many batches.
 
-    The flights `compared` are identified alone, and all together; what is refused has its cause. `pairs` has the share
-    of pairs of flights whose difference is inside its 95 %, with an interval from a bootstrap of the flights.
-
     Commands answer what disturbs the vehicle after the start, which no prediction in open loop knows. How much that
     costs is simulated with the true vehicle (`gusts.py`): flights through `gusts` of these strengths [rad/s^2].
     """
-    names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
+    names = tuple(dict.fromkeys((*fitted, *predicted)))
     paths = flight_files(flights, [f"nanobench/{name}.csv" for name in names])
     recordings = {
         name: aligned(read_recording(path, CRAZYFLIE))._replace(name=name)
@@ -195,19 +162,7 @@ def public_flights(
     print_errors(report["flights"])
     report["simulated"] = {f"{gust:g}": simulated(gust, simulations) for gust in gusts}
     print_shares(report)
-    report["alone"] = {name: alone([recordings[name]], end) for name in compared}
-    trusted = {name: row for name, row in report["alone"].items() if row["result"] == "successful"}
-    report["pairs"] = {"not refused": agreement(trusted), "all that have a number": agreement(report["alone"])}
-    if len(compared) > 1:
-        report["alone"]["all together"] = alone([recordings[name] for name in compared], end)
     write_report(out, report)
-    columns: dict[str, Column] = {"flight": "flight", "result": "result"}
-    columns |= INTERVALS
-    columns |= {"results": lambda row: "; ".join(row["doubts"])}
-    rows = ({"flight": name} | row for name, row in report["alone"].items())
-    print_rows("each flight alone, 95 % intervals", rows, columns, width=180)
-    for which, one in report["pairs"].items():
-        print(f"{which}: {one['pairs']} pairs, share inside 95 %: {one['share']}, by flight {one['ci95']}")
 
 
 def print_errors(flights: dict[str, Row]) -> None:

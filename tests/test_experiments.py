@@ -15,7 +15,6 @@ from experiments import figures, shared
 from experiments.__main__ import again, main, main_of, scripts
 from experiments.closed_loop.run import print_cases
 from experiments.published import RECORDER, read
-from experiments.real_flights import agreement
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
@@ -348,24 +347,11 @@ def test_long_flight(tmp_path):
 
 
 @pytest.mark.slow
-def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interval():
-    def row(value):
-        return {"constants": {name: {"estimate": value, "std": 1.0} for name in ("Ix", "Iy")}}
-
-    rows = {"a": row(0.0), "b": row(2.7), "c": row(2.9)}
-    found = agreement(rows | {"refused": {"constants": {}}})  # 1.96 sqrt(2) = 2.77
-    assert (found["pairs"], found["share"]) == (6, pytest.approx(2 / 3))
-    assert found["ci95"][0] <= found["share"] <= found["ci95"][1]
-    assert agreement({})["share"] is None
-
-
-@pytest.mark.slow
 def test_public_flights(shared_flights, tmp_path):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    small = {"end": 15.0, "batches": 20, "compared": [], "gusts": [0.0, 8.0], "simulations": 1}
+    small = {"end": 15.0, "batches": 20, "gusts": [0.0, 8.0], "simulations": 1}
     report = result_of(tmp_path, "public_flights", flights=shared_flights, **small, **names)
-    assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
     assert all(found[rate]["error"][9] < found[rate]["constant"][9] for rate in "pq")
