@@ -6,6 +6,8 @@ The moments of inertia of two flights of one vehicle should differ by chance alo
 import itertools
 from pathlib import Path
 
+import numpy as np
+
 import jaxos4
 from experiments.fits import INERTIAS, constants, identified
 from experiments.monte_carlo import (
@@ -21,15 +23,17 @@ from experiments.monte_carlo import (
     text,
     write_report,
 )
-from experiments.public_flights.clocks import aligned
 from experiments.public_flights.gusts import measured_share, simulated
 from experiments.public_flights.rate_network import errors_of, trained
 from experiments.sample_times.run import VEHICLE as CINERAT
 from experiments.shared import End, Estimators, Flights, Out, Report, flight_files
 from experiments.verdicts.faults import thinned
 from jaxos4.estimators import ESTIMATORS
-from jaxos4.recording import read_recording
+from jaxos4.flight import RATES
+from jaxos4.forecast.measured import Measured
+from jaxos4.recording import Recording, read_recording
 from jaxos4.results import NINETY_FIVE
+from jaxos4.rotations import deviation
 
 CRAZYFLIE = jaxos4.load_airframe("crazyflie")
 ARPL = jaxos4.load_airframe(Path(__file__).parent / "real_flight" / "crazyflie.toml")
@@ -45,10 +49,42 @@ STEP = 0.01  # s; of the slower logs
 HORIZONS = (5, 10, 20, 30, 50)  # steps ahead, of a table
 AHEAD = 0.25  # s
 SEEDS = 3  # of networks
+# Of clocks: half of the time over which turns are compared, and the largest lag [samples]; an error of more medians is
+# an outlier.
+HALF, MOST, OUTLIER = 5, 6, 3.0
 COMPARED = ("Ix", "Iy")
 INTERVALS: dict[str, Column] = {
     f"{name} [1e-5 kg m^2]": lambda row, n=name: interval(row["constants"].get(n), 1e5) for name in COMPARED
 }
+
+
+def capture_lag(recording: Recording) -> float:
+    """How late the motion capture is recorded, compared with the gyro [s]: by the rates of roll and pitch.
+
+    The gyro turns the attitude that the motion capture saw before into the one that it saw after, best at this lag.
+    """
+    attitude = Measured.of(jaxos4.Flight(recording.time, recording.omega, recording.states)).states[:, 6:10]
+    seen = np.stack(deviation(attitude[: -2 * HALF].T, attitude[2 * HALF :].T), axis=1)[:, :2]
+    rates = np.nan_to_num(recording.states[:, RATES[:2]])
+    turned = np.cumsum((rates[1:] + rates[:-1]) / 2, axis=0) * recording.dt
+    turned = np.concatenate([np.zeros((1, 2)), turned])
+    turned = turned[2 * HALF :] - turned[: -2 * HALF]
+    lags, costs = np.arange(-MOST, MOST + 1), []
+    for lag in lags:
+        off = seen[MOST + lag : len(seen) - MOST + lag] - turned[MOST:-MOST]
+        off = np.abs(off - np.nanmedian(off, axis=0))
+        costs.append(np.nanmean(np.minimum(off, OUTLIER * np.nanmedian(off, axis=0))))
+    best = int(np.clip(np.argmin(costs), 1, len(lags) - 2))
+    before, least, after = costs[best - 1 : best + 2]  # the minimum of a parabola
+    return float(recording.dt * (lags[best] + np.clip((before - after) / (before - 2 * least + after) / 2, -1, 1)))
+
+
+def aligned(recording: Recording) -> Recording:
+    """The recording with position, velocity and attitude on the clock of the gyro."""
+    states, time = recording.states.copy(), recording.time + capture_lag(recording)
+    for column in np.setdiff1d(np.arange(states.shape[1]), RATES):
+        states[:, column] = np.interp(time, recording.time, recording.states[:, column])
+    return recording._replace(states=states)
 
 
 def disagreements(rows: dict[str, Row]) -> dict[str, dict[tuple[str, str], float]]:
@@ -128,7 +164,7 @@ def public_flights(
 ) -> None:
     """Public flights of a Crazyflie 2.1 (NanoBench): some are identified together, and others predicted whole.
 
-    The motion capture is moved to the clock of the gyro first (`clocks.py`). The flights `fitted` are identified
+    The motion capture is moved to the clock of the gyro first. The flights `fitted` are identified
     together, and those `predicted` are predicted: position, velocity, attitude and body rates, 50 steps of 10 ms ahead,
     open loop, with the recorded commands and the offsets that the past of a flight shows. The errors stand beside those
     of constant velocity and rates, of a regression that is fitted to the first half of the flight that it predicts, and
