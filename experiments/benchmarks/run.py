@@ -12,6 +12,7 @@ import numpy as np
 import jaxos4
 from experiments.benchmarks.case import ALL, RATES, Case, costs, trajectories
 from experiments.benchmarks.contenders import FITS, NETWORKS, QUICK, SHOTS, Contender
+from experiments.benchmarks.opponents.ours import problem_of
 from experiments.benchmarks.race import line_up, race, ratios
 from experiments.benchmarks.tables import print_report
 from experiments.monte_carlo import machine, write_report
@@ -125,10 +126,7 @@ def growth(
 def networks(steps: int, simulations: int, flights: int, skipped: list[str]) -> dict[str, Any]:
     """Time of training, and root mean square errors in Cramer-Rao bounds of the rates."""
     case = make_case(flights, 500)
-    model = jaxos4.PublishedOS4(jaxos4.OS4)
-    flight = jaxos4.simulate(model, model.alpha, case.omega, dt=DT)
-    problem = jaxos4.ShootingProblem(model, flight, sigma=case.sigma, initial_state=flight.states[0], channels="rates")
-    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem_of(case, "rates"), case.truth)))
     budgets = ({"steps": steps}, {"simulations": simulations})
     pairs = zip(NETWORKS.items(), budgets, strict=True)
     contenders = {name: c._replace(options=budget) for (name, c), budget in pairs if any(budget.values())}
