@@ -79,19 +79,19 @@ def real_flight(report: Row) -> Figure:
     A colour for each estimator.
     """
     figure, panels = grid(4, columns=2, height=2.8)
-    looks = styles(list(report["estimators"]))
-    flights = list(next(iter(report["estimators"].values()))["flights"])
+    estimators, flights = (list(dict.fromkeys(row[key] for row in report["rows"])) for key in ("estimator", "flight"))
+    looks = styles(estimators)
     above, below = dict(zip(("Ix", "Iy"), panels[:2], strict=True)), dict(zip("pq", panels[2:], strict=True))
-    for number, (estimator, rows) in enumerate(report["estimators"].items()):
+    for number, ((estimator,), rows) in enumerate(groups(report["rows"], "estimator").items()):
         places = np.arange(len(flights)) + 0.2 * (number - (len(looks) - 1) / 2)
         look = line(looks[estimator], linestyle="none", capsize=2)
         for name, panel in above.items():
-            known = [row["constants"].get(name) for row in rows["flights"].values()]
+            known = [row["constants"].get(name) for row in rows]
             some = [(at, 1e5 * x["estimate"], 1e5 * x["std"]) for at, x in zip(places, known, strict=True) if x]
             at, value, std = np.array(some).reshape(-1, 3).T
             panel.errorbar(at, value, NINETY_FIVE * std, label=estimator, **look)
         for rate, panel in below.items():
-            for at, row in zip(places, rows["flights"].values(), strict=True):
+            for at, row in zip(places, rows, strict=True):
                 if rate in row["ahead"]:
                     value, std = row["ahead"][rate]
                     panel.errorbar([at], [value], [NINETY_FIVE * std], **look)

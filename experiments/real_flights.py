@@ -5,7 +5,6 @@ The moments of inertia of two flights of one vehicle should differ by chance alo
 
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from experiments.monte_carlo import (
     Column,
     Row,
     check_names,
+    groups,
     interval,
     print_rows,
     print_table,
@@ -23,15 +23,17 @@ from experiments.monte_carlo import (
     text,
     write_report,
 )
-from experiments.public_flights.clocks import aligned
 from experiments.public_flights.gusts import measured_share, simulated
 from experiments.public_flights.rate_network import errors_of, trained
 from experiments.sample_times.run import VEHICLE as CINERAT
 from experiments.shared import End, Estimators, Flights, Out, Report, flight_files
 from experiments.verdicts.faults import thinned
 from jaxos4.estimators import ESTIMATORS
+from jaxos4.flight import RATES
+from jaxos4.forecast.flight_prediction import Measured
 from jaxos4.recording import Recording, read_recording
 from jaxos4.results import NINETY_FIVE
+from jaxos4.rotations import deviation
 
 CRAZYFLIE = jaxos4.load_airframe("crazyflie")
 ARPL = jaxos4.load_airframe(Path(__file__).parent / "real_flight" / "crazyflie.toml")
@@ -46,39 +48,55 @@ AIRFRAMES |= {"cinerat/cinerat_281.csv": CINERAT}
 STEP = 0.01  # s; of the slower logs
 HORIZONS = (5, 10, 20, 30, 50)  # steps ahead, of a table
 AHEAD = 0.25  # s
-BOOTSTRAPS, SEEDS = 2000, 3
-SHOWN = {name: f"{name} [1e-5 kg m^2]" for name in ("Ix", "Iy")}
+SEEDS = 3  # of networks
+# Of clocks: half of the time over which turns are compared, and the largest lag [samples]; an error of more medians is
+# an outlier.
+HALF, MOST, OUTLIER = 5, 6, 3.0
+COMPARED = ("Ix", "Iy")
+INTERVALS: dict[str, Column] = {
+    f"{name} [1e-5 kg m^2]": lambda row, n=name: interval(row["constants"].get(n), 1e5) for name in COMPARED
+}
+
+
+def capture_lag(recording: Recording) -> float:
+    """How late the motion capture is recorded, compared with the gyro [s]: by the rates of roll and pitch.
+
+    The gyro turns the attitude that the motion capture saw before into the one that it saw after, best at this lag.
+    """
+    attitude = Measured.of(jaxos4.Flight(recording.time, recording.omega, recording.states)).states[:, 6:10]
+    seen = np.stack(deviation(attitude[: -2 * HALF].T, attitude[2 * HALF :].T), axis=1)[:, :2]
+    rates = np.nan_to_num(recording.states[:, RATES[:2]])
+    turned = np.cumsum((rates[1:] + rates[:-1]) / 2, axis=0) * recording.dt
+    turned = np.concatenate([np.zeros((1, 2)), turned])
+    turned = turned[2 * HALF :] - turned[: -2 * HALF]
+    lags, costs = np.arange(-MOST, MOST + 1), []
+    for lag in lags:
+        off = seen[MOST + lag : len(seen) - MOST + lag] - turned[MOST:-MOST]
+        off = np.abs(off - np.nanmedian(off, axis=0))
+        costs.append(np.nanmean(np.minimum(off, OUTLIER * np.nanmedian(off, axis=0))))
+    best = int(np.clip(np.argmin(costs), 1, len(lags) - 2))
+    before, least, after = costs[best - 1 : best + 2]  # the minimum of a parabola
+    return float(recording.dt * (lags[best] + np.clip((before - after) / (before - 2 * least + after) / 2, -1, 1)))
+
+
+def aligned(recording: Recording) -> Recording:
+    """The recording with position, velocity and attitude on the clock of the gyro."""
+    states, time = recording.states.copy(), recording.time + capture_lag(recording)
+    for column in np.setdiff1d(np.arange(states.shape[1]), RATES):
+        states[:, column] = np.interp(time, recording.time, recording.states[:, column])
+    return recording._replace(states=states)
 
 
 def disagreements(rows: dict[str, Row]) -> dict[str, dict[tuple[str, str], float]]:
     """For Ix and Iy, and each pair of flights that have them: their difference over its standard deviation."""
     table: dict[str, dict[tuple[str, str], float]] = {}
     for (one, first), (other, second) in itertools.combinations(rows.items(), 2):
-        for name in SHOWN:
+        for name in COMPARED:
             a, b = (row["constants"].get(name) for row in (first, second))
             if a and b:
                 z = abs(a["estimate"] - b["estimate"]) / (a["std"] ** 2 + b["std"] ** 2) ** 0.5
                 table.setdefault(name, {})[one, other] = z
     return table
-
-
-def agreement(rows: dict[str, Row]) -> Row:
-    """The share of pairs whose difference is inside its 95 %, over Ix and Iy, with a bootstrap by flight.
-
-    Two draws of one flight are no pair. `None`: no pair.
-    """
-    names, found = [name for name, row in rows.items() if row["constants"]], disagreements(rows)
-    pairs = [(*pair, z <= NINETY_FIVE) for name in SHOWN for pair, z in found.get(name, {}).items()]
-    if not pairs:
-        return {"flights": names, "pairs": 0, "share": None, "ci95": None}
-    first, second = (np.array([names.index(pair[k]) for pair in pairs]) for k in (0, 1))
-    inside = np.array([pair[2] for pair in pairs])
-    draws = np.random.default_rng(0).integers(len(names), size=(BOOTSTRAPS, len(names)))
-    times = (draws[:, :, None] == np.arange(len(names))).sum(axis=1)  # that a flight was drawn
-    weights = times[:, first] * times[:, second]
-    weights = weights[weights.any(axis=1)]
-    ends = np.quantile(weights @ inside / weights.sum(axis=1), [0.025, 0.975])
-    return {"flights": names, "pairs": len(pairs), "share": float(inside.mean()), "ci95": ends.tolist()}
 
 
 def skill_ahead(skill: Row | None) -> dict[str, tuple[float, float]]:
@@ -95,7 +113,7 @@ def real_flight(
     end: End = None,
     names: list[str] = ARPL_FLIGHTS,
     estimators: Estimators = ("filter-error", "ibss"),
-    out: Report = None,
+    out: Out = None,
 ) -> None:
     """Do flights of a real Crazyflie agree on its moments of inertia, and how well is the rest of a flight predicted?
 
@@ -108,69 +126,54 @@ def real_flight(
     """
     check_names("estimators", estimators, ESTIMATORS)
     paths = flight_files(flights, [f"arpl_crazyflie_{name}.csv" for name in names])
-    recordings = {name: read_recording(path, ARPL) for name, path in zip(names, paths, strict=True)}
-    groups = {name: [recording] for name, recording in recordings.items()}
-    if len(groups) > 1:
-        groups["all"] = list(recordings.values())
-    report: Row = {"version": jaxos4.__version__, "authors": AUTHORS, "estimators": {}}
-    for estimator in estimators:
-        rows = {}
-        for name, group in groups.items():
-            found = jaxos4.identify(group, ARPL, settings=jaxos4.VehicleSettings(end=end), estimator=estimator)
-            print(f"{estimator}, {name}: {found.seconds:.0f} s", flush=True)
-            rows[name] = found.to_dict()
-            rows[name]["ahead"] = skill_ahead(rows[name]["skill"])
-        z = {name: {", ".join(p): x for p, x in pairs.items()} for name, pairs in disagreements(rows).items()}
-        report["estimators"][estimator] = {"flights": rows, "z": z}
-        write_report(out, report)
+    flown = {name: [read_recording(path, ARPL)] for name, path in zip(names, paths, strict=True)}
+    if len(flown) > 1:
+        flown["all"] = [recording for (recording,) in flown.values()]
+
+    def row_of(estimator: str, flight: str) -> Row:
+        settings = jaxos4.VehicleSettings(end=end)
+        found = jaxos4.identify(flown[flight], ARPL, settings=settings, estimator=estimator)
+        print(f"{estimator}, {flight}: {found.seconds:.0f} s", flush=True)
+        row = found.to_dict()
+        return row | {"ahead": skill_ahead(row["skill"])}
+
+    settings = {"authors": AUTHORS, "names": list(names), "end": end}
+    rows = study(out, settings, product(estimator=estimators, flight=flown), row_of)
     columns: dict[str, Column] = {name: name for name in ("estimator", "flight", "result")}
-    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
+    columns |= INTERVALS
     for rate in "pq":
         columns[f"skill {rate}"] = lambda row, r=rate: (
             "{:.2f} +- {:.2f}".format(*row["ahead"][r]) if r in row["ahead"] else ""
         )
-    every = report["estimators"].items()
-    lines = [{"estimator": e, "flight": f} | row for e, found in every for f, row in found["flights"].items()]
-    print_rows(f"moments of inertia with 95 % intervals, and the skill {AHEAD:g} s ahead", lines, columns)
-    for estimator, found in every:
-        worst = ", ".join(f"{name} {max(pairs.values()):.2g}" for name, pairs in found["z"].items())
+    print_rows(f"moments of inertia with 95 % intervals, and the skill {AHEAD:g} s ahead", rows, columns)
+    for (estimator,), some in groups(rows, "estimator").items():
+        apart = disagreements({row["flight"]: row for row in some})
+        worst = ", ".join(f"{name} {max(pairs.values()):.2g}" for name, pairs in apart.items())
         print(f"{estimator}: the largest disagreement of two flights (z): {worst or 'no pair'}")
-
-
-def alone(recordings: list[Recording], end: float | None) -> Row:
-    """The result, the doubts and the moments of inertia of these recordings; or why they are refused."""
-    row, found = identified(recordings, CRAZYFLIE, settings=jaxos4.VehicleSettings(sample_time=STEP, end=end))
-    if found is None:
-        return row | {"constants": {}}
-    return row | {"doubts": [issue.cause for issue in found.issues], "constants": constants(found)}
 
 
 def public_flights(
     flights: Flights = None,
     fitted: list[str] = FITTED,
     predicted: list[str] = PREDICTED,
-    compared: list[str] = (*FITTED, *PREDICTED),
     end: End = None,
     batches: int = 300,
     gusts: list[float] = (0.0, 2.0, 4.0, 8.0),
     simulations: int = 5,
     out: Report = None,
 ) -> None:
-    """Public flights of a Crazyflie 2.1 (NanoBench): identified alone and together, and predicted whole.
+    """Public flights of a Crazyflie 2.1 (NanoBench): some are identified together, and others predicted whole.
 
-    The motion capture is moved to the clock of the gyro first (`clocks.py`). The flights `fitted` are identified
+    The motion capture is moved to the clock of the gyro first. The flights `fitted` are identified
     together, and those `predicted` are predicted: position, velocity, attitude and body rates, 50 steps of 10 ms ahead,
     open loop, with the recorded commands and the offsets that the past of a flight shows. The errors stand beside those
     of constant velocity and rates, of a regression that is fitted to the first half of the flight that it predicts, and
     of a small network for the rates that is trained on the identified flights, in so many batches.
 
-    The flights `compared` are identified alone, and all together; what is refused has its cause. `pairs` has the share
-    of pairs of flights whose difference is inside its 95 %, with an interval from a bootstrap of the flights.
-
     Commands answer what disturbs the vehicle after the start, which no prediction in open loop knows. How much that
     costs is simulated with the true vehicle (`gusts.py`): flights through `gusts` of these strengths [rad/s^2].
     """
-    names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
+    names = tuple(dict.fromkeys((*fitted, *predicted)))
     paths = flight_files(flights, [f"nanobench/{name}.csv" for name in names])
     recordings = {
         name: aligned(read_recording(path, CRAZYFLIE))._replace(name=name)
@@ -195,19 +198,7 @@ def public_flights(
     print_errors(report["flights"])
     report["simulated"] = {f"{gust:g}": simulated(gust, simulations) for gust in gusts}
     print_shares(report)
-    report["alone"] = {name: alone([recordings[name]], end) for name in compared}
-    trusted = {name: row for name, row in report["alone"].items() if row["result"] == "successful"}
-    report["pairs"] = {"not refused": agreement(trusted), "all that have a number": agreement(report["alone"])}
-    if len(compared) > 1:
-        report["alone"]["all together"] = alone([recordings[name] for name in compared], end)
     write_report(out, report)
-    columns: dict[str, Column] = {"flight": "flight", "result": "result"}
-    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
-    columns |= {"results": lambda row: "; ".join(row["doubts"])}
-    rows = ({"flight": name} | row for name, row in report["alone"].items())
-    print_rows("each flight alone, 95 % intervals", rows, columns, width=180)
-    for which, one in report["pairs"].items():
-        print(f"{which}: {one['pairs']} pairs, share inside 95 %: {one['share']}, by flight {one['ci95']}")
 
 
 def print_errors(flights: dict[str, Row]) -> None:
@@ -238,7 +229,7 @@ def print_shares(report: Row) -> None:
     print_table(title, ("flight", "rate", *headings), rows, width=180)
 
 
-def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End = None, out: Report = None) -> None:
+def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End = None, out: Out = None) -> None:
     """What does a radio do to an identification? A flight that was logged on board, with fewer of its commands.
 
     A radio brings each command as it was at one moment. The flight is one of `real_flight`, logged at 1 kHz. It is
@@ -246,17 +237,17 @@ def radio(flights: Flights = None, every: list[int] = (1, 10, 20, 40), end: End 
     """
     (path,) = flight_files(flights, ["arpl_crazyflie_rollpitch.csv"])
     recording, settings = read_recording(path, CRAZYFLIE), jaxos4.VehicleSettings(sample_time=STEP, end=end)
-    report: dict[int, Any] = {}
-    for n in every:
+
+    def row_of(n: int) -> Row:
         found = jaxos4.identify([thinned(recording, float(n))], CRAZYFLIE, settings=settings).to_dict()
-        report[n] = {name: found[name] for name in ("result", "doubts", "verdicts", "parameters", "constants")}
-        write_report(out, report)
+        return {name: found[name] for name in ("result", "doubts", "verdicts", "parameters", "constants")}
+
+    rows = study(out, {"end": end}, product(n=every), row_of)
     columns: dict[str, Column] = {"one command of": "n"}
     for name in ("roll_damping", "pitch_damping"):
         columns[f"{name.replace('_', ' ')} [1/s]"] = lambda row, name=name: interval(row["parameters"].get(name), 1.0)
-    columns |= {heading: lambda row, n=name: interval(row["constants"].get(n), 1e5) for name, heading in SHOWN.items()}
-    columns |= {f"verdict of {name}": lambda row, name=name: row["verdicts"][name]["status"] for name in SHOWN}
-    rows = ({"n": n} | row for n, row in report.items())
+    columns |= INTERVALS
+    columns |= {f"verdict of {name}": lambda row, name=name: row["verdicts"][name]["status"] for name in COMPARED}
     print_rows("thinned commands, 95 % intervals", rows, columns, width=180)
 
 

@@ -81,10 +81,10 @@ def run_studies(studies: dict[str, Study], out: Path) -> None:
         )
     print_table("time and memory of this run", ("study", "flights", "time [s]", "peak memory [MiB]"), spent)
     titles = {f"{study.title}: {study.flights} flights, seed {study.seed}" for study in studies.values()}
-    error = 1 / np.sqrt(2 * max(study.flights for study in studies.values()))
+    error = monte_carlo_error(max(study.flights for study in studies.values()))
     headings = "scenario", "noise", "estimator", "RMSE / bound", "95 % intervals that hold [%]", "rollouts", "results"
     lines = (line for name, data in found.items() for line in study_lines(name, data))
-    print_table(f"{', '.join(titles)}, Monte-Carlo error {error:.2g} of the RMSE", headings, lines)
+    print_table(f"{', '.join(titles)}, {error} of the RMSE", headings, lines)
 
 
 def study_lines(name: str, dataset: xr.Dataset) -> Iterator[tuple[str, ...]]:
@@ -210,6 +210,11 @@ def scores(problem: ShootingProblem, found: Estimate) -> Row:
         "std": np.median(found.std / bound, axis=0).tolist(),
         "rollouts": float(np.mean(found.rollouts)),
     }
+
+
+def monte_carlo_error(flights: int) -> str:
+    """The Monte-Carlo error of a root mean square, for the title of a table."""
+    return f"Monte-Carlo error {1 / np.sqrt(2 * flights):.2g}"
 
 
 class Fit(NamedTuple):

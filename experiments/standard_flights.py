@@ -6,7 +6,6 @@ truth. Flights are simulated with the model that is fitted (the inverse crime), 
 
 import functools
 import time
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,9 +38,9 @@ from experiments.shared import (
     flight_keys,
     identify,
     measure,
+    monte_carlo_error,
     standard_problem,
 )
-from jaxos4.analysis.evaluation import evaluate, robust_covariance
 from jaxos4.estimators import ESTIMATORS, make_estimator
 from jaxos4.models import MODELS
 from jaxos4.noise import NOISES
@@ -50,51 +49,6 @@ from jaxos4.results import NINETY_FIVE
 CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
 COVERED: dict[str, Column] = {"95 % intervals that hold [%]": lambda row: 100 * np.mean(row["covered"])}
 SECONDS: dict[str, Column] = {"s": lambda row: row["flights"] * row["seconds"]}
-
-
-def accuracy(flights: int) -> str:
-    """The Monte-Carlo error of a root mean square, for the title of a table."""
-    return f"Monte-Carlo error {1 / np.sqrt(2 * flights):.2g}"
-
-
-def baselines(
-    flights: Count = 200,
-    seed: Seed = 5,
-    channels: str = "rates",
-    estimators: Estimators = (),
-    noises: list[str] = tuple(NOISES),
-    scales: list[float] = (0.0, 0.1, 1.0, 10.0),
-    out: Out = None,
-) -> None:
-    """How do all estimators without a network perform, with their default settings, for each kind and scale of noise?
-
-    The bound is always the one for white noise of the same standard deviation, so that the cost of coloured and biased
-    noise is visible. At scale 0 there is no noise, and errors are in units of the bound at scale 1.
-    """
-
-    def row_of(noise: str, scale: float, estimator: str) -> Row:
-        kind = NOISES[noise if scale else "white"](scale * jaxos4.SENSOR_SIGMA)
-        fit = Fit(make_estimator(estimator), channels=channels, scale=scale or 1.0)
-        _, (row, _) = (fit.row(flights, seed, kind) for _ in range(2))  # the first call compiles
-        return row
-
-    check_names("noises", noises, NOISES)
-    check_names("estimators", estimators, ESTIMATORS)
-    chosen = estimators or [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
-    every = product(noise=noises, scale=scales, estimator=chosen)
-    trials = (trial for trial in every if trial["scale"] or trial["noise"] == noises[0])
-    rows = study(out, {"seed": seed, "channels": channels, "flights": flights}, trials, row_of)
-    columns: dict[str, Column] = {
-        "noise": lambda row: row["noise"] if row["scale"] else "none",
-        "scale": "scale",
-        "estimator": "estimator",
-        **EFFICIENCY,
-        "bias": lambda row: float(np.abs(row["bias"]).max()) if row["bias"] else None,
-        **COVERED,
-        "ms": lambda row: 1000 * row["seconds"],
-        **ENDED,
-    }
-    print_rows(f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights", rows, columns)
 
 
 def efficiency(
@@ -123,7 +77,7 @@ def efficiency(
     settings = {"flights": flights, "seed": seed, "scale": scale}
     rows = study(out, settings, product(case=cases or every), row_of, rows="cases")
     columns = {"case": "case", **EFFICIENCY, **COVERED, **ENDED, **SECONDS}
-    print_rows(f"RMSE / bound, {flights} flights, noise {scale:g}, {accuracy(flights)}", rows, columns)
+    print_rows(f"RMSE / bound, {flights} flights, noise {scale:g}, {monte_carlo_error(flights)}", rows, columns)
 
 
 def coverage(
@@ -186,7 +140,7 @@ def robust(flights: Count = 256, seed: Seed = 13) -> None:
 
     def deviations(parameters: jax.Array, states: jax.Array) -> np.ndarray:
         flown = eqx.tree_at(lambda p: p.flight.states, problem, states)
-        return np.sqrt(np.diagonal(robust_covariance(evaluate(flown, parameters))))
+        return np.sqrt(np.diagonal(jaxos4.robust_covariance(jaxos4.evaluate(flown, parameters))))
 
     states = measure(noise, problem.flight, flight_keys(seed, flights)[0])
     sandwich = np.stack([deviations(*one) for one in zip(found.parameters, states, strict=True)])
@@ -202,41 +156,35 @@ def robust(flights: Count = 256, seed: Seed = 13) -> None:
     print_table(title, ("covariance", *PARAMETERS, "all"), rows)
 
 
-class Setting(NamedTuple):
-    """An estimator with a setting, and the flights on which it is measured."""
+def every_setting() -> dict[str, list[Fit]]:
+    """The settings of `defaults`, each with the flights on which it is measured."""
 
-    estimator: jaxos4.AbstractEstimator
-    channels: str = "rates"
-    known: bool = True
-    scales: tuple[float, ...] = (1.0,)
-    models: tuple[str, ...] = ("published",)
+    def fits(estimator, channels="rates", known=True, scales=(1.0,), models=("published",)) -> list[Fit]:
+        return [Fit(estimator, model, channels, scale, known) for model in models for scale in scales]
 
-
-def every_setting() -> dict[str, Setting]:
-    """The settings of `defaults`."""
     both, noises = ("published", "corrected"), (0.1, 1.0, 10.0)
     squares = jaxos4.RecursiveLeastSquares
     return {
-        **{f"equation error, memory {m:g}": Setting(jaxos4.EquationError(memory=m)) for m in (0.0, 0.9, 0.99)},
-        "equation error, memory 1 (default)": Setting(jaxos4.EquationError(), scales=noises),
+        **{f"equation error, memory {m:g}": fits(jaxos4.EquationError(memory=m)) for m in (0.0, 0.9, 0.99)},
+        "equation error, memory 1 (default)": fits(jaxos4.EquationError(), scales=noises),
         **{
-            f"recursive least squares, forgetting {f:g}": Setting(squares(forgetting=f), known=False)
+            f"recursive least squares, forgetting {f:g}": fits(squares(forgetting=f), known=False)
             for f in (0.98, 0.995)
         },
-        "recursive least squares, forgetting 1 (default)": Setting(squares(), known=False),
-        "SVSF, equilibration 1": Setting(jaxos4.SVSF(equilibration=1.0), scales=noises),
-        **{f"SVSF, passes {n}": Setting(jaxos4.SVSF(passes=n), scales=noises) for n in (1, 8)},
-        "SVSF (default: equilibration 150, passes 4)": Setting(jaxos4.SVSF(), scales=noises, models=both),
-        "SVSF (default), free start": Setting(jaxos4.SVSF(), known=False, scales=noises),
-        "Kalman filter, passes 1, rates": Setting(jaxos4.JointEKF(passes=1), models=both),
-        "Kalman filter, passes 1": Setting(jaxos4.JointEKF(passes=1), "all", models=both),
-        "Kalman filter, passes 10 (default)": Setting(jaxos4.JointEKF(), "all", models=both),
-        "output error, ten times the noise, free start": Setting(jaxos4.OutputError(), "all", False, (10.0,)),
-        "IBSS, ten times the noise, free start": Setting(jaxos4.IBSS(), "all", False, (10.0,)),
-        **{f"ant colony, q {q:g}": Setting(jaxos4.AntColony(q=q), "all") for q in (0.02, 0.1)},
-        **{f"ant colony, xi {xi:g}": Setting(jaxos4.AntColony(xi=xi), "all") for xi in (0.7, 1.0)},
-        "ant colony, archive 30": Setting(jaxos4.AntColony(archive=30), "all"),
-        "ant colony (default: q 0.05, xi 0.85, archive 50)": Setting(jaxos4.AntColony(), "all"),
+        "recursive least squares, forgetting 1 (default)": fits(squares(), known=False),
+        "SVSF, equilibration 1": fits(jaxos4.SVSF(equilibration=1.0), scales=noises),
+        **{f"SVSF, passes {n}": fits(jaxos4.SVSF(passes=n), scales=noises) for n in (1, 8)},
+        "SVSF (default: equilibration 150, passes 4)": fits(jaxos4.SVSF(), scales=noises, models=both),
+        "SVSF (default), free start": fits(jaxos4.SVSF(), known=False, scales=noises),
+        "Kalman filter, passes 1, rates": fits(jaxos4.JointEKF(passes=1), models=both),
+        "Kalman filter, passes 1": fits(jaxos4.JointEKF(passes=1), "all", models=both),
+        "Kalman filter, passes 10 (default)": fits(jaxos4.JointEKF(), "all", models=both),
+        "output error, ten times the noise, free start": fits(jaxos4.OutputError(), "all", False, (10.0,)),
+        "IBSS, ten times the noise, free start": fits(jaxos4.IBSS(), "all", False, (10.0,)),
+        **{f"ant colony, q {q:g}": fits(jaxos4.AntColony(q=q), "all") for q in (0.02, 0.1)},
+        **{f"ant colony, xi {xi:g}": fits(jaxos4.AntColony(xi=xi), "all") for xi in (0.7, 1.0)},
+        "ant colony, archive 30": fits(jaxos4.AntColony(archive=30), "all"),
+        "ant colony (default: q 0.05, xi 0.85, archive 50)": fits(jaxos4.AntColony(), "all"),
     }
 
 
@@ -253,21 +201,17 @@ def defaults(flights: Count = 64, seed: Seed = 7, settings: list[str] = (), out:
         return np.asarray(Fit(jaxos4.OutputError(), *flown).row(flights, seed)[1].cost)
 
     def row_of(setting: str, model: str, scale: float) -> Row:
-        of = every[setting]
-        flown = model, of.channels, scale, of.known
-        row, found = Fit(of.estimator, *flown).row(flights, seed)
+        (fit,) = (fit for fit in every[setting] if (fit.model, fit.scale) == (model, scale))
+        row, found = fit.row(flights, seed)
         # Costs of estimators without a search are those of another criterion.
-        gap = float(np.max(np.asarray(found.cost) - least_costs(*flown))) if of.estimator.shoots else None
+        gap = float(np.max(np.asarray(found.cost) - least_costs(*fit[1:]))) if fit.estimator.shoots else None
         return row | {"gap": gap}
 
-    trials = (
-        trial
-        for name in settings or every
-        for trial in product(setting=[name], model=every[name].models, scale=every[name].scales)
-    )
+    chosen = {name: every[name] for name in settings or every}
+    trials = ({"setting": s, "model": fit.model, "scale": fit.scale} for s, some in chosen.items() for fit in some)
     rows = study(out, {"flights": flights, "seed": seed}, trials, row_of)
     columns = {"setting": "setting", "model": "model", "noise": "scale", **SPAN, **COVERED, "gap": "gap", **ENDED}
-    print_rows(f"{flights} flights, {accuracy(flights)}", rows, columns)
+    print_rows(f"{flights} flights, {monte_carlo_error(flights)}", rows, columns)
 
 
 def long_flight(
@@ -328,7 +272,6 @@ def long_flight(
 
 
 SCRIPTS = {
-    "baselines.run": baselines,
     "coverage.robust": robust,
     "coverage.run": coverage,
     "defaults.run": defaults,

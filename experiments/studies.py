@@ -23,12 +23,12 @@ from experiments.shared import (
     fit_noisy,
     identify,
     measure,
+    monte_carlo_error,
     run_studies,
     save_results,
     span,
     standard_problem,
 )
-from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.study import Study, load_study
 
@@ -67,13 +67,12 @@ def bracket_and_seeds(specification: Path, out: Folder, seeds: list[int] = (0, 1
 
 def model_of(study: Study, name: str | None = None) -> jaxos4.AbstractModel:
     """A model with the airframe of a study; by default its first."""
-    return MODELS[name or study.models[0]](jaxos4.load_airframe(study.airframes[0]))
+    return MODELS[name or study.models[0]](study.vehicle(study.airframes[0]))
 
 
 def input_of(study: Study, excitation: str | None = None, duration: float | None = None) -> jax.Array:
     """Rotor speeds of a study; by default its first."""
-    settings = {"duration": duration or study.durations[0], "dt": study.dt}
-    return EXCITATIONS[excitation or study.excitations[0]](model_of(study).airframe, **settings)
+    return study.omega(excitation or study.excitations[0], study.airframes[0], duration or study.durations[0])
 
 
 def noise_limits(study: Study, model: str, excitation: str, duration: float, channels: str) -> np.ndarray:
@@ -149,8 +148,8 @@ def rollout_budget(
         "RMSE / bound": lambda case: span(rms.sel(case)),
         "rollouts": lambda case: float(spent.sel(case)),
     }
-    accuracy = f"Monte-Carlo error {1 / np.sqrt(2 * study.flights):.2g}"
-    print_rows(f"accuracy by limit, {study.flights} flights, {accuracy}", cases, columns)
+    title = f"accuracy by limit, {study.flights} flights, {monte_carlo_error(study.flights)}"
+    print_rows(title, cases, columns)
 
 
 def p_values(exact: jaxos4.ShootingProblem, found: jaxos4.Estimate, states: jax.Array) -> np.ndarray:

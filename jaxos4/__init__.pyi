@@ -66,7 +66,6 @@ from .closed_loop import (
     ClosedLoop as ClosedLoop,
     Sensors as Sensors,
     fly_closed_loop as fly_closed_loop,
-    random_references as random_references,
 )
 from .comparison import Comparison as Comparison, compare_results as compare_results
 from .design import (
@@ -89,7 +88,13 @@ from .estimators import (
     OutputError as OutputError,
     RecursiveLeastSquares as RecursiveLeastSquares,
 )
-from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
+from .excitation import (
+    chirp as chirp,
+    doublet as doublet,
+    multisine as multisine,
+    random_references as random_references,
+    step3211 as step3211,
+)
 from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
 from .forecast import FlightPrediction as FlightPrediction, predict as predict
 from .identification import (

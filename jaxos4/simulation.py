@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector, as_float, setting
+from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float, setting
 from .batching import in_blocks
 from .flight import STATE_NAMES, Flight, Inputs
 from .models.abstract import AbstractModel
@@ -120,20 +120,26 @@ _in_one_program = eqx.filter_jit(in_blocks)
 def _flown(
     model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
 ) -> Flight:
+    states = trajectory(model, parameters, omega, dt, start, METHODS[method])
+    valid, result = until_failure(states, states[:, STATE_NAMES.index("theta")])
+    states = jnp.where(valid[:, None], states, jnp.nan)
+    return Flight(time=dt * jnp.arange(omega.shape[0]), omega=omega, states=states, result=result)
+
+
+def trajectory(
+    model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, stepper: Stepper
+) -> States:
+    """The states of a flight, also after a failure: with derivatives everywhere."""
     scalars = tuple(parameters)
 
     def step(state: State, forcing: Forcing) -> tuple[State, State]:
-        following = METHODS[method](model, state, forcing, scalars, dt)
+        following = stepper(model, state, forcing, scalars, dt)
         return following, following
 
     first = unstack(start[CASCADE_ORDER])
     forcing = jax.tree.map(lambda leaf: leaf[:-1], model.forcing(Inputs(omega, dt), parameters))
     rest = jax.lax.scan(step, first, forcing)[1]
-    trajectory = jnp.concatenate([stack(first)[None], stack(rest)])
-    states = trajectory[:, CASCADE_ORDER.argsort()]
-    valid, result = until_failure(states, states[:, STATE_NAMES.index("theta")])
-    states = jnp.where(valid[:, None], states, jnp.nan)
-    return Flight(time=dt * jnp.arange(omega.shape[0]), omega=omega, states=states, result=result)
+    return jnp.concatenate([stack(first)[None], stack(rest)])[:, CASCADE_ORDER.argsort()]
 
 
 def until_failure(

@@ -7,9 +7,8 @@ from small_experiments import load, plot, result_of
 
 from experiments.benchmarks.case import ALL, RATES, costs
 from experiments.benchmarks.contenders import FITS, KINDS, REFERENCE_SHOT, SHOTS
-from experiments.benchmarks.opponents import c_fit, c_shots
-from experiments.benchmarks.opponents.c_library import FAST, compiled, compiler
-from experiments.benchmarks.opponents.residuals import Residuals
+from experiments.benchmarks.opponents.in_c import FAST, compiled, compiler, lanes as shots_in_lanes, levenberg_marquardt
+from experiments.benchmarks.opponents.least_squares import Residuals
 
 pytestmark = pytest.mark.usefixtures("optimised")
 in_c = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -38,8 +37,8 @@ def test_benchmarks(monkeypatch, tmp_path):
 def test_a_benchmark_skips_who_is_missing_or_fails_and_times_only_who_reaches_the_least_cost():
     run = load("benchmarks")
     case = run.make_case(2, 50)
-    failing = run.Contender("scipy_fit:levenberg_marquardt", alone=True, options={"unknown": 1})
-    absent = run.Contender("scipy_fit:levenberg_marquardt", "no_such_package")
+    failing = run.Contender("least_squares:levenberg_marquardt", alone=True, options={"unknown": 1})
+    absent = run.Contender("least_squares:levenberg_marquardt", "no_such_package")
     skipped = []
     assert run.line_up({"failing": failing, "absent": absent}, case, 1, skipped) == {}
     assert "failing: failed: TypeError" in skipped[0]
@@ -69,7 +68,7 @@ def test_the_fit_in_c_reaches_the_optimum(known, lanes):
     """NumPy's Gauss-Newton step from the answer would not lower the cost, which is less than that of the truth."""
     run = load("benchmarks")
     case = run.make_case(6, 200, known=known)
-    answer = c_fit.levenberg_marquardt(case, lanes=lanes, cores=2)()
+    answer = levenberg_marquardt(case, lanes=lanes, cores=2)()
     least = costs(case, np.tile(case.truth, (6, 1)), np.zeros((6, 12)))
     found = costs(case, answer["parameters"], answer["first"])
     assert (found < least).all()
@@ -89,7 +88,7 @@ def test_the_fit_in_c_reaches_the_optimum(known, lanes):
 def test_shots_in_c_have_the_costs_and_slopes_of_numpy(kind, same_flight):
     options = KINDS[kind] | {"same_flight": same_flight}
     case = load("benchmarks").make_case(10, 200, share=0.1)
-    answer = c_shots.lanes(case, **options)()
+    answer = shots_in_lanes(case, **options)()
     stepped = case.starts + 1e-30j * case.half_width
     columns = RATES if options.get("channels") == "rates" else ALL
     expected = costs(case.first(1) if same_flight else case, stepped, np.zeros((10, 12)), columns)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from jaxos4.airframe import OS4, OS4_SIMULATOR, VOOS
-from jaxos4.closed_loop import standard_references
-from jaxos4.excitation import EXCITATIONS, chirp, doublet, multisine, step3211
+from jaxos4.excitation import EXCITATIONS, chirp, doublet, multisine, standard_references, step3211
 
 X_LAYOUT = eqx.tree_at(
     lambda a: a.rotor_positions, OS4, np.array([[0.16, -0.16], [-0.16, -0.16], [-0.16, 0.16], [0.16, 0.16]])

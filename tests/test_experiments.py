@@ -15,7 +15,6 @@ from experiments import figures, shared
 from experiments.__main__ import again, main, main_of, scripts
 from experiments.closed_loop.run import print_cases
 from experiments.published import RECORDER, read
-from experiments.real_flights import agreement
 from jaxos4.study import load_study, metrics, read_results
 
 pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
@@ -39,7 +38,7 @@ def test_usage(arguments, capsys):
             "closed_loop.run",
             ["Number of flights", "Random seed of", "continued if it exists", "Names of the"],
         ),
-        ("real_flight.run", ["Folder of the recorded flights", "up to this time", "written anew if it exists"]),
+        ("public_flights.run", ["Folder of the recorded flights", "up to this time", "written anew if it exists"]),
     ],
 )
 def test_help_describes_the_common_options(script, texts, capsys, monkeypatch):
@@ -62,7 +61,7 @@ def test_help_describes_the_common_options(script, texts, capsys, monkeypatch):
         *(
             ([script, *place, "--estimators", "filter-eror"], "--estimators: no 'filter-eror'; give one of ibss")
             for script, *place in (
-                *(["baselines.run"], ["coverage.run"], ["long_flight.run"], ["precision.run"], ["real_flight.run"]),
+                *(["coverage.run"], ["long_flight.run"], ["precision.run"], ["real_flight.run"]),
                 *(["closed_loop.run"], ["closed_loop.effects"], ["rotorpy.run", "flights"]),
             )
         ),
@@ -93,7 +92,7 @@ def test_case_whose_flights_are_all_refused_has_a_line():
 
 # Studies: experiments with a specification.
 
-STUDIES = ("comparison", "noise_study", "noise_kinds", "scale")  # those without a script of their own
+STUDIES = ("comparison", "noise_study", "noise_kinds", "scale", "baselines")  # those without a script of their own
 OTHERS = ("frontier", "rollout_budget", "published_corrected", "inverse_crime", "bracket_and_seeds")
 
 
@@ -147,6 +146,20 @@ def test_comparison_noise_study_and_scale(tmp_path):
     np.testing.assert_allclose(error.sel(scale=1.0) / error.sel(scale=0.1), 10, rtol=0.1)
     # At ten times the noise IBSS ends at its limits around the bracket.
     assert (accuracy.sel(scale=10.0, estimator="ibss") < accuracy.sel(scale=10.0, estimator="equation-error")).all()
+
+
+@pytest.mark.slow
+def test_baselines(tmp_path):
+    shared.run_studies({"out": load_study(small("baselines"))}, tmp_path)
+    data = read_results(tmp_path / "out").squeeze()
+    ratio = metrics.error(data) / data["bound"].sel(scale=1.0)
+    exact, noisy = ((ratio.sel(scale=scale) ** 2).mean("flight") ** 0.5 for scale in (0.0, 1.0))
+    assert ratio.notnull().all()
+    assert (exact < 1e-6).all()
+    # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
+    chance = 1 / np.sqrt(2 * data.sizes["flight"])
+    assert float(noisy.sel(estimator="output-error").max()) < 1 + 5 * chance
+    assert float(noisy.sel(estimator="equation-error").max()) < 1.6 + 8 * chance
 
 
 @pytest.mark.slow
@@ -246,9 +259,8 @@ def test_speed(tmp_path):
 @pytest.mark.slow
 def test_networks(tmp_path):
     trained = {"networks": ["score, mlp", "score, cmac"], "channels": "rates", "separate": False}
-    report = result_of(tmp_path, "networks", flights=FLIGHTS, seed=7, steps=100, many=FLIGHTS, noises=[1.0], **trained)
+    report = result_of(tmp_path, "networks", flights=FLIGHTS, seed=7, steps=100, noises=[1.0], **trained)
     rows = {row["estimator"]: row for row in report["rows"]}
-    assert report["one_call"]["flights"] == FLIGHTS
     hybrids = [f"hybrid from {label}" for label in trained["networks"]]
     assert list(rows) == ["score, mlp", hybrids[0], "ibss", "score, cmac", hybrids[1]]
     # Each of eight parameters within five Monte-Carlo errors of the bound.
@@ -277,18 +289,6 @@ def test_precision(tmp_path):
         assert double["results"] == single["results"] == {"successful": 64}
         assert near(single["covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 64))
     assert all(near(rows[name, "float32"]["efficiency"], 1, 5 * np.sqrt(1 / 128)) for name in ("kalman", "ibss"))
-
-
-@pytest.mark.slow
-def test_baselines(tmp_path):
-    cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
-    rows = result_of(tmp_path, "baselines", flights=FLIGHTS, seed=5, channels="rates", **cases)["rows"]
-    exact, noisy = rows[:2], rows[2:]
-    assert all(row["answers"] == FLIGHTS for row in rows)
-    assert all(max(row["efficiency"]) < 1e-6 for row in exact)
-    # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
-    assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
-    assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]
 
 
 @pytest.mark.slow
@@ -347,24 +347,11 @@ def test_long_flight(tmp_path):
 
 
 @pytest.mark.slow
-def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interval():
-    def row(value):
-        return {"constants": {name: {"estimate": value, "std": 1.0} for name in ("Ix", "Iy")}}
-
-    rows = {"a": row(0.0), "b": row(2.7), "c": row(2.9)}
-    found = agreement(rows | {"refused": {"constants": {}}})  # 1.96 sqrt(2) = 2.77
-    assert (found["pairs"], found["share"]) == (6, pytest.approx(2 / 3))
-    assert found["ci95"][0] <= found["share"] <= found["ci95"][1]
-    assert agreement({})["share"] is None
-
-
-@pytest.mark.slow
 def test_public_flights(shared_flights, tmp_path):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    small = {"end": 15.0, "batches": 20, "compared": [], "gusts": [0.0, 8.0], "simulations": 1}
+    small = {"end": 15.0, "batches": 20, "gusts": [0.0, 8.0], "simulations": 1}
     report = result_of(tmp_path, "public_flights", flights=shared_flights, **small, **names)
-    assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
     assert all(found[rate]["error"][9] < found[rate]["constant"][9] for rate in "pq")

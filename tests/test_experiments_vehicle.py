@@ -9,7 +9,7 @@ import jaxos4
 from experiments.__main__ import main_of
 from experiments.fits import summary
 from experiments.monte_carlo import groups
-from experiments.real_flights import disagreements
+from experiments.real_flights import aligned, capture_lag, disagreements
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
 
@@ -19,7 +19,7 @@ def test_real_flight(shared_flights, tmp_path):
         tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
     )
     plot(tmp_path, "real_flight")
-    (row,) = report["estimators"]["filter-error"]["flights"].values()
+    (row,) = report["rows"]
     assert all(0.8e-5 < row["constants"][name]["estimate"] < 2.2e-5 for name in ("Ix", "Iy"))
     assert all(value > 0 for value, _ in row["ahead"].values())
 
@@ -161,13 +161,13 @@ def test_the_order_of_a_disturbance_decides_on_the_thrust():
 
 
 def test_commands_that_are_too_rare_are_named(shared_flights, tmp_path):
-    (row,) = result_of(tmp_path, "public_flights", "radio", flights=shared_flights, every=[40]).values()
+    (row,) = result_of(tmp_path, "public_flights", "radio", flights=shared_flights, every=[40])["rows"]
     assert row["result"] != "successful"
     assert any("damping" in doubt["cause"] and "too rarely" in doubt["cause"] for doubt in row["doubts"])
 
 
 def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
-    clocks, random = load("public_flights", "clocks"), np.random.default_rng(0)
+    random = np.random.default_rng(0)
     time = 0.01 * np.arange(2000)
     angle, rate = (
         (lambda t: 0.3 * np.sin(7 * t) + 0.2 * np.sin(11 * t)),
@@ -178,7 +178,7 @@ def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
     states[:, 6:8] += random.normal(0, [0.003, 0.1], (len(time), 2))
     states[::50, 6] += 1.0  # markers that were taken for others
     recording = jaxos4.recording.Recording(time, np.ones((len(time), 4)), states)
-    assert clocks.capture_lag(recording) == pytest.approx(0.013, abs=0.002)
-    moved = clocks.aligned(recording)
+    assert capture_lag(recording) == pytest.approx(0.013, abs=0.002)
+    moved = aligned(recording)
     assert np.median(np.abs(moved.states[:-5, 6] - angle(time[:-5]))) < 0.005
     np.testing.assert_array_equal(moved.states[:, 7], states[:, 7])

@@ -58,6 +58,11 @@ class Case:
         """Where each search for the initial state begins: 0 if it is known, else the first measurement."""
         return np.zeros_like(self.measured[:, 0]) if self.known else self.measured[:, 0]
 
+    def answer(self, scaled: np.ndarray) -> dict[str, np.ndarray]:
+        """Parameters and initial states of all flights from offsets of the starts in `half_width` and in `sigma`."""
+        first = self.first_states() + (0 if self.known else scaled[:, 8:20] * self.sigma)
+        return {"parameters": self.starts + scaled[:, :8] * self.half_width, "first": first}
+
     def save(self, path: Path) -> None:
         """Writes the case as `.npz`."""
         np.savez(path, **dataclasses.asdict(self))  # type: ignore[arg-type]

@@ -3,7 +3,7 @@
 import importlib.util
 from typing import Any, NamedTuple
 
-from experiments.benchmarks.opponents.c_library import COMPILERS, compiler
+from experiments.benchmarks.opponents.in_c import COMPILERS, compiler
 from jaxos4.shooting import cores
 
 REFERENCE_FIT = "CasADi, single shooting, compiled"
@@ -48,12 +48,12 @@ def _casadi(method: str = "single", **options: Any) -> Contender:
 
 
 def _in_c(**options: Any) -> Contender:
-    return Contender("c_fit:levenberg_marquardt", "cc", alone=options["lanes"] == 1, options=options)
+    return Contender("in_c:levenberg_marquardt", "cc", alone=options["lanes"] == 1, options=options)
 
 
 def _ours(estimator: str, **options: Any) -> Contender:
     alone = options.get("lanes") == 1
-    return Contender("jaxos4_fit:fit", alone=alone, options={"estimator": estimator, **options})
+    return Contender("ours:fit", alone=alone, options={"estimator": estimator, **options})
 
 
 def _compared_fit(name: str, contender: Contender) -> Contender:
@@ -72,8 +72,8 @@ _FITS = {
     REFERENCE_FIT + ALL_CORES: _casadi(compiled=True, cores=cores()),
     "CasADi, single shooting": _casadi(),
     "CasADi, multiple shooting": _casadi("multiple"),
-    "SciPy least_squares": Contender("scipy_fit:levenberg_marquardt", "scipy", alone=True),
-    "pyPESTO, 4 starts": Contender("pypesto_fit:multi_start", "pypesto", alone=True),
+    "SciPy least_squares": Contender("least_squares:levenberg_marquardt", "scipy", alone=True),
+    "pyPESTO, 4 starts": Contender("least_squares:multi_start", "pypesto", alone=True),
     "JAX and optimistix": Contender("optimistix_fit:levenberg_marquardt", "optimistix"),
     **{f"jaxos4 {name}{ALL_CORES}": _ours(name, all_cores=True) for name in OURS},
     **{f"jaxos4 {name}": _ours(name) for name in OURS},
@@ -100,17 +100,17 @@ def _shots(entry: str, needs: str = "jaxos4", kind: str = "", **options: Any) ->
 
 
 SHOTS = {
-    **{REFERENCE_SHOT + kind: _shots("c_shots:lanes", "cc", kind) for kind in KINDS},
-    **{f"{REFERENCE_SHOT}{SAME}{kind}": _shots("c_shots:lanes", "cc", kind, same_flight=True) for kind in KINDS},
-    "C, plain": _shots("c_shots:plain", "cc"),
+    **{REFERENCE_SHOT + kind: _shots("in_c:lanes", "cc", kind) for kind in KINDS},
+    **{f"{REFERENCE_SHOT}{SAME}{kind}": _shots("in_c:lanes", "cc", kind, same_flight=True) for kind in KINDS},
+    "C, plain": _shots("in_c:plain", "cc"),
     "JAX, plain": _shots("optimistix_fit:shots", "optimistix"),
-    **{f"jaxos4{kind}": _shots("jaxos4_shots:shots", kind=kind) for kind in KINDS},
-    **{f"jaxos4{SAME}{kind}": _shots("jaxos4_shots:shots", kind=kind, same_flight=True) for kind in KINDS},
-    "jaxos4, all cores": Contender("jaxos4_shots:shots", options={"all_cores": True}),
-    "jaxos4, rates, all cores": Contender("jaxos4_shots:shots", options={"all_cores": True, "channels": "rates"}),
+    **{f"jaxos4{kind}": _shots("ours:shots", kind=kind) for kind in KINDS},
+    **{f"jaxos4{SAME}{kind}": _shots("ours:shots", kind=kind, same_flight=True) for kind in KINDS},
+    "jaxos4, all cores": Contender("ours:shots", options={"all_cores": True}),
+    "jaxos4, rates, all cores": Contender("ours:shots", options={"all_cores": True, "channels": "rates"}),
     "crazyflow (richer model)": Contender("crazyflow_steps:steps", "crazyflow"),
 }
 NETWORKS = {
-    "jaxos4 network": Contender("jaxos4_network:network"),
+    "jaxos4 network": Contender("ours:network"),
     "sbi NPE, reduced budget": Contender("sbi_network:npe", "sbi"),
 }

@@ -12,6 +12,7 @@ import numpy as np
 import jaxos4
 from experiments.benchmarks.case import ALL, RATES, Case, costs, trajectories
 from experiments.benchmarks.contenders import FITS, NETWORKS, QUICK, SHOTS, Contender
+from experiments.benchmarks.opponents.ours import problem_of
 from experiments.benchmarks.race import line_up, race, ratios
 from experiments.benchmarks.tables import print_report
 from experiments.monte_carlo import machine, write_report
@@ -115,7 +116,7 @@ def growth(
         plan += [("unknowns", 20, same | {"known": False}, {})]
     rows = []
     for axis, size, flown, options in plan:
-        contender = Contender("jaxos4_fit:fit", options={"estimator": estimator, **options})
+        contender = Contender("ours:fit", options={"estimator": estimator, **options})
         racers = line_up({f"{axis} {size}": contender}, make_case(**flown), 1, skipped)
         found = race(racers, repeats if flown["flights"] <= MANY else 1)
         rows += [{"axis": axis, "size": size, **row} for row in found.values()]
@@ -125,10 +126,7 @@ def growth(
 def networks(steps: int, simulations: int, flights: int, skipped: list[str]) -> dict[str, Any]:
     """Time of training, and root mean square errors in Cramer-Rao bounds of the rates."""
     case = make_case(flights, 500)
-    model = jaxos4.PublishedOS4(jaxos4.OS4)
-    flight = jaxos4.simulate(model, model.alpha, case.omega, dt=DT)
-    problem = jaxos4.ShootingProblem(model, flight, sigma=case.sigma, initial_state=flight.states[0], channels="rates")
-    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem_of(case, "rates"), case.truth)))
     budgets = ({"steps": steps}, {"simulations": simulations})
     pairs = zip(NETWORKS.items(), budgets, strict=True)
     contenders = {name: c._replace(options=budget) for (name, c), budget in pairs if any(budget.values())}
@@ -144,7 +142,7 @@ def networks(steps: int, simulations: int, flights: int, skipped: list[str]) -> 
 
 def roofline(shot_rows: dict[str, Any], skipped: list[str]) -> dict[str, Any]:
     """The peak of the machine, the operations of one step, and the share of the peak that our shots reach."""
-    racers = line_up({"roofline": Contender("roofline:roofline")}, make_case(1, 10), 1, skipped)
+    racers = line_up({"roofline": Contender("ours:roofline")}, make_case(1, 10), 1, skipped)
     found: dict[str, Any] = {}
     for racer in racers.values():
         found = {name: float(value) for name, value in racer.answer.items()}

@@ -23,6 +23,7 @@ from experiments.monte_carlo import Row, check_names, product, study
 from experiments.shared import Count, Estimators, Out, Seed
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import STANDARD_TONES
+from jaxos4.flight import ANGLES
 
 VEHICLE = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
 LAG, DELAY = 0.05, 0.01
@@ -101,8 +102,8 @@ def effect_of(kind: str, random: np.random.Generator) -> Effect:
 
 def turned_over(flight: jaxos4.Flight) -> bool:
     """True if the gusts threw the vehicle on its side: then it is lost, and nobody has its log."""
-    angles = np.asarray(flight.states)[:, [jaxos4.STATE_NAMES.index(name) for name in ("phi", "theta")]]
-    return bool(flight.result != jaxos4.RESULTS.successful) or bool((np.abs(angles) > np.pi / 2).any())
+    tilt = np.asarray(flight.states)[:, ANGLES[:2]]
+    return bool(flight.result != jaxos4.RESULTS.successful) or bool((np.abs(tilt) > np.pi / 2).any())
 
 
 def stacked(modules: list) -> object:
@@ -151,7 +152,7 @@ def flights_of(
     return flown
 
 
-def sines(*, duration: float, dt: float, key: jax.Array) -> jaxos4.closed_loop.References:
+def sines(*, duration: float, dt: float, key: jax.Array) -> jaxos4.excitation.References:
     """References of a soft flight: the tones of the standard multisine, with frequencies and phases of the flight."""
     tones = np.array([*STANDARD_TONES, VERTICAL_TONES])
     spread, phases = jax.random.uniform(key, (2, *tones.shape))

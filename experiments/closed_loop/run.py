@@ -48,20 +48,17 @@ def references_of(kind: str, gust: float, duration: float, seed: int) -> np.ndar
     return standard_references(round(duration / DT) + 1, DT, LARGEST)[kind]
 
 
-def _fit(
-    estimator: jaxos4.AbstractEstimator, flights: jaxos4.Flight, airframes: jaxos4.Airframe
-) -> tuple[jaxos4.Estimate, jax.Array]:
-    """Estimates, and their standard deviations."""
+def _fit(estimator: jaxos4.AbstractEstimator, flights: jaxos4.Flight, airframes: jaxos4.Airframe) -> jaxos4.Estimate:
+    """The estimates of a batch of flights, each with its airframe."""
 
-    def one(flight: jaxos4.Flight, airframe: jaxos4.Airframe) -> tuple[jaxos4.Estimate, jax.Array]:
+    def one(flight: jaxos4.Flight, airframe: jaxos4.Airframe) -> jaxos4.Estimate:
         model = jaxos4.FlightModel(airframe, terms=("offset", "damping", "lag", "delay", "reaction"))
         windows = flight.time.shape[0] // WINDOW
         flight = jax.tree.map(lambda x: x[: windows * WINDOW] if x.ndim else x, flight)
         problem = jaxos4.ShootingProblem(
             model, flight, sigma=np.full(12, SIGMA), channels="rates", method="rk4", windows=windows
         )
-        found = estimator(problem.hold({"rotor_lag": LAG, "rotor_delay": DELAY}))
-        return found, found.std
+        return estimator(problem.hold({"rotor_lag": LAG, "rotor_delay": DELAY}))
 
     return eqx.filter_vmap(one)(flights, airframes)
 
@@ -75,11 +72,11 @@ def regress(estimator: str, flights: dict[int, jaxos4.Flight], wrong: float) -> 
     spare = CHUNK - len(flights)  # one program for all calls
     batch = (stacked(some + some[-1:] * spare) for some in (list(flights.values()), known))
     begin = time.perf_counter()
-    found, stds = jax.block_until_ready(_fit(WITHOUT_DISTURBANCE[estimator], *batch))
+    found = jax.block_until_ready(_fit(WITHOUT_DISTURBANCE[estimator], *batch))
     results, seconds = jaxos4.result_names(found.result), time.perf_counter() - begin
     places = [jaxos4.CorrectedOS4().parameter_names.index(alpha) for alpha in INERTIAS.values()]
     ratios = 1 / np.asarray(found.parameters)[:, places] / np.asarray(VEHICLE.inertia)
-    errors = np.asarray(stds)[:, places] * ratios**2 * np.asarray(VEHICLE.inertia)
+    errors = np.asarray(found.std)[:, places] * ratios**2 * np.asarray(VEHICLE.inertia)
     rows = []
     for k in range(len(flights)):
         row: Row = {"result": str(results[k]), "seconds": seconds / len(flights)}
@@ -103,18 +100,15 @@ def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> Row:
 
 def print_cases(title: str, rows: list[Row]) -> None:
     """One line for each estimator, strength of gusts and moment of inertia; one without numbers if none has any."""
-    lines: list[tuple[str, ...]] = [
-        (
-            *(f"{gust:g}", references, estimator, name, str(row["flights"]), plus_minus(row)),
-            *(f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}", plus_minus(row, "efficiency", 1.0)),
-            *(plus_minus(row, "covered"), results_of(some)),
-        )
-        for (gust, references, estimator), some in groups(rows, "gust", "references", "estimator").items()
-        for name, row in summary(some).items()
-    ]
-    for about, some in groups(rows, "gust", "references", "estimator").items():
-        if not summary(some):
-            lines.append((f"{about[0]:g}", *about[1:], *[""] * 7, results_of(some)))
+    lines: list[tuple[str, ...]] = []
+    for (gust, *about), some in groups(rows, "gust", "references", "estimator").items():
+        begin, results, found = (f"{gust:g}", *about), results_of(some), summary(some)
+        for name, row in found.items():
+            sizes = plus_minus(row), f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}"
+            shares = plus_minus(row, "efficiency", 1.0), plus_minus(row, "covered")
+            lines.append((*begin, name, str(row["flights"]), *sizes, *shares, results))
+        if not found:
+            lines.append((*begin, *[""] * 7, results))
     figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
     print_table(title, ("gust", "references", "estimator", "", *figures), lines)
 

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxos4
-from experiments.benchmarks.worker import peak_mib
 from experiments.monte_carlo import Column, Row, check_names, count_results, print_rows, print_table, write_report
 from experiments.shared import (
     CHUNK,
@@ -24,7 +23,6 @@ from experiments.shared import (
     Seed,
     brackets_at,
     identify,
-    measure,
     standard_problem,
 )
 from jaxos4.study import metrics
@@ -100,28 +98,6 @@ def unseen(
     }
 
 
-def amortised(network: jaxos4.TrainedNetwork, channels: str, flights: int) -> dict:
-    """Identifies many noisy flights in one call: time, and the growth of the process's memory."""
-    keys = jax.random.split(jax.random.key(3), flights)
-    problem = standard_problem(MODEL, channels)
-    noisy = measure(jaxos4.WhiteNoise(problem.sigma), problem.flight, keys)
-    arguments = network, problem, brackets_at(MODEL, 0.0, flights), noisy
-
-    begin = time.perf_counter()
-    compiled = identify.lower(*arguments).compile()
-    built, before = time.perf_counter(), peak_mib()
-    jax.block_until_ready(compiled(*arguments))
-    seconds = time.perf_counter() - built
-    return {
-        "flights": flights,
-        "compile_seconds": built - begin,
-        "seconds": seconds,
-        "data_mib": noisy.nbytes / 2**20,
-        "peak_mib": peak_mib(),
-        "added_mib": peak_mib() - before,
-    }
-
-
 def main(
     flights: Count = 2000,
     seed: Seed = 7,
@@ -129,13 +105,12 @@ def main(
     noises: list[float] = (0.1, 1.0, 10.0),
     channels: str = "all",
     steps: int | None = None,
-    many: int = 10_000,
     separate: bool = True,
     out: Report = None,
 ) -> None:
     """Networks, hybrid and IBSS on flights drawn over the whole bracket. Networks are trained with seed 0.
 
-    - `networks`: Names of the networks. `many`: Flights identified in one call.
+    - `networks`: Names of the networks.
     - `channels`: Channels that are measured, and that the hybrid and IBSS look at.
     - `steps`: Training steps of all networks; each has its own number without it.
     - `separate`: Train one network for each noise scale too.
@@ -162,9 +137,6 @@ def main(
         add(label, trained, channels, "rates", noises)
         if "features" in NETWORKS[label]:
             continue
-        if label == networks[0]:
-            report["one_call"] = amortised(trained, channels, many)
-            print(f"one call: {report['one_call']}")
         if channels != trained.channels:
             trained = fit(f"{label} of {channels} channels, for the hybrid", NETWORKS[label] | {"channels": channels})
         add(f"hybrid from {label}", jaxos4.Hybrid(trained), channels, channels, noises)

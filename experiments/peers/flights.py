@@ -13,7 +13,9 @@ from experiments.closed_loop.effects import VEHICLE as CRAZYFLIE, turned_over
 from experiments.real_flights import ARPL, AUTHORS, CRAZYFLIE as NANOBENCH, PENDULUM
 from experiments.sample_times.run import VEHICLE as CINERAT
 from experiments.shared import flight_files
+from jaxos4.flight import ANGLES, RATES
 from jaxos4.recording import Recording, read_recording
+from jaxos4.rotations import euler_angles
 
 GUSTS, DT = (0.0, 2.0, 5.0), 0.004  # [rad/s^2], [s]
 VEHICLES = {  # with what is logged
@@ -65,13 +67,7 @@ def in_mujoco(loop: jaxos4.ClosedLoop, seed: int, duration: float) -> jaxos4.Fli
     kept, integral, blown, commands, rows = np.exp(-h / gust_time), np.zeros(3), gust * random.normal(size=3), [], []
     for k, reference in enumerate(references):
         mujoco.mj_forward(model, data)
-        w, x, y, z = data.qpos[3:7]
-        roll, yaw = (
-            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-            np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        )
-        angles = np.array([roll, np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)), yaw])
-        attitude = angles + float(loop.attitude_noise) * random.normal(size=3)
+        attitude = euler_angles(data.qpos[3:7]) + float(loop.attitude_noise) * random.normal(size=3)
         gyro = data.sensordata[:3] + float(loop.gyro_noise) * random.normal(size=3)
         force = data.sensordata[3:] + float(loop.force_noise) * random.normal(size=3)
         error = gains[0] * (reference[:3] - attitude) - gyro
@@ -89,8 +85,7 @@ def in_mujoco(loop: jaxos4.ClosedLoop, seed: int, duration: float) -> jaxos4.Fli
             mujoco.mj_step(model, data)
     omega, gyro, attitude, force = (np.array(column) for column in zip(*rows, strict=True))
     states = np.full((len(omega), len(jaxos4.STATE_NAMES)), np.nan)
-    for names, values in ((("p", "q", "r"), gyro), (("phi", "theta", "psi"), attitude)):
-        states[:, [jaxos4.STATE_NAMES.index(name) for name in names]] = values
+    states[:, RATES], states[:, ANGLES] = gyro, attitude
     held = {"commanded": True, "held": True}
     return jaxos4.Flight(time=DT * np.arange(len(omega)), omega=omega, states=states, specific_force=force, **held)
 

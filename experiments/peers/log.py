@@ -7,10 +7,10 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 
 import jaxos4
+from jaxos4.flight import RATES
 from jaxos4.recording import Recording
 
 DT = 0.004  # s; faster logs are averaged to it, as jaxos4 does
-RATES = [jaxos4.STATE_NAMES.index(name) for name in "pqr"]
 
 
 class Log(NamedTuple):

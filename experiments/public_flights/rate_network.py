@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxos4.flight import STATE_NAMES
+from jaxos4.flight import RATES
 from jaxos4.forecast import FlightPrediction
 from jaxos4.recording import Recording
 
 PAST, STEPS, BATCH, WIDTH, RATE = 10, 50, 256, 32, 2e-3
-COLUMNS = [STATE_NAMES.index(name) for name in "pqr"]
 
 
 class RateNetwork(eqx.Module):
@@ -39,7 +38,7 @@ class RateNetwork(eqx.Module):
 def _data(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Rates [rad/s], and commands about their mean."""
     commands = recording.omega / recording.omega.mean()
-    return recording.states[:, COLUMNS], 5 * (commands - 1.0)
+    return recording.states[:, RATES], 5 * (commands - 1.0)
 
 
 def trained(recordings: list[Recording], *, batches: int, seed: int) -> RateNetwork:

@@ -15,7 +15,7 @@ from rotorpy.wind.default_winds import SinusoidWind
 from scipy.spatial.transform import Rotation
 
 import jaxos4
-from jaxos4.flight import STATE_NAMES
+from jaxos4.flight import ANGLES, POSITION, RATES, STATE_NAMES, VELOCITY
 from jaxos4.logs.csv import write_flight
 
 DT = 0.004
@@ -109,14 +109,13 @@ def fly(gust: float, duration: float, seed: int, i: int, *, captured: bool = Fal
         state = vehicle.step(state, control, DT)
     omega, rates, angles, specific, position, velocity = np.split(np.array(rows), [4, 7, 10, 13, 16], axis=1)
     states = np.full((len(omega), len(STATE_NAMES)), np.nan)
-    states[:, [STATE_NAMES.index(name) for name in "pqr"]] = rates + random.normal(0, GYRO_NOISE, rates.shape)
+    states[:, RATES] = rates + random.normal(0, GYRO_NOISE, rates.shape)
     measured = np.unwrap(angles, axis=0) + random.normal(0, ATTITUDE_NOISE, angles.shape)
-    states[:, [STATE_NAMES.index(name) for name in ("phi", "theta", "psi")]] = measured
+    states[:, ANGLES] = measured
     force = specific + random.normal(0, FORCE_NOISE, specific.shape)
     if captured:
-        for names, true, noise in (("x y z", position, POSITION_NOISE), ("vx vy vz", velocity, VELOCITY_NOISE)):
-            places = [STATE_NAMES.index(name) for name in names.split()]
-            states[:, places] = true + random.normal(0, noise, true.shape)
+        states[:, POSITION] = position + random.normal(0, POSITION_NOISE, position.shape)
+        states[:, VELOCITY] = velocity + random.normal(0, VELOCITY_NOISE, velocity.shape)
     return jaxos4.Flight(time=DT * np.arange(len(omega)), omega=omega, states=states, specific_force=force)
 
 

@@ -50,9 +50,8 @@ def simulator(folder: Path | None) -> tuple[dict[str, Row], Fly]:
         raise SystemExit(f"--truth: no cases.jsonl in {folder}: give the folder of the simulator, or set JAXOS4_TRUTH.")
     lines = (folder / "cases.jsonl").read_text(encoding="utf-8").splitlines()
     sys.path.insert(0, str(folder))  # its files import each other
-    return {case["name"]: case for case in map(json.loads, filter(None, lines))}, runpy.run_path(
-        str(folder / "fly.py")
-    )["fly"]
+    cases = {case["name"]: case for case in map(json.loads, filter(None, lines))}
+    return cases, runpy.run_path(str(folder / "fly.py"))["fly"]
 
 
 def studies(sag: int, clean: int) -> dict[str, Row]:
@@ -139,18 +138,10 @@ def by_effect(groups: dict[str, list[Row]]) -> Iterator[tuple[str, ...]]:
                 continue
             found, z = statistics(off, std), off / std
             known = [row["quantities"][name]["status"] for row in rows if name in row["quantities"]]
-            trusted = sum(each in (IDENTIFIED, RESERVED) for each in known)
-            yield (
-                *(
-                    effect,
-                    name,
-                    str(off.size),
-                    plus_minus(found),
-                    plus_minus(statistics(z, np.ones_like(z)), scale=1.0),
-                ),
-                *(f"{np.sqrt(np.mean(z**2)):.2f}", plus_minus(found, "covered"), f"{100 * found['width']:.1f}"),
-                share(trusted, len(rows)),
-            )
+            trusted = share(sum(each in (IDENTIFIED, RESERVED) for each in known), len(rows))
+            mean_z, rms_z = plus_minus(statistics(z, np.ones_like(z)), scale=1.0), f"{np.sqrt(np.mean(z**2)):.2f}"
+            held, width = plus_minus(found, "covered"), f"{100 * found['width']:.1f}"
+            yield effect, name, str(off.size), plus_minus(found), mean_z, rms_z, held, width, trusted
 
 
 def linearised(rows: list[Row]) -> Iterator[tuple[str, ...]]:

@@ -1,6 +1,6 @@
 """Faults of real logs: each spoils a good recording, in three sizes, and has the cause that an answer must name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,39 +25,38 @@ def changed(recording: Recording, channels: np.ndarray) -> Recording:
     return recording._replace(states=channels[:, :12], specific_force=channels[:, FORCE])
 
 
-def scaled(columns: np.ndarray) -> Callable[[Recording, float], Recording]:
-    """Some channels have another scale."""
-
-    def spoil(recording: Recording, size: float) -> Recording:
-        channels = recording.channels.copy()
-        channels[:, columns] *= size
-        return changed(recording, channels)
-
-    return spoil
-
-
-def late(columns: np.ndarray) -> Callable[[Recording, float], Recording]:
-    """Some channels are recorded late by `size` [s]; negative: early."""
+def of_each(
+    columns: Iterable[int], change: Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+) -> Callable[[Recording, float], Recording]:
+    """A fault of some channels, one by one. `change`: makes a spoiled channel of a good one, the times and the size."""
 
     def spoil(recording: Recording, size: float) -> Recording:
         channels = recording.channels.copy()
         for i in columns:
-            channels[:, i] = np.interp(recording.time - size, recording.time, channels[:, i])
+            channels[:, i] = change(channels[:, i], recording.time, size)
         return changed(recording, channels)
 
     return spoil
+
+
+def scaled(columns: Iterable[int]) -> Callable[[Recording, float], Recording]:
+    """Some channels have another scale."""
+    return of_each(columns, lambda channel, _, size: size * channel)
+
+
+def late(columns: Iterable[int]) -> Callable[[Recording, float], Recording]:
+    """Some channels are recorded late by `size` [s]; negative: early."""
+    return of_each(columns, lambda channel, time, size: np.interp(time - size, time, channel))
 
 
 def clipped(column: int) -> Callable[[Recording, float], Recording]:
     """The range of a sensor ends at this share of its largest value."""
 
-    def spoil(recording: Recording, size: float) -> Recording:
-        channels = recording.channels.copy()
-        end = size * np.nanmax(np.abs(channels[:, column]))
-        channels[:, column] = np.clip(channels[:, column], -end, end)
-        return changed(recording, channels)
+    def clip(channel: np.ndarray, _: np.ndarray, size: float) -> np.ndarray:
+        end = size * np.nanmax(np.abs(channel))
+        return np.clip(channel, -end, end)
 
-    return spoil
+    return of_each([column], clip)
 
 
 def turned(recording: Recording, degrees: float) -> Recording:
@@ -125,7 +124,7 @@ FAULTS = {
     "gyro clipped": Fault(clipped(int(RATES[0])), (0.5, 0.65, 0.8), "is clipped"),
     "force clipped": Fault(clipped(14), (0.9, 0.85, 0.8), "is clipped"),
     "gyro early": Fault(late(RATES), (-0.05, -0.03, -0.02), "gyro is recorded"),
-    "force late": Fault(late(np.array([12, 13, 14])), (0.05, 0.03, 0.02), "accelerometer is recorded"),
+    "force late": Fault(late((12, 13, 14)), (0.05, 0.03, 0.02), "accelerometer is recorded"),
     "turned": Fault(turned, (30.0, 20.0, 10.0), "at an angle about the vertical axis"),
     "earth's axes": Fault(along_the_earth, (1.0,), "along the axes of the earth"),
     "impossible speeds": Fault(impossible, (40.0, 19.0, 5.0), "are impossible"),

@@ -1,6 +1,6 @@
 """Design of flights: rotor speeds or references that make the estimate as accurate as possible within an envelope."""
 
-from ..closed_loop import standard_references as standard_references
+from ..excitation import standard_references as standard_references
 from .envelope import Envelope as Envelope
 from .fleet import model_of as model_of
 from .references import design_references as design_references

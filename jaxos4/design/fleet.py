@@ -13,8 +13,9 @@ from .._custom_types import Key, Numeric, Parameters, Scalar, as_float
 from .._xla import quick_jit
 from ..airframe import INERTIAS, INVERSES, MOTIONS
 from ..bracket import Bracket
-from ..closed_loop import ClosedLoop, References, fly_closed_loop
+from ..closed_loop import ClosedLoop, fly_closed_loop
 from ..errors import InputError
+from ..excitation import References
 from ..flight import ANGLES, POSITION, VELOCITY, Flight
 from ..models.flight_model import FlightModel
 from ..models.state import Attitude, Orientation, to_earth

@@ -13,8 +13,9 @@ from jaxtyping import Float
 from .._custom_types import Key, Numeric, Scalar, as_float
 from ..airframe import INERTIAS
 from ..bracket import Bracket
-from ..closed_loop import ClosedLoop, standard_references, with_largest
+from ..closed_loop import ClosedLoop
 from ..errors import InputError
+from ..excitation import standard_references, with_largest
 from ..flight import ANGLES, RATES
 from . import task
 from .envelope import Envelope, Uses

@@ -21,9 +21,9 @@ from ..excitation import EXCITATIONS, multisine
 from ..flight import Inputs
 from ..linalg import covariance_of_shared
 from ..models.abstract import AbstractModel
-from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State, stack, unstack
+from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State, unstack
 from ..noise import SENSOR_SIGMA
-from ..simulation import euler_step, simulate
+from ..simulation import euler_step, simulate, trajectory
 from . import task
 from .envelope import Envelope, Uses, hover_squares
 from .task import Coefficients, Designed, Flown, Series
@@ -112,7 +112,8 @@ class RotorSpeedTask(task.AbstractTask):
     def uses(self, coefficients: Coefficients) -> Uses:
         """See `AbstractTask`."""
         omega = self._omega(coefficients)
-        states = jax.vmap(lambda parameters: self._fly(omega, parameters))(self.watched)
+        rest = jnp.zeros(12, dtype=float)
+        states = jax.vmap(lambda a: trajectory(self.model, a, omega, self.dt, rest, euler_step))(self.watched)
         return {name: use / _TARGET for name, use in self.envelope.uses(omega, states, self.dt).items()}
 
     def watching(self, coefficients: Coefficients) -> "RotorSpeedTask":
@@ -193,17 +194,6 @@ class RotorSpeedTask(task.AbstractTask):
             return total, jnp.sqrt(jnp.diagonal(covariance_of_shared(total[None], parameters.shape[0])))
 
         return jax.lax.scan(add, jnp.zeros((slopes.shape[-1],) * 2, dtype=float), slopes)[1]
-
-    def _fly(self, omega: RotorSpeeds, parameters: Parameters) -> Float[Array, "samples 12"]:
-        """The states of a flight from rest, without an end at a failure, which would have no slopes."""
-
-        def step(state: State, forcing: Forcing) -> tuple[State, State]:
-            following = euler_step(self.model, state, forcing, tuple(parameters), self.dt)
-            return following, following
-
-        forcing = jax.tree.map(lambda leaf: leaf[:-1], self.model.forcing(Inputs(omega, self.dt), parameters))
-        states = stack(jax.lax.scan(step, unstack(jnp.zeros(12, dtype=float)), forcing)[1])
-        return jnp.concatenate([jnp.zeros((1, 12), dtype=float), states[:, CASCADE_ORDER.argsort()]])
 
     def _sense(self, omega: RotorSpeeds, parameters: Parameters) -> Float[Array, "samples sensors unknowns"]:
         """The derivatives of the weighted outputs of a flight from rest, in the parameters and an unknown start."""

@@ -33,23 +33,7 @@ def single(case: Case, compiled: bool = False, cores: int = 1) -> Callable[[], d
     errors = casadi.vec((casadi.horzcat(first, following) - measured)[:, case.begin :] / _tiled(case, steps + 1))
     unknowns, data = casadi.vertcat(scaled, offset), casadi.vertcat(start, casadi.vec(measured))
     solver = gauss_newton(errors, unknowns, data, COMPILED if compiled else None)
-    zero = np.zeros(8 + offset.numel())
-    begin = case.first_states()
-
-    def solve(which: int) -> np.ndarray:
-        data = np.concatenate([case.starts[which], case.measured[which].ravel()])
-        return np.asarray(solver(x0=zero, p=data)["x"]).ravel()
-
-    each = _on_cores(solve, cores) if cores > 1 else lambda whiches: ([solve(which) for which in whiches], 0.0)
-
-    def run() -> dict:
-        found, elsewhere = each(range(case.flights))
-        answer = np.array(found)
-        offsets = 0 if case.known else answer[:, 8:] * case.sigma
-        parameters = case.starts + answer[:, :8] * case.half_width
-        return {"parameters": parameters, "first": begin + offsets, "elsewhere": elsewhere}
-
-    return run
+    return _answers(case, solver, unknowns.numel(), cores)
 
 
 def multiple(case: Case) -> Callable[[], dict]:
@@ -65,16 +49,22 @@ def multiple(case: Case) -> Callable[[], dict]:
     gaps = casadi.vec((following - states[:, 1:]) / casadi.repmat(casadi.DM(case.sigma), 1, steps))
     unknowns, data = casadi.veccat(scaled, offsets), casadi.vertcat(start, casadi.vec(measured))
     solver = gauss_newton(casadi.vec(offsets), unknowns, data, gaps=gaps)
-    zero = np.zeros(unknowns.numel())
+    return _answers(case, solver, unknowns.numel(), lbg=0, ubg=0)
+
+
+def _answers(case: Case, solver: casadi.Function, unknowns: int, cores: int = 1, **limits: float) -> Callable[[], dict]:
+    """All flights, one after another; or by several processes, whose processor time is counted `elsewhere`."""
+    zero = np.zeros(unknowns)
+
+    def solve(which: int) -> np.ndarray:
+        data = np.concatenate([case.starts[which], case.measured[which].ravel()])
+        return np.asarray(solver(x0=zero, p=data, **limits)["x"]).ravel()
+
+    each = _on_cores(solve, cores) if cores > 1 else lambda whiches: ([solve(which) for which in whiches], 0.0)
 
     def run() -> dict:
-        parameters, first = [], []
-        for which in range(case.flights):
-            data = np.concatenate([case.starts[which], case.measured[which].ravel()])
-            found = np.asarray(solver(x0=zero, p=data, lbg=0, ubg=0)["x"]).ravel()
-            parameters.append(case.starts[which] + found[:8] * case.half_width)
-            first.append(np.zeros(12) if case.known else case.measured[which, 0] + found[8:20] * case.sigma)
-        return {"parameters": np.array(parameters), "first": np.array(first)}
+        found, elsewhere = each(range(case.flights))
+        return case.answer(np.array(found)) | {"elsewhere": elsewhere}
 
     return run
 
