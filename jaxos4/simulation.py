@@ -23,13 +23,13 @@ Stepper = Callable[[AbstractModel, State, Forcing, Parameters | tuple[Scalar, ..
 
 def euler_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
     """The paper's discrete model x_{k+1} = x_k + T f(x_k, u_k), of order 1."""
-    return _advance(state, model.cascade(state, forcing, parameters), dt)
+    return along(state, model.cascade(state, forcing, parameters), dt)
 
 
 def midpoint_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
     """A step by the midpoint rule, of order 2."""
-    middle = _advance(state, model.cascade(state, forcing, parameters), dt / 2)
-    return _advance(state, model.cascade(middle, forcing, parameters), dt)
+    middle = along(state, model.cascade(state, forcing, parameters), dt / 2)
+    return along(state, model.cascade(middle, forcing, parameters), dt)
 
 
 def rk4_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
@@ -40,14 +40,15 @@ def rk4_step(model: AbstractModel, state: State, forcing: Forcing, parameters, d
 def runge_kutta(derivative: Callable[[S], S], state: S, dt: Scalar) -> S:
     """The classical Runge-Kutta step, of order 4."""
     k1 = derivative(state)
-    k2 = derivative(_advance(state, k1, dt / 2))
-    k3 = derivative(_advance(state, k2, dt / 2))
-    k4 = derivative(_advance(state, k3, dt))
+    k2 = derivative(along(state, k1, dt / 2))
+    k3 = derivative(along(state, k2, dt / 2))
+    k4 = derivative(along(state, k3, dt))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
-    return _advance(state, mean, dt)
+    return along(state, mean, dt)
 
 
-def _advance(state: S, derivative: S, dt: Scalar) -> S:
+def along(state: S, derivative: S, dt: Scalar) -> S:
+    """The state after `dt` at a constant derivative."""
     return jax.tree.map(lambda x, dx: x + dt * dx, state, derivative)
 
 
@@ -74,8 +75,7 @@ def _diffrax_step(model: AbstractModel, state: State, forcing: Forcing, paramete
     return jax.tree.map(lambda y: jnp.where(failed, jnp.nan, y[0]), solution.ys)
 
 
-STEPPERS: dict[str, Stepper] = {"euler": euler_step, "rk4": rk4_step}
-METHODS: dict[str, Stepper] = {**STEPPERS, "diffrax": _diffrax_step}
+METHODS: dict[str, Stepper] = {"euler": euler_step, "rk4": rk4_step, "diffrax": _diffrax_step}
 
 
 def simulate(

@@ -17,7 +17,6 @@ from experiments.closed_loop.run import print_cases
 from experiments.published import RECORDER, read
 from jaxos4.study import load_study, metrics, read_results
 
-pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 
 
@@ -149,6 +148,7 @@ def test_comparison_noise_study_and_scale(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_baselines(tmp_path):
     shared.run_studies({"out": load_study(small("baselines"))}, tmp_path)
     data = read_results(tmp_path / "out").squeeze()
@@ -303,6 +303,7 @@ def test_coverage(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_defaults(tmp_path):
     settings = ["equation error, memory 0", "equation error, memory 1 (default)", "ant colony, q 0.1"]
     rows = result_of(tmp_path, "defaults", flights=8, seed=7, settings=settings)["rows"]
@@ -347,6 +348,7 @@ def test_long_flight(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_public_flights(shared_flights, tmp_path):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}

@@ -11,9 +11,10 @@ from experiments.fits import summary
 from experiments.monte_carlo import groups
 from experiments.real_flights import aligned, capture_lag, disagreements
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("optimised")]
+pytestmark = pytest.mark.slow
 
 
+@pytest.mark.usefixtures("optimised")
 def test_real_flight(shared_flights, tmp_path):
     report = result_of(
         tmp_path, "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
@@ -55,6 +56,7 @@ def test_closed_loop(monkeypatch, tmp_path):
         assert (row["mean"] > 0.2, row["covered"]) == (True, 0)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_effects(tmp_path):
     """The effects of real flights are flown, identified and drawn."""
     report = result_of(tmp_path, "closed_loop", "effects", flights=1, duration=16.0, effects=["clock"])
@@ -75,6 +77,7 @@ def test_a_soft_flight_has_no_steps_and_the_mix_of_effects_stays_what_it_was():
     assert (mixed.log_every, mixed.soft) == (4, False)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_verdicts(capsys, tmp_path):
     """Good and spoiled flights are judged, and counted."""
     cases = {"gusts": None, "force clipped 0.8": True}
@@ -117,6 +120,7 @@ def test_each_fault_of_the_verdicts_changes_a_flight_as_it_says():
     assert len(np.unique(spoiled["rare motors"].omega[:, 0])) == 100
 
 
+@pytest.mark.usefixtures("optimised")
 def test_sample_times(tmp_path):
     """Every sample time has the same answer, within its interval."""
     report = result_of(tmp_path, "sample_times", flights=2, sample_times=[0.004, 0.016], duration=16.0)
@@ -127,6 +131,7 @@ def test_sample_times(tmp_path):
         assert found["Ix"]["covered"] == 1
 
 
+@pytest.mark.usefixtures("optimised")
 def test_rotorpy(tmp_path):
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     cases = {"flights": 1, "kinds": ["calm"], "duration": 16.0, "estimators": ["filter-error"]}
@@ -147,6 +152,7 @@ def test_rotorpy(tmp_path):
     assert all(abs(row[name]["error"]) < 0.05 for name in ("Ix", "Iy", "Iz", "thrust"))
 
 
+@pytest.mark.usefixtures("optimised")
 def test_the_order_of_a_disturbance_decides_on_the_thrust():
     """Under a controller that answers it by half, one order too few is a bias."""
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
@@ -160,6 +166,7 @@ def test_the_order_of_a_disturbance_decides_on_the_thrust():
     assert abs(first.gain - 0.9) > 2 * abs(second.gain - 0.9)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_commands_that_are_too_rare_are_named(shared_flights, tmp_path):
     (row,) = result_of(tmp_path, "public_flights", "radio", flights=shared_flights, every=[40])["rows"]
     assert row["result"] != "successful"

@@ -27,10 +27,13 @@ from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
-from ..simulation import STEPPERS, runge_kutta
+from ..simulation import along, runge_kutta
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Stage, Stages, Unknowns, WindowUnknowns
 from .layout import each_window, windowed
 from .scans import Length, Rows, predict_window, shoot, shot_with_derivatives, with_tangents
+
+STEPS = ("euler", "rk4")
+"""The methods of a shot, see `ShootingProblem.advance`."""
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
 ROUNDING = 64.0
@@ -87,8 +90,8 @@ class ShootingProblem(AbstractProblem):
     ):
         if channels not in CHANNELS:
             raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
-        if method not in STEPPERS:
-            raise ValueError(f"`method` must be one of {', '.join(STEPPERS)}, got {method!r}.")
+        if method not in STEPS:
+            raise ValueError(f"`method` must be one of {', '.join(STEPS)}, got {method!r}.")
         if np.shape(sigma) not in ((len(STATE_NAMES),), (len(CHANNEL_NAMES),)):
             raise ValueError(
                 "`sigma` must hold one value for each of the 12 states, and may hold three more for specific force, "
@@ -348,11 +351,11 @@ class ShootingProblem(AbstractProblem):
 
     def advance(self, forcing: Forcing, state: State, parameters) -> tuple[State, tuple[Scalar, ...]]:
         """The state one sample later, down to the same level of the cascade, and the output of noise-free sensors."""
-        dt, derivative = self.flight.dt, functools.partial(self.model.cascade, forcing=forcing, parameters=parameters)
-        if self.method == "euler":  # the paper's x_{k+1} = x_k + T f(x_k, u_k)
-            following = jax.tree.map(lambda x, dx: x + dt * dx, state, derivative(state))
+        if self.method == "euler":
+            following = along(state, self.model.cascade(state, forcing, parameters), self.flight.dt)
         else:
-            following = runge_kutta(derivative, state, dt)
+            derivative = functools.partial(self.model.cascade, forcing=forcing, parameters=parameters)
+            following = runge_kutta(derivative, state, self.flight.dt)
         return following, self.model.observe(state, forcing, parameters)
 
     @property
