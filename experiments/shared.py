@@ -142,10 +142,17 @@ def identify(
 
 
 def standard_problem(
-    model: AbstractModel, channels: str = "all", *, scale: float = 1.0, known: bool = True, windows: int = 1, omega=None
+    model: AbstractModel,
+    channels: str = "all",
+    *,
+    scale: float = 1.0,
+    known: bool = True,
+    windows: int = 1,
+    omega=None,
+    dt: float = DT,
 ) -> ShootingProblem:
     """The standard flight of a model, or that of other rotor speeds, without noise; for sensors of this `scale`."""
-    exact = simulate(model, model.alpha, multisine(model.airframe) if omega is None else omega, dt=DT)
+    exact = simulate(model, model.alpha, multisine(model.airframe) if omega is None else omega, dt=dt)
     settings = {"channels": channels, "windows": windows, "initial_state": exact.states[0] if known else None}
     return ShootingProblem(model, exact, sigma=scale * SENSOR_SIGMA, **settings)
 

@@ -109,7 +109,7 @@ def frontier(specification: Path, out: Folder) -> None:
 def searched(study: Study, channels: str, search: str, limit: int) -> xr.Dataset:
     """Errors in bounds, and rollouts, of all flights by a search with a limit."""
     model = model_of(study)
-    problem = standard_problem(model, channels, scale=study.scales[0], omega=input_of(study))
+    problem = standard_problem(model, channels, scale=study.scales[0], omega=input_of(study), dt=study.dt)
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
     found, _ = fit_noisy(SEARCHES[search](limit), problem, study.flights, study.seed)
     error = np.asarray((found.parameters - model.alpha) / bound)
@@ -166,7 +166,7 @@ def p_values(exact: jaxos4.ShootingProblem, found: jaxos4.Estimate, states: jax.
 def fitted_to(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
     """Fit the model `fitted` to flights of the model `flown`."""
     truth, model, omega = model_of(study, flown), model_of(study, fitted), input_of(study)
-    exact = standard_problem(model, channels, scale=study.scales[0], omega=omega)
+    exact = standard_problem(model, channels, scale=study.scales[0], omega=omega, dt=study.dt)
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(exact, model.alpha)))
     keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(study.seed), i))(jnp.arange(study.flights))
     flight = jaxos4.simulate(truth, truth.alpha, omega, dt=study.dt)

@@ -98,8 +98,8 @@ Estimates = tuple[tuple[PerSegment, ...], tuple[PerSegment, ...]]
 # The unknowns at which a flight is filtered, common to all segments or of each segment: the parameters; the noise; the
 # feedthroughs, by which input innovations explain the innovations of the same samples; feedthroughs that were found
 # before, so that the innovations that they explain count as noise; and the gains of input innovations.
-OfChannels = tuple[Float[Array, " channels *segments"], ...]
-Point = tuple[Float[Array, "parameters *segments"], LogNoise, OfChannels, OfChannels, InputGains]
+OfChannels = tuple[Float[Array, "channels ..."], ...]
+Point = tuple[Float[Array, "parameters ..."], LogNoise, OfChannels, OfChannels, InputGains]
 
 
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:

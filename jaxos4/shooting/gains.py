@@ -24,6 +24,7 @@ from ..models.state import CHANNELS
 
 PerSegment = Float[Array, " segments"]
 Channels = Float[Array, "channels segments"]
+Times = Float[Array, "channels *segments"]
 Series = Float[Array, "time channels segments"]
 T = TypeVar("T")
 
@@ -127,7 +128,7 @@ def is_rate(channels: Float[Numeric, "channels *rest"]) -> Bool[np.ndarray, "cha
     return (np.arange(len(channels)) < RATE_COUNT).reshape(-1, *(1,) * (channels.ndim - 1))
 
 
-def _times(noise: LogNoise) -> tuple[Channels, Channels]:
+def _times(noise: LogNoise) -> tuple[Times, Times]:
     """The time constants [s] of a channel's disturbance d, and of the low-pass filter from d to x."""
     tau = jnp.exp(noise.time_constant)
     if noise.smoothing is None:
@@ -135,12 +136,12 @@ def _times(noise: LogNoise) -> tuple[Channels, Channels]:
     return tau, jnp.where(is_rate(tau), _NO_FILTER, jnp.exp(noise.smoothing))
 
 
-def _x_from_x(fast: Channels, time: Array) -> Array:
+def _x_from_x(fast: Times, time: Array) -> Array:
     """The response of x to x after a time [s]."""
     return jnp.where(is_rate(fast), 1.0, jnp.exp(-time / fast))
 
 
-def _x_from_d(tau: Channels, fast: Channels, time: Array) -> Array:
+def _x_from_d(tau: Times, fast: Times, time: Array) -> Array:
     """The response of x to d after a time [s]."""
     force = tau / (tau - fast) * (jnp.exp(-time / tau) - jnp.exp(-time / fast))
     return jnp.where(is_rate(tau), -tau * jnp.expm1(-time / tau), force)
