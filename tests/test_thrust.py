@@ -80,6 +80,7 @@ def thrust_of(flight):
     return found.parameters[PLACE], jnp.sqrt(found.covariance[PLACE, PLACE])
 
 
+@pytest.mark.usefixtures("optimised")
 def test_the_thrust_is_right_if_a_controller_answers_smooth_gusts(monkeypatch):
     """Eight flights. Without the filter of the disturbance, the thrust is 20 % too small, and sure of it."""
     rng = np.random.default_rng(1)
