@@ -12,7 +12,7 @@ paper it is the derivative of one step alone, whose errors are small compared wi
 """
 
 import functools
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,17 +30,20 @@ from ..shooting import Rows, ShootingProblem, Unknowns
 _AVERAGED = 0.5  # the share of the last pass over which the parameters are averaged
 
 
-# The filter before a measurement: the rates; the parameters in half-widths from the bracket's center; Phi12, their
-# influence; the squared influence of each parameter, summed over all samples so far; the number of these samples; and
-# the covariance of the errors of rates, parameters, and the parameters' average.
-_Filter = tuple[
-    Float[Array, "3"],
-    Parameters,
-    Float[Array, "3 parameters"],
-    Float[Array, " parameters"],
-    Scalar,
-    Float[Array, "joint joint"],
-]
+class _Filter(NamedTuple):
+    """The filter before a measurement; parameters in half-widths from the bracket's center.
+
+    - `influence`: Phi12, the derivative of the rates with respect to the parameters.
+    - `energy`: the squared influence of each parameter, summed over `samples` so far.
+    - `covariance`: of the errors of rates, parameters, and the parameters' average.
+    """
+
+    rates: Float[Array, "3"]
+    parameters: Parameters
+    influence: Float[Array, "3 parameters"]
+    energy: Float[Array, " parameters"]
+    samples: Float[Array, ""]
+    covariance: Float[Array, "joint joint"]
 
 
 class SVSF(AbstractEstimator):
@@ -89,24 +92,31 @@ class SVSF(AbstractEstimator):
         spread = jnp.concatenate([start[1] / 3, jnp.ones(count), jnp.zeros(count)])
         kept = (jnp.arange(spread.size) >= 3) & (jnp.arange(spread.size) < 3 + count)
         anew = jnp.diag(jnp.where(kept, 0.0, jnp.square(spread)))
-        zero, no_influence = jnp.zeros(count, dtype=float), jnp.zeros((3, count), dtype=float)
-        first = start[0], zero, no_influence, zero, jnp.zeros((), dtype=float), jnp.diag(jnp.square(spread))
+        at_center = _Filter(
+            rates=start[0],
+            parameters=jnp.zeros(count, dtype=float),
+            influence=jnp.zeros((3, count), dtype=float),
+            energy=jnp.zeros(count, dtype=float),
+            samples=jnp.zeros((), dtype=float),
+            covariance=jnp.diag(jnp.square(spread)),
+        )
 
         def fly(previous: tuple[_Filter, Array], _) -> tuple[tuple[_Filter, Array], None]:
             """One pass: rates and average begin anew, the parameters do not."""
-            (_, parameters, _, energy, seen, covariance), _ = previous
-            covariance = jnp.where(kept[:, None] & kept, covariance, 0.0) + anew
-            begin = start[0], parameters, no_influence, energy, seen, covariance
+            last = previous[0]
+            covariance = jnp.where(kept[:, None] & kept, last.covariance, 0.0) + anew
+            kept_fields = {"parameters": last.parameters, "energy": last.energy, "samples": last.samples}
+            begin = at_center._replace(**kept_fields, covariance=covariance)
             return jax.lax.scan(lambda f, row: self._step(rates, box, f, *row), begin, (rows, shares)), None
 
         none = jnp.zeros((samples, count), dtype=float)
-        ((*_, covariance), history), _ = jax.lax.scan(fly, (first, none), length=self.passes)
+        (last, history), _ = jax.lax.scan(fly, (at_center, none), length=self.passes)
         parameters = box.center + box.width * (shares[:, None] * history).sum(axis=0)
         initial_state, cost, feasible, rollouts = fit_start(problem, parameters)
         return as_estimate(
             problem,
             parameters=parameters,
-            covariance=covariance[3 + count :, 3 + count :] * box.width[:, None] * box.width,
+            covariance=last.covariance[3 + count :, 3 + count :] * box.width[:, None] * box.width,
             initial_state=initial_state,
             cost=cost,
             rollouts=self.passes * (1 + 3 + count) + rollouts,
@@ -121,7 +131,7 @@ class SVSF(AbstractEstimator):
         self, problem: ShootingProblem, box: Unknowns, before: _Filter, row: Rows, share: Float[Array, ""]
     ) -> tuple[_Filter, Parameters]:
         """Corrects with one measurement and predicts the next; returns the parameters after the correction too."""
-        rates, parameters, influence, energy, samples, covariance = before
+        rates, parameters, influence, energy, _, covariance = before
         sigma, count = problem.sigma[RATES], parameters.shape[0]
         measured = jnp.stack(row.measured)
         valid = ~jnp.isnan(measured)
@@ -129,7 +139,7 @@ class SVSF(AbstractEstimator):
 
         # The pseudo-inverse has least norm in units in which all parameters had the same influence so far.
         energy = energy + jnp.square(jnp.where(valid[:, None], influence, 0.0)).sum(axis=0)
-        most, samples = energy.max(), samples + 1
+        most, samples = energy.max(), before.samples + 1
         weakness = jnp.sqrt(most / jnp.where(energy > 0, energy, 1.0))
         unit = jnp.where(energy > 0, jnp.minimum(weakness, self.equilibration), self.equilibration)
         scaled = jnp.where(valid[:, None], unit * influence, 0.0)
@@ -164,7 +174,7 @@ class SVSF(AbstractEstimator):
         passing = advanced.at[:, :3].add(-entering)
         added = _product(jnp.square(sigma) * entering, entering.T)
         covariance = _product(_product(passing, covariance), passing.T) + added
-        return (following, parameters, influence, energy, samples, covariance), parameters
+        return _Filter(following, parameters, influence, energy, samples, covariance), parameters
 
 
 def _gain(error: Float[Array, " n"], layer: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
