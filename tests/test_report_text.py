@@ -10,7 +10,7 @@ from pages import printed, says, words
 from rich.console import Console
 from synthetic_identification import COLOURED, CONSTANTS, WHITE, WRONG, identified_flight, identified_vehicle
 
-from jaxos4.identification.answers import PRIOR_NOTE
+from jaxos4.identification.intervals import PRIOR_NOTE
 from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
 from jaxos4.report import write_flight_page
 from jaxos4.report.text import DASH, Listing, plain

@@ -15,12 +15,13 @@ from jaxos4.airframe import OS4
 from jaxos4.closed_loop import fly_standard
 from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification import verdict
-from jaxos4.identification.answers import prediction_horizons, vehicle_constants, vehicle_quantities
+from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.intervals import consequences, corrected
 from jaxos4.identification.issues import few_parts, issues_of_log, stronger_or_weaker
 from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.judge import judge_vehicle
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
+from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill, RigidBody
 from jaxos4.identification.search import search
 from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, reason_lines, result_of, verdicts_of

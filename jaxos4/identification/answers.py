@@ -1,7 +1,7 @@
-"""`Answer`: an estimate with intervals; its parameters, moments of inertia, and the quantities that get a verdict."""
+"""`Answer`: an estimate with intervals, and tables of its parameters and moments of inertia."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -18,27 +18,17 @@ from ..estimate import Estimate
 from ..models.abstract import PARAMETER_NAMES
 from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
-from ..models.terms import SAG, VOLTAGE_EXPONENT, follows_commands
-from ..results import NINETY_FIVE, has_answer
+from ..models.terms import follows_commands
+from ..results import has_answer
 from ..shooting import ShootingProblem
 from .data import Data
-from .results import (
-    Constant,
-    Disturbance,
-    FixedParameter,
-    OS4Identification,
-    ParameterEstimate,
-    PredictionSkill,
-    RigidBody,
-    VehicleIdentification,
-)
+from .results import Constant, Disturbance, FixedParameter, ParameterEstimate, RigidBody
 from .search import Optimum
-from .verdict import MAX_PRIOR, PREDICTIONS, RIGID_BODY, Quantity
 
 UNIT = "kg m^2"
 NEGATIVE_NOTE = "negative, which is impossible; set to 0"
-PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
-MEASURE = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
+
+
 SCALE_ERROR = 0.01  # relative error of an accelerometer's scale, including the additional lift in forward flight
 GUESSED_DRAG = 0.4  # relative standard deviation of a guess: nearly all published quadrotors are within it
 # If the thrust differs from the airframe's by more than this share, the airframe's coefficients were not measured
@@ -244,8 +234,9 @@ def vehicle_constants(answer: Answer) -> RigidBody:
     covariance[YAW.place, YAW.place] += (drag_error(answer) * alpha[YAW.place]) ** 2
     constants, thrust = {}, "mass" if gains else "thrust_coefficient"
     ratio = float(model.airframe.drag_coefficient / model.airframe.thrust_coefficient)
-    guessed = "guessed " if model.airframe.guesses_drag else ""
-    of_yaw = f"{thrust} and the {guessed}ratio of drag to thrust, {ratio:.3g} m,"
+    of_yaw = f"{thrust} and the ratio of drag to thrust, {ratio:.3g} m,"
+    if model.airframe.guesses_drag:
+        of_yaw = f"{thrust} and the guessed ratio of drag to thrust, {ratio:.3g} m,"
     for axis in AXES:
         place, needed = axis.place, of_yaw if axis == YAW else f"arms and {thrust}"
         if known[place] and alpha[place] > 0:
@@ -256,105 +247,3 @@ def vehicle_constants(answer: Answer) -> RigidBody:
         return RigidBody(constants)
     rigid = fit_inertia(CorrectedOS4(model.airframe), alpha, covariance)
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
-
-
-def vehicle_quantities(answer: Answer, found: VehicleIdentification, still: Sequence[str]) -> dict[str, Quantity]:
-    """Moments of inertia, the quantities of the terms, and predictions.
-
-    `found`: the answer's parameters, moments of inertia and skill. `still`: axes without predictions.
-    """
-    model, own, quantities = answer.problem.model, answer.problem.unknowns, dict[str, Quantity]()
-    table, constants = found.parameters, found.rigid_body.constants
-    shares = dict(zip(own.names, np.square(answer.bound / np.asarray(own.half_width)).tolist(), strict=True))
-    half_widths = dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))
-    for axis in AXES:
-        row, alpha = constants.get(axis.inertia), axis.inverse
-        if row is None:
-            quantities[axis.inertia] = Quantity(
-                missing=f"the flights say too little about {alpha}; fly more {axis.motion}"
-            )
-        else:
-            condition = f", {row.note}" if row.note else ""
-            value = f"{row.estimate:.4g} +- {row.half_width:.2g} {row.unit} (95 %){condition}"
-            notes = _notes(answer, {alpha: table[alpha]}, shares)
-            remedy = f"fly more {axis.motion}, or longer"
-            if axis == YAW and drag_error(answer):
-                remedy = MEASURE
-            elif shares.get(SAG, 0.0) > MAX_PRIOR and VOLTAGE_EXPONENT not in own.names:
-                remedy = f"log rotor speeds, or the battery's voltage at 10 Hz or more, or {remedy}"
-            quantities[axis.inertia] = Quantity(value, row.half_width / row.estimate, reservations=notes, remedy=remedy)
-    for quantity, names in model.quantities.items():
-        unseen = [name for name in names if name in answer.fixed and answer.fixed[name].note == PRIOR_NOTE]
-        which = f"the flights say less about {', '.join(unseen)} than the bracket; fly with more motion"
-        rows = {name: table[name] for name in names if name in table}
-        reservations = ((which,) if unseen else ()) + _notes(answer, rows, shares)
-        wide = tuple(_too_wide(rows, half_widths))
-        missing = which if not rows else "; ".join(wide) if len(wide) == len(rows) else ""
-        axes = {axis.inertia for axis in AXES for name in names if name.startswith(axis.motion) and axis != YAW}
-        quantities[quantity] = Quantity("", 0.0, missing, (*reservations, *wide), requires=tuple(sorted(axes)))
-    return quantities | {PREDICTIONS: prediction_horizons(found.skill, still)}
-
-
-def _too_wide(rows: dict[str, ParameterEstimate], half_widths: dict[str, float]) -> Iterator[str]:
-    """The parameters whose 95 % intervals are wider than their brackets."""
-    for name, row in rows.items():
-        if row.std is not None and NINETY_FIVE * row.std > half_widths[name]:
-            unit = "" if row.unit == "1" else f" {row.unit}"
-            yield f"{name} is known to +-{NINETY_FIVE * row.std:.2g}{unit} only; fly with more motion"
-
-
-def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:
-    """Notes on parameters that rest on a bracket, lie outside it, or are at their limit."""
-    parameters, guessed = answer.problem.model.parameters, {axis.inverse: axis.inertia for axis in AXES}
-    found, of_airframe = [], {each.name for each in parameters if each.scales_torque or callable(each.center)}
-    for name, row in rows.items():
-        if name in answer.negative:
-            found.append(f"{name} is negative, which is impossible; it is 0 here")
-        elif row.is_outside_bracket and name in guessed and row.estimate and isinstance(row.bracket, tuple):
-            ratio = sum(row.bracket) / 2 / row.estimate
-            check = (
-                "measure `drag_coefficient`" if guessed[name] == YAW.inertia else "check `mass` and `rotor_positions`"
-            )
-            found.append(f"{guessed[name]} is {ratio:.2g} times the guess; {check}, or give a wider `bracket`")
-        elif row.is_outside_bracket:
-            # Only an airframe that has such a constant can be wrong about it.
-            check = "check the airframe, or " if name in (*PARAMETER_NAMES, *of_airframe) else ""
-            found.append(f"{name} is outside its bracket; {check}give a wider `bracket`")
-    resting = (name for name in rows if shares[name] > MAX_PRIOR)
-    return *found, *(
-        f"{100 * shares[name]:.0f} % of the information about {name} comes from its bracket" for name in resting
-    )
-
-
-def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> Quantity:
-    """The horizon up to which predictions beat constant rates by a standard error, about each axis that moves."""
-    if skill is None:
-        return Quantity(missing="nothing was held out; give `holdout` or `validate`")
-    ahead, poor = [], []
-    for axis in (each for each in AXES if each.motion not in still):
-        own, longest = getattr(skill, axis.rate), 0.0
-        for horizon, value, std in zip(skill.horizons, own.skill, own.std, strict=True):
-            if value is not None and value <= (std or 0.0):
-                break
-            longest = horizon if value is not None else longest
-        if longest:
-            ahead.append(f"{axis.motion} {longest:.2g} s")
-        else:
-            poor.append(axis.motion)
-    unseen = (f"{' and '.join(still)} cannot be checked; fly more {' and '.join(still)}",) if still else ()
-    if poor and not ahead:
-        motions = " and ".join(poor)
-        return Quantity(missing=f"{motions} cannot be predicted better than by constant rates; fly more {motions}")
-    reach = f"better than constant rates up to {', '.join(ahead)} ahead" if ahead else ""
-    worse = f"; no better for {' and '.join(poor)}" if poor else ""
-    return Quantity(reach + worse, reservations=unseen)
-
-
-def os4_quantities(found: OS4Identification) -> dict[str, Quantity]:
-    """The alphas of an OS4, and its rigid body."""
-    quantities = {}
-    for name, row in found.parameters.items():
-        notes = tuple(filter(None, row.note.split("; ")))
-        quantities[name] = Quantity(missing=row.note) if row.estimate is None else Quantity(reservations=notes)
-    unknown = "" if found.rigid_body.constants else "the alphas are not known well enough"
-    return quantities | {RIGID_BODY: Quantity(missing=unknown)}

@@ -25,12 +25,13 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator
 from ..estimators import FilterError
 from ..results import NINETY_FIVE, has_answer, result_names
-from .answers import PRIOR_NOTE, VehicleAnswer
+from .answers import VehicleAnswer
 from .data import Progress, silent
 from .results import Constant, FixedParameter
 from .search import LOWER, Optimum, deviations, disturbances_of, search
 from .verdict import Move
 
+PRIOR_NOTE = "not identifiable from these flights; the uncertainty is included in the other intervals"
 _NOMINAL_NOTE = "at the usual value, which these flights do not contradict"
 
 

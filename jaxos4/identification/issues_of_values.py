@@ -11,7 +11,7 @@ from ..models.abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..models.terms import DAMPED
 from ..recording.checks.evidence import HELD
-from .answers import MEASURE, Answer, drag_error, thrust_excess
+from .answers import Answer, drag_error, thrust_excess
 from .results import Constant, ParameterEstimate, RigidBody
 from .verdict import CONTRADICTION, IMPROBABLE, MAX_PRIOR, RESERVATION, RIGID_BODY, SIGNIFICANT, Issue, Move, Moves
 
@@ -26,6 +26,7 @@ COUPLING = 0.25  # of alpha1, alpha4 and alpha7: aerodynamic moments may mimic a
 MAX_DELAY = 0.04  # s; a longer delay of rotors is a clock error
 ALL_INERTIAS: Moves = dict.fromkeys(INERTIAS)
 _FLAT = 0.6  # Iz / (Ix + Iy) is rarely smaller if the rotors lie in a plane; for a lamina it is 1
+MEASURE = "measure the yaw torque of a rotor, or swing the vehicle as a pendulum"
 
 
 def issues_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) -> Iterator[Issue]:

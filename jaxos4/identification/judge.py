@@ -36,14 +36,13 @@ from .answers import (
     OS4Answer,
     VehicleAnswer,
     dominated,
-    os4_quantities,
     parameter_table,
     shared_fields,
     vehicle_constants,
-    vehicle_quantities,
 )
 from .data import Data, HeldOut, Progress, class_name, silent
 from .issues import issues_of_log, issues_of_os4, issues_of_vehicle
+from .quantities import os4_quantities, vehicle_quantities
 from .results import (
     ChannelFit,
     Constant,
