@@ -49,8 +49,8 @@ STEP = 0.01  # s; of the slower logs
 HORIZONS = (5, 10, 20, 30, 50)  # steps ahead, of a table
 AHEAD = 0.25  # s
 SEEDS = 3  # of networks
-# Of clocks: half of the time over which turns are compared, and the largest lag [samples]; an error of more medians is
-# an outlier.
+# For `capture_lag`: half of the time over which turns are compared, and the largest lag [samples]; errors above this
+# many medians are outliers.
 HALF, MOST, OUTLIER = 5, 6, 3.0
 COMPARED = ("Ix", "Iy")
 INTERVALS: dict[str, Column] = {
@@ -164,11 +164,11 @@ def public_flights(
 ) -> None:
     """Public flights of a Crazyflie 2.1 (NanoBench): some are identified together, and others predicted whole.
 
-    The motion capture is moved to the clock of the gyro first. The flights `fitted` are identified
-    together, and those `predicted` are predicted: position, velocity, attitude and body rates, 50 steps of 10 ms ahead,
-    open loop, with the recorded commands and the offsets that the past of a flight shows. The errors stand beside those
-    of constant velocity and rates, of a regression that is fitted to the first half of the flight that it predicts, and
-    of a small network for the rates that is trained on the identified flights, in so many batches.
+    The motion capture is moved to the clock of the gyro first. The flights `fitted` are identified together, and those
+    `predicted` are predicted: position, velocity, attitude and body rates, 50 steps of 10 ms ahead, open loop, with the
+    recorded commands and the offsets that the past of a flight shows. The errors stand beside those of constant
+    velocity and rates, of a regression that is fitted to the first half of the flight that it predicts, and of a small
+    network for the rates that is trained on the identified flights, in so many batches.
 
     Commands answer what disturbs the vehicle after the start, which no prediction in open loop knows. How much that
     costs is simulated with the true vehicle (`gusts.py`): flights through `gusts` of these strengths [rad/s^2].

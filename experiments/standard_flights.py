@@ -51,6 +51,46 @@ COVERED: dict[str, Column] = {"95 % intervals that hold [%]": lambda row: 100 * 
 SECONDS: dict[str, Column] = {"s": lambda row: row["flights"] * row["seconds"]}
 
 
+def baselines(
+    flights: Count = 200,
+    seed: Seed = 5,
+    channels: str = "rates",
+    estimators: Estimators = (),
+    noises: list[str] = tuple(NOISES),
+    scales: list[float] = (0.0, 0.1, 1.0, 10.0),
+    out: Out = None,
+) -> None:
+    """How do all estimators without a network perform, with their default settings, for each kind and scale of noise?
+
+    The bound is always the one for white noise of the same standard deviation, so that the cost of coloured and biased
+    noise is visible. At scale 0 there is no noise, and errors are in units of the bound at scale 1.
+    """
+
+    def row_of(noise: str, scale: float, estimator: str) -> Row:
+        kind = NOISES[noise if scale else "white"](scale * jaxos4.SENSOR_SIGMA)
+        fit = Fit(make_estimator(estimator), channels=channels, scale=scale or 1.0)
+        _, (row, _) = (fit.row(flights, seed, kind) for _ in range(2))  # the first call compiles
+        return row
+
+    check_names("noises", noises, NOISES)
+    check_names("estimators", estimators, ESTIMATORS)
+    chosen = estimators or [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
+    every = product(noise=noises, scale=scales, estimator=chosen)
+    trials = (trial for trial in every if trial["scale"] or trial["noise"] == noises[0])
+    rows = study(out, {"seed": seed, "channels": channels, "flights": flights}, trials, row_of)
+    columns: dict[str, Column] = {
+        "noise": lambda row: row["noise"] if row["scale"] else "none",
+        "scale": "scale",
+        "estimator": "estimator",
+        **EFFICIENCY,
+        "bias": lambda row: float(np.abs(row["bias"]).max()) if row["bias"] else None,
+        **COVERED,
+        "ms": lambda row: 1000 * row["seconds"],
+        **ENDED,
+    }
+    print_rows(f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights", rows, columns)
+
+
 def efficiency(
     flights: Count = 512, seed: Seed = 0, scale: float = 1.0, cases: list[str] = (), out: Out = None
 ) -> None:
@@ -203,9 +243,10 @@ def defaults(flights: Count = 64, seed: Seed = 7, settings: list[str] = (), out:
     def row_of(setting: str, model: str, scale: float) -> Row:
         (fit,) = (fit for fit in every[setting] if (fit.model, fit.scale) == (model, scale))
         row, found = fit.row(flights, seed)
-        # Costs of estimators without a search are those of another criterion.
-        gap = float(np.max(np.asarray(found.cost) - least_costs(*fit[1:]))) if fit.estimator.shoots else None
-        return row | {"gap": gap}
+        if not fit.estimator.shoots:  # its cost is that of another criterion
+            return row | {"gap": None}
+        least = least_costs(fit.model, fit.channels, fit.scale, fit.known)
+        return row | {"gap": float(np.max(np.asarray(found.cost) - least))}
 
     chosen = {name: every[name] for name in settings or every}
     trials = ({"setting": s, "model": fit.model, "scale": fit.scale} for s, some in chosen.items() for fit in some)
@@ -272,6 +313,7 @@ def long_flight(
 
 
 SCRIPTS = {
+    "baselines.run": baselines,
     "coverage.robust": robust,
     "coverage.run": coverage,
     "defaults.run": defaults,

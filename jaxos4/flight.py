@@ -110,7 +110,7 @@ _STATES = Signal((len(STATE_NAMES),), dict(zip(STATE_NAMES, STATE_UNITS, strict=
 class Flight(eqx.Module):
     """A recorded or simulated flight on a uniform time grid. A new signal is a field here and in `Recording`.
 
-    Its unit must be in `jaxos4.logs.values`. `report.log_page` says where it is drawn. A signal that
+    Its unit must be in `jaxos4.logs.values`. `report.log_figures` says where it is drawn. A signal that
     fits compare has names in `CHANNEL_NAMES` too.
 
     - `time`: sample times [s], uniform.

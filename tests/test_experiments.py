@@ -60,7 +60,7 @@ def test_help_describes_the_common_options(script, texts, capsys, monkeypatch):
         *(
             ([script, *place, "--estimators", "filter-eror"], "--estimators: no 'filter-eror'; give one of ibss")
             for script, *place in (
-                *(["coverage.run"], ["long_flight.run"], ["precision.run"], ["real_flight.run"]),
+                *(["baselines.run"], ["coverage.run"], ["long_flight.run"], ["precision.run"], ["real_flight.run"]),
                 *(["closed_loop.run"], ["closed_loop.effects"], ["rotorpy.run", "flights"]),
             )
         ),
@@ -91,7 +91,7 @@ def test_case_whose_flights_are_all_refused_has_a_line():
 
 # Studies: experiments with a specification.
 
-STUDIES = ("comparison", "noise_study", "noise_kinds", "scale", "baselines")  # those without a script of their own
+STUDIES = ("comparison", "noise_study", "noise_kinds", "scale")  # those without a script of their own
 OTHERS = ("frontier", "rollout_budget", "published_corrected", "inverse_crime", "bracket_and_seeds")
 
 
@@ -145,21 +145,6 @@ def test_comparison_noise_study_and_scale(tmp_path):
     np.testing.assert_allclose(error.sel(scale=1.0) / error.sel(scale=0.1), 10, rtol=0.1)
     # At ten times the noise IBSS ends at its limits around the bracket.
     assert (accuracy.sel(scale=10.0, estimator="ibss") < accuracy.sel(scale=10.0, estimator="equation-error")).all()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
-def test_baselines(tmp_path):
-    shared.run_studies({"out": load_study(small("baselines"))}, tmp_path)
-    data = read_results(tmp_path / "out").squeeze()
-    ratio = metrics.error(data) / data["bound"].sel(scale=1.0)
-    exact, noisy = ((ratio.sel(scale=scale) ** 2).mean("flight") ** 0.5 for scale in (0.0, 1.0))
-    assert ratio.notnull().all()
-    assert (exact < 1e-6).all()
-    # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
-    chance = 1 / np.sqrt(2 * data.sizes["flight"])
-    assert float(noisy.sel(estimator="output-error").max()) < 1 + 5 * chance
-    assert float(noisy.sel(estimator="equation-error").max()) < 1.6 + 8 * chance
 
 
 @pytest.mark.slow
@@ -289,6 +274,19 @@ def test_precision(tmp_path):
         assert double["results"] == single["results"] == {"successful": 64}
         assert near(single["covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 64))
     assert all(near(rows[name, "float32"]["efficiency"], 1, 5 * np.sqrt(1 / 128)) for name in ("kalman", "ibss"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
+def test_baselines(tmp_path):
+    cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
+    rows = result_of(tmp_path, "baselines", flights=FLIGHTS, seed=5, channels="rates", **cases)["rows"]
+    exact, noisy = rows[:2], rows[2:]
+    assert all(row["answers"] == FLIGHTS for row in rows)
+    assert all(max(row["efficiency"]) < 1e-6 for row in exact)
+    # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
+    assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
+    assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]
 
 
 @pytest.mark.slow

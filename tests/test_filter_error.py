@@ -31,8 +31,8 @@ NOISE = LogNoise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 
 def observed_in(problem, segments=1):
     """Where filters restart, and which samples count, in segments of about this many samples; by default in one."""
     found = InnovationsProblem(problem, segments=segments)
-    rows, (_, restart, counts, _) = found.segmentation.rows, observe_in_segments(found)
-    return restart[:rows, 0], counts[:rows, 0]
+    rows, observed = found.segmentation.rows, observe_in_segments(found)
+    return observed["restart"][:rows, 0], observed["counts"][:rows, 0]
 
 
 @eqx.filter_jit

@@ -24,7 +24,8 @@ from jaxos4.logs import LogFacts
 from jaxos4.recording.inspection import ASSUMED_FULL_SCALE, airframe_draft, inspect_log
 from jaxos4.recording.motion import rotor_signs
 from jaxos4.report import print_inspection, write_log_page
-from jaxos4.report.log_page import amplitude_density, fitted, logged
+from jaxos4.report.log_figures import amplitude_density, logged
+from jaxos4.report.log_page import fitted
 from jaxos4.report.timeline import thinned
 
 EVIL = "</script><script>alert(1)</script>"

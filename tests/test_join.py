@@ -146,7 +146,7 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     rng, t, dt = np.random.default_rng(0), 3.0 + 0.001 * np.arange(83), 0.001 * ratio
     channels = np.cumsum(rng.normal(size=(83, 3)), axis=0)
     channels[rng.uniform(size=channels.shape) < lost] = np.nan
-    grid, _, found = averages(t, rng.uniform(100, 300, (83, 4)), channels, dt, held=True)
+    grid, _, found = averages(t, rng.uniform(100, 300, (83, 4)), channels, held=True)(dt)
     # The first sample begins half of a row before the first row, and the last ends half of a row after the last.
     edges = t[0] - 0.0005 + dt * np.arange(grid.size + 1)
     np.testing.assert_allclose(grid, edges[:-1] + dt / 2, rtol=1e-12)

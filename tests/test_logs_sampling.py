@@ -129,7 +129,7 @@ def test_impulse_is_conserved_whatever_the_rates(seed, measured):
     t = np.cumsum(rng.uniform(0.001, 0.1, 60))
     rows = np.sort(rng.uniform(t[0], t[-1], 40))
     values = rng.uniform(0, 900, (60, 4))
-    got = root_mean_square(Series(t, values), rows, linear=measured)
+    got = root_mean_square(Series(t, values), linear=measured)(rows)
     fine = np.linspace(rows[0], rows[-1], 400_001)
     held = values[np.searchsorted(t, fine, side="right") - 1] ** 2
     if measured:
@@ -149,7 +149,7 @@ def test_speeds_within_a_sample_are_those_of_its_quarters(held):
     omega = rng.uniform(100, 900, (60, 4))
     dt = (t[-1] - t[0]) / 18.2
     rows = t[0] + dt * np.arange(19)
-    found = speeds_within(t, omega, rows, dt, held=held)
+    found = speeds_within(t, omega, held=held)(rows, dt)
     assert found.shape == (rows.size, PARTS, 4)
     count = 2000  # in each part
     fine = rows[0] - dt / 2 + dt / PARTS / count * (np.arange(rows.size * PARTS * count) + 0.5)

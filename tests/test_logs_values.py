@@ -143,10 +143,10 @@ def test_zeros_in_arrays_count_as_not_measured_unless_they_are_commands():
     omega, states = speeds(t), np.full((t.size, 12), np.nan)
     omega[100::50, 1], states[:, [7, 9, 11]] = 0, rates(t)
     flight = Recording(t, omega, states)
-    found, outliers, _ = plausible(flight)
-    assert outliers == {"rotor 2": (8, 0.0)}
-    np.testing.assert_array_equal(found.omega[100::50, 1], omega[99:-1:50, 1])
-    assert plausible(flight._replace(commanded=True))[1] == {}
+    found = plausible(flight)
+    assert found.impossible == {"rotor 2": (8, 0.0)}
+    np.testing.assert_array_equal(found.recording.omega[100::50, 1], omega[99:-1:50, 1])
+    assert plausible(flight._replace(commanded=True)).impossible == {}
 
 
 # How often motors and gyro were logged

@@ -8,13 +8,13 @@ from helpers import CRAZYFLIE
 
 from jaxos4.flight import RATES
 from jaxos4.logs.values import plausible
-from jaxos4.recording import Recording, prepared, windows
+from jaxos4.recording import Recording, windows
 from jaxos4.recording.checks import Evidence
 from jaxos4.recording.inspection import inspect_log
 from jaxos4.recording.prepared import finest, prepare
 from jaxos4.recording.stretches import Stretch
 from jaxos4.recording.windows import fair_share, richest
-from jaxos4.report.log_page import logged, spectra
+from jaxos4.report.log_figures import logged, spectra
 
 DT, HOVER = 0.01, float(CRAZYFLIE.hover_speed)
 ROLL, PITCH, YAW = np.sign(np.asarray(CRAZYFLIE.mixer)[:3])
@@ -43,8 +43,7 @@ def log(seconds=600.0, *, manoeuvres=(), name="long.csv", ground=3.0, seed=0):
 
 @pytest.fixture
 def two_minutes(monkeypatch):
-    for module in (windows, prepared):
-        monkeypatch.setattr(module, "MOST", round(120 / DT))
+    monkeypatch.setattr(windows, "MOST", round(120 / DT))
 
 
 def test_the_parts_of_a_long_log_that_excite_each_axis_are_fitted(two_minutes):

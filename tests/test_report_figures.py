@@ -16,7 +16,7 @@ from jaxos4 import compare_results
 from jaxos4.analysis.inertia import CenterOfMass
 from jaxos4.report import identification_figures, study_figures
 from jaxos4.report.comparison import forest
-from jaxos4.report.log_page import motors, spectra
+from jaxos4.report.log_figures import motors, spectra
 from jaxos4.report.panels import INK, Band, Figure, Line, Panel, Scale, Words, spread, styles
 from jaxos4.report.study_tables import scenarios
 from jaxos4.report.svg import as_file, inline

@@ -28,7 +28,10 @@ def changed(recording: Recording, channels: np.ndarray) -> Recording:
 def of_each(
     columns: Iterable[int], change: Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 ) -> Callable[[Recording, float], Recording]:
-    """A fault of some channels, one by one. `change`: makes a spoiled channel of a good one, the times and the size."""
+    """A fault of some channels, one by one.
+
+    `change`: takes a channel, the times and the size, and returns the spoiled channel.
+    """
 
     def spoil(recording: Recording, size: float) -> Recording:
         channels = recording.channels.copy()

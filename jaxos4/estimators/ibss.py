@@ -62,9 +62,9 @@ class Directions(NamedTuple):
 
     @classmethod
     def at(cls, stage: Stage, unknowns: WindowUnknowns, model: LocalModel, reach: Scalar) -> "Directions":
-        """The directions at some unknowns. The search does not go further than `reach` half-widths from the center.
+        """The directions at some unknowns, with limits `reach` half-widths from the center.
 
-        The parameters' bracket counts as weak prior information, so that no direction is without any.
+        The bracket of the parameters counts as weak prior information, so that every direction has some.
         """
         limits, count, windows = stage.limits(reach), stage.unknowns.count, len(unknowns)
         of_bracket, of_stride = 1 / jnp.square(stage.off / 2), _DAMPING / jnp.square(stage.unknowns.stride)

@@ -1,8 +1,9 @@
-"""Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood, corrected by secants. Output and filter error.
+"""Levenberg-Marquardt, and the two estimators that use it: output error and filter error.
 
-Gauss-Newton ignores the second derivatives of the residuals. So its steps are too long along some unknowns, such as a
-delay, and damping shortens them along all unknowns. The change of the gradient over the last step, a secant, shows by
-how much the information misjudges the curvature along that step.
+The steps are damped Gauss-Newton steps on any likelihood, corrected by secants. Gauss-Newton ignores the second
+derivatives of the residuals. So its steps are too long along some unknowns, such as a delay, and damping shortens them
+along all unknowns. The change of the gradient over the last step, a secant, shows by how much the information misjudges
+the curvature along that step.
 
 Output error models sensor noise only, filter error disturbances too (`InnovationsProblem`). Both are maximum likelihood
 by these steps.

@@ -31,7 +31,7 @@ class HeldOut(NamedTuple):
 
     - `problem`: the flight and its model.
     - `recording`: the name of another recording; `None`: a part of the fitted recordings was held out.
-    - `time`: of each sample of another vehicle's recording in its log [s].
+    - `time`: of each sample in the log of that recording [s]; empty for an OS4 or a held-out part.
     """
 
     problem: ShootingProblem
@@ -74,7 +74,10 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, problem: ShootingProblem, notes: Sequence[str], **own: Any) -> "Provenance":
-        """The provenance of a flight that is fitted, with the fields of its own kind. An airframe may be "custom"."""
+        """The provenance of a flight that is fitted. `own`: the fields of its kind.
+
+        `airframe`: the name of a preset, or "custom".
+        """
         airframe, flight = problem.model.airframe, problem.flight
         return cls(
             airframe=next((name for name, preset in PRESETS.items() if preset is airframe), "custom"),

@@ -33,7 +33,7 @@ from ..shooting import InnovationsProblem, ShootingProblem, padded
 from .answers import OS4Answer, VehicleAnswer, dominated, vehicle_constants
 from .data import Data, Progress, name_and_class, silent
 from .intervals import at_lowest, corrected
-from .results import COLOURED, SampleTime
+from .results import COLOURED, Constant, SampleTime
 from .search import Optimum, search
 
 DEFAULT = "filter-error"
@@ -237,16 +237,19 @@ def is_white(row: SampleTime) -> bool:
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:
     """Whether the next longer sample time with an answer agrees, and Ix or Iy is not clearly more certain there."""
-    both = {name: (one, other.constants[name]) for name, one in row.constants.items() if name in other.constants}
-    less_certain = any(one.std > WIDER * two.std for name, (one, two) in both.items() if name != YAW.inertia)
-    return bool(both) and not moved(row, other) and not less_certain
+    pairs = {name: (one, other.constants[name]) for name, one in row.constants.items() if name in other.constants}
+    less_certain = any(one.std > WIDER * two.std for name, (one, two) in pairs.items() if name != YAW.inertia)
+    return bool(pairs) and not moved(row, other) and not less_certain
 
 
 def moved(row: SampleTime, other: SampleTime) -> list[str]:
     """The moments of inertia that another sample time contradicts."""
-    both = [(name, one, other.constants[name]) for name, one in row.constants.items() if name in other.constants]
-    limits = {name: AGREE * max(one.std, two.std) + DISCRETE * one.estimate for name, one, two in both}
-    return [name for name, one, two in both if abs(one.estimate - two.estimate) > limits[name]]
+
+    def differs(one: Constant, two: Constant) -> bool:
+        return abs(one.estimate - two.estimate) > AGREE * max(one.std, two.std) + DISCRETE * one.estimate
+
+    both = [name for name in row.constants if name in other.constants]
+    return [name for name in both if differs(row.constants[name], other.constants[name])]
 
 
 def sample_time_of(answer: VehicleAnswer) -> SampleTime:

@@ -56,7 +56,7 @@ def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:
 def spreads_of(found: Identification) -> dict[str, float]:
     """The relative half-width of the 95 % interval of each moment of inertia of a result."""
     constants = found.rigid_body.constants if found.is_vehicle else {}
-    return {name: row.half_width / abs(row.estimate) for name, row in constants.items() if row.estimate}
+    return {name: row.margin / abs(row.estimate) for name, row in constants.items() if row.estimate}
 
 
 def _more(motion: str, spread: float, seconds: float) -> str:

@@ -32,14 +32,14 @@ def vehicle_quantities(answer: Answer, found: VehicleIdentification, still: Sequ
             )
         else:
             condition = f", {row.note}" if row.note else ""
-            value = f"{row.estimate:.4g} +- {row.half_width:.2g} {row.unit} (95 %){condition}"
+            value = f"{row.estimate:.4g} +- {row.margin:.2g} {row.unit} (95 %){condition}"
             notes = _notes(answer, {alpha: table[alpha]}, shares)
             remedy = f"fly more {axis.motion}, or longer"
             if axis == YAW and drag_error(answer):
                 remedy = MEASURE
             elif shares.get(SAG, 0.0) > MAX_PRIOR and VOLTAGE_EXPONENT not in own.names:
                 remedy = f"log rotor speeds, or the battery's voltage at 10 Hz or more, or {remedy}"
-            quantities[axis.inertia] = Quantity(value, row.half_width / row.estimate, reservations=notes, remedy=remedy)
+            quantities[axis.inertia] = Quantity(value, row.margin / row.estimate, reservations=notes, remedy=remedy)
     for quantity, names in model.quantities.items():
         unseen = [name for name in names if name in answer.fixed and answer.fixed[name].note == PRIOR_NOTE]
         which = f"the flights say less about {', '.join(unseen)} than the bracket; fly with more motion"

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 VEHICLE_MODEL = "flight"  # the name of the model of a vehicle, in files and on the command line
 APART = {"rigid_body", "airframe", "estimate", "problem"}  # fields that a file holds in another form, or not at all
+LATE = 0.005  # s; a `rotor_delay` below minus this means that motors are recorded late
 
 
 class ParameterEstimate(msgspec.Struct, frozen=True):
@@ -66,14 +67,14 @@ class Constant(msgspec.Struct, frozen=True):
     note: str | msgspec.UnsetType = msgspec.UNSET
 
     @property
-    def half_width(self) -> float:
+    def margin(self) -> float:
         """Half the width of the 95 % interval."""
         return NINETY_FIVE * self.std
 
     @property
     def ci95(self) -> tuple[float, float]:
         """The 95 % interval."""
-        return self.estimate - self.half_width, self.estimate + self.half_width
+        return self.estimate - self.margin, self.estimate + self.margin
 
 
 class RigidBody(msgspec.Struct, frozen=True):
@@ -248,6 +249,14 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def warnings(self) -> tuple[str, ...]:
         """Why the estimate cannot be trusted, or only with care, and what to do; one line each."""
         return tuple(issue.warning for issue in self.issues)
+
+    @property
+    def motor_clock(self) -> str:
+        """The delay of the recorded motors in words, if `rotor_delay` is clearly negative; else empty."""
+        delay = self.parameters.get("rotor_delay")
+        if delay is None or delay.estimate is None or delay.estimate > -LATE:
+            return ""
+        return f"motors are recorded {-1e3 * delay.estimate:.0f} ms late"
 
     def sample(self, samples: int, *, key: PRNGKeyArray) -> dict[str, Array]:
         """Vehicles drawn from the uncertainty, ready for `jax.vmap`; see `jaxos4.export.sample_vehicles`."""

@@ -52,29 +52,31 @@ def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
 
     A quantity that was not estimated is not in the table, nor is one that `possible` leaves out.
     """
+    quantities: list[PhysicalQuantity] = []
+
+    def add(name: str, row: Constant, ci95: tuple[float, float], judged: str) -> None:
+        verdict, note = found.verdicts.get(judged), row.note or ""
+        quantities.append(PhysicalQuantity(name, row.unit, row.estimate, row.std, ci95, note, judged, verdict))
+
     constants = found.rigid_body.constants if found.is_vehicle else possible(found.rigid_body)
+    for name, row in constants.items():
+        add(name, row, row.ci95, name if found.is_vehicle else RIGID_BODY)
     # The name of the verdict on each parameter.
     judged = {name: name for name in found.parameters}
     if found.is_vehicle:
         terms = [term for term in TERMS.values() if term.verdict]
         judged = {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}
-    rows = [(name, each, name if found.is_vehicle else RIGID_BODY, each.ci95) for name, each in constants.items()]
-    rows += [
-        (name.replace("_", " "), Constant(each.estimate, each.std, each.unit), judged[name], each.ci95)
-        for name, each in found.parameters.items()
-        if judged.get(name, CENTER) != CENTER and each.estimate is not None and each.std is not None
-    ]
-    for each in centers_of_mass(found) if found.is_vehicle else ():
-        center = Constant(1e3 * each.value, 1e3 * each.std, "mm", "if rotors are alike")
-        rows.append((f"{CENTER} {each.axis}", center, CENTER, center.ci95))
+    for name, row in found.parameters.items():
+        if row.estimate is None or row.std is None or row.ci95 is None:
+            continue
+        if judged.get(name, CENTER) != CENTER:
+            add(name.replace("_", " "), Constant(row.estimate, row.std, row.unit), row.ci95, judged[name])
     if found.is_vehicle:
-        rows.sort(key=lambda row: _ORDER.index(row[2]) if row[2] in _ORDER else -1)
-    return [
-        PhysicalQuantity(
-            name, x.unit, x.estimate, x.std, ends or x.ci95, x.note or "", verdict, found.verdicts.get(verdict)
-        )
-        for name, x, verdict, ends in rows
-    ]
+        for each in centers_of_mass(found):
+            center = Constant(1e3 * each.value, 1e3 * each.std, "mm", "if rotors are alike")
+            add(f"{CENTER} {each.axis}", center, center.ci95, CENTER)
+        quantities.sort(key=lambda each: _ORDER.index(each.judged) if each.judged in _ORDER else -1)
+    return quantities
 
 
 def possible(body: RigidBody) -> dict[str, Constant]:
@@ -82,7 +84,7 @@ def possible(body: RigidBody) -> dict[str, Constant]:
     vehicle = body.constants.get(YAW.inertia)
     most = {} if vehicle is None else {"J_R": vehicle.estimate}
     every = ((name, row, most.get(name, np.inf)) for name, row in body.constants.items())
-    return {name: row for name, row, limit in every if row.half_width < row.estimate <= limit}
+    return {name: row for name, row, limit in every if row.margin < row.estimate <= limit}
 
 
 def centers_of_mass(found: Identification) -> list[CenterOfMass]:

@@ -223,8 +223,8 @@ def _add_rates(log: _Log) -> None:
     if not log.settings and names["p"] not in log.converted:
         fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
         log.notes.append(f"{field} is taken as deg/s: {fine}")
-    unit = DEGREE  # of one count
-    for name in reversed(_GYRO_SCALES):  # in deg/s, or, of Baseflight and in exports, in rad/us
+    unit = DEGREE  # of one count; the setting is in deg/s, or, of Baseflight and in exports, in rad/us
+    for name in reversed(_GYRO_SCALES):  # the first name has precedence
         if (scale := log.setting(name, 1e-3, 10)) is not None:
             unit = scale * DEGREE
         elif (scale := log.setting(name, 1e-11, 1e-6)) is not None:

@@ -62,32 +62,31 @@ def decode_frames(
 
 
 def _fields(settings: dict[str, str]) -> tuple[list[str], dict[int, list[tuple[int, int]]], dict[int, list[int]]]:
-    """The names of the fields of main frames; by kind of frame, (encoding, number of fields) and predictors of fields.
+    """The names of the fields of main frames; by kind of frame, groups (encoding, number of fields) and predictors.
 
     Raises `BadHeader`.
     """
-    names, encodings, predictors = [], {}, {}
+    names, groups, predictors = [], {}, {}
     for letter in "IPSGH":
-        each, predicted = (_numbers(settings.get(f"Field {letter} {what}")) for what in ("encoding", "predictor"))
-        if not each:
+        encodings, predicted = (_numbers(settings.get(f"Field {letter} {what}")) for what in ("encoding", "predictor"))
+        if not encodings:
             continue
         labels = [name.strip() for name in settings.get(f"Field {letter} name", "").split(",")]
-        same = len(predicted) == len(each) <= _MOST_FIELDS and (letter == "P" or len(labels) == len(each))
+        same = len(predicted) == len(encodings) <= _MOST_FIELDS and (letter == "P" or len(labels) == len(encodings))
         if not same or (letter == "P" and names and len(predicted) != len(names)):
             raise BadHeader(_BAD)
-        groups: list[tuple[int, int]] = []
-        for encoding, group in itertools.groupby(each):
+        names = labels if letter == "I" else names
+        groups[ord(letter)], predictors[ord(letter)] = [], predicted
+        for encoding, alike in itertools.groupby(encodings):
             if encoding not in _TOGETHER:
                 raise BadHeader(f"its frames have an encoding that is not known, {encoding}")
-            count, most = len(list(group)), _TOGETHER[encoding]
-            groups += [(encoding, min(most, count - done)) for done in range(0, count, most)]
-        if _TAG8_4 in each and settings.get("Data version", "2") != "2":
+            count, most = len(list(alike)), _TOGETHER[encoding]
+            groups[ord(letter)] += [(encoding, min(most, count - done)) for done in range(0, count, most)]
+        if _TAG8_4 in encodings and settings.get("Data version", "2") != "2":
             raise BadHeader("its frames are of version 1")
-        names = labels if letter == "I" else names
-        encodings[ord(letter)], predictors[ord(letter)] = groups, predicted
     if not {_TIME, _ITERATION} <= set(names):
         raise BadHeader("its header does not describe the frames")
-    return names, encodings, predictors
+    return names, groups, predictors
 
 
 def _numbers(text: str | None) -> list[int]:
@@ -186,7 +185,7 @@ class _Stream:
 
     def __init__(self, settings: dict[str, str], data: bytes):
         self.data, self.numbers = data, Numbers(data)
-        self.names, self.encodings, self.predictors = _fields(settings)
+        self.names, self.groups, self.predictors = _fields(settings)
         self.damaged, self.ended = 0, False
         self.last: tuple[int, int] | None = None  # iteration and time of the last frame
         self.time, self.iteration = self.names.index(_TIME), self.names.index(_ITERATION)
@@ -270,9 +269,9 @@ class _Stream:
         values: list[int] = []
         if letter == _E:
             return values if self._event() else None
-        if letter not in self.encodings:
+        if letter not in self.groups:
             return None
-        for encoding, count in self.encodings[letter]:
+        for encoding, count in self.groups[letter]:
             self.numbers.read(encoding, count, values)
         return values
 

@@ -78,7 +78,7 @@ def _check_whole(path: Path, packed: IO[bytes]) -> None:
 def check_part(path: LogPath, kind: str, content: bytes) -> None:
     """Refuse a part of a bag that has more than `MAX_PART` bytes when it is decompressed.
 
-    `kind`: the name of its compression. A part with another name is not compressed, or its reader refuses it.
+    `kind`: the name of its compression. Any other name: the part is not compressed, or its reader refuses it.
     """
     if kind not in _DECOMPRESSORS:
         return

@@ -212,7 +212,7 @@ class Messages:
         if rows.size > MAX_ROWS:
             refuse(self.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
         columns = {"t": rows - rows[0]} | dict(zip(RATE_NAMES, rates.values[inside].T, strict=True))
-        columns |= zip(rotor_names, root_mean_square(speeds, rows, linear=rotors.is_measured).T, strict=True)
+        columns |= zip(rotor_names, root_mean_square(speeds, linear=rotors.is_measured)(rows).T, strict=True)
         for names, series in others.items():
             if series is None:
                 continue

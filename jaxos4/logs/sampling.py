@@ -54,34 +54,44 @@ def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Colum
     return until
 
 
-def root_mean_square(series: Series, rows: Rows, *, linear: bool = False) -> Columns:
+def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[Rows], Columns]:
     """Root mean square of each rotor's speed or command from each row to the next, so that its impulse is conserved.
 
     Thrust and torque are proportional to the square. Speeds are held until the next sample; if `linear`, their squares
     are interpolated. The last row has the speed at that time. The rows are times; none lies before the first sample.
     """
     squares = Series(series.t, np.square(series.values))
-    out = np.empty((rows.size, squares.values.shape[1]))
-    out[:-1] = np.diff(integral(squares, linear=linear)(rows), axis=0) / np.diff(rows)[:, None]
-    out[-1] = squares.values[np.searchsorted(series.t, rows[-1], side="right") - 1]
-    if linear:
-        out[-1] = [np.interp(rows[-1], series.t, column) for column in squares.values.T]
-    return np.sqrt(np.maximum(out, 0.0))
+    impulse = integral(squares, linear=linear)
+
+    def at(rows: Rows) -> Columns:
+        last = np.searchsorted(series.t, rows[-1], side="right") - 1
+        out = np.empty((rows.size, squares.values.shape[1]))
+        out[:-1] = np.diff(impulse(rows), axis=0) / np.diff(rows)[:, None]
+        out[-1] = squares.values[last]
+        if linear:
+            out[-1] = [np.interp(rows[-1], series.t, column) for column in squares.values.T]
+        return np.sqrt(np.maximum(out, 0.0))
+
+    return at
 
 
-def speeds_within(t: Times, omega: Speeds, rows: Rows, dt: float, *, held: bool) -> Float[np.ndarray, "rows parts 4"]:
-    """Root mean square of each rotor's speed in the parts of the samples of length `dt` [s] around rows.
+def speeds_within(t: Times, omega: Speeds, *, held: bool) -> Callable[[Rows, float], Float[np.ndarray, "rows parts 4"]]:
+    """Root mean square of each rotor's speed in the parts of the samples around rows, a function of rows and step [s].
 
     Arguments as of `averages`. Before the first time, rotors have the speeds of the first row.
     """
     times, values = np.append(2 * t[0] - t[-1], t), np.concatenate([omega[:1], omega])
-    edges = rows[0] - dt / 2 + dt / PARTS * np.arange(PARTS * rows.size + 1)
-    speeds = root_mean_square(Series(times, values), edges, linear=not held)
-    return speeds[:-1].reshape(rows.size, PARTS, -1)
+    speeds = root_mean_square(Series(times, values), linear=not held)
+
+    def at(rows: Rows, dt: float) -> Float[np.ndarray, "rows parts 4"]:
+        edges = rows[0] - dt / 2 + dt / PARTS * np.arange(PARTS * rows.size + 1)
+        return speeds(edges)[:-1].reshape(rows.size, PARTS, -1)
+
+    return at
 
 
-def averages(t: Times, omega: Speeds, channels: Columns, dt: float, *, held: bool) -> Resampled:
-    """Uniformly sampled rows, averaged to longer samples of length `dt` [s], from the first time on.
+def averages(t: Times, omega: Speeds, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
+    """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
 
     Each measurement becomes the mean over a sample around its time, or NaN if less than about half of it was measured.
     The first sample begins half of a row before the first row, so that samples of whole rows share none. Each rotor
@@ -92,16 +102,21 @@ def averages(t: Times, omega: Speeds, channels: Columns, dt: float, *, held: boo
     some, gaps = measured.any(axis=0), ~measured.all(axis=0)
     total = integral(Series(t - own / 2, np.where(measured, channels, 0.0)[:, some]))
     share = integral(Series(t - own / 2, measured[:, some & gaps].astype(float)))
-    samples = max(math.floor((t[-1] - t[0] + own) / dt + UNIFORM), 1)
-    edges = np.minimum(t[0] - own / 2 + dt * np.arange(samples + 1), t[-1] + own / 2)
-    grid = t[0] - own / 2 + dt * (np.arange(samples) + 0.5)
-    covered = np.repeat(np.diff(np.maximum(edges, t[0] - own / 2))[:, None], channels.shape[1], axis=1)
-    covered[:, some & gaps] = np.diff(share(edges), axis=0)
-    means = np.full((grid.size, channels.shape[1]), np.nan)
-    means[:, some] = np.diff(total(edges), axis=0)
-    # Below one half, because the samples at the ends have half of their rows.
-    means /= np.where(covered > 0.45 * dt, covered, np.nan)
-    return grid, root_mean_square(Series(t, omega), grid, linear=not held), means
+    speeds = root_mean_square(Series(t, omega), linear=not held)
+
+    def average(dt: float) -> Resampled:
+        samples = max(math.floor((t[-1] - t[0] + own) / dt + UNIFORM), 1)
+        edges = np.minimum(t[0] - own / 2 + dt * np.arange(samples + 1), t[-1] + own / 2)
+        grid = t[0] - own / 2 + dt * (np.arange(samples) + 0.5)
+        covered = np.repeat(np.diff(np.maximum(edges, t[0] - own / 2))[:, None], channels.shape[1], axis=1)
+        covered[:, some & gaps] = np.diff(share(edges), axis=0)
+        means = np.full((grid.size, channels.shape[1]), np.nan)
+        means[:, some] = np.diff(total(edges), axis=0)
+        # Below one half, because the samples at the ends have half of their rows.
+        means /= np.where(covered > 0.45 * dt, covered, np.nan)
+        return grid, speeds(grid), means
+
+    return average
 
 
 def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
@@ -173,7 +188,7 @@ def resample(t: Times, omega: Speeds, channels: Columns, dt: float, *, held: boo
             f"{int((ends[1] - ends[0]).sum())} samples in gaps {'hold' if held else 'interpolate'} the rotor speeds "
             "and count as not measured"
         )
-    speeds = root_mean_square(Series(t, omega), grid, linear=not held)
+    speeds = root_mean_square(Series(t, omega), linear=not held)(grid)
     return (grid, speeds, at_rows(grid, Series(t, channels), step=dt)), note
 
 

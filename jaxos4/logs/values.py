@@ -116,13 +116,19 @@ def without_impossible(
     return table._replace(columns=columns, impossible=impossible)
 
 
-Impossible = Mapping[str, tuple[int, float]]
-"""By channel, how many values are impossible, and the most extreme of them."""
-Clipped = Mapping[str, tuple[int, float, float]]
-"""By channel, how many values are stuck at the end of the range, their share, and the end."""
+class Plausible(NamedTuple):
+    """A recording in which faulty values count as not measured, and how many they are, by channel.
+
+    - `impossible`: by channel, how many values, and the most extreme of them.
+    - `clipped`: by channel, how many values are stuck at the end of the range, their share, and the end.
+    """
+
+    recording: Recording
+    impossible: Mapping[str, tuple[int, float]]
+    clipped: Mapping[str, tuple[int, float, float]]
 
 
-def plausible(recording: Recording) -> tuple[Recording, Impossible, Clipped]:
+def plausible(recording: Recording) -> Plausible:
     """Take out values that no sensor measured, by the other values of their channel. Rotors get the value before.
 
     A rotor's measured speed is taken out if it is `dropped`, too.
@@ -155,7 +161,7 @@ def plausible(recording: Recording) -> tuple[Recording, Impossible, Clipped]:
             if field not in cleaned:
                 cleaned[field] = logged.copy()
             cleaned[field].reshape(len(logged), -1)[:, place] = filled(column) if field == "omega" else column
-    return recording._replace(**cleaned) if cleaned else recording, impossible, clipped
+    return Plausible(recording._replace(**cleaned) if cleaned else recording, impossible, clipped)
 
 
 Samples = Float[np.ndarray, " samples"]

@@ -53,6 +53,19 @@ class Parameter(NamedTuple):
     contradiction: Contradiction | None = None
 
 
+class ByRecording(NamedTuple):
+    """The parameters of each of several recordings.
+
+    - `model`: the model of a single recording, the same for all.
+    - `places`: for each recording, the indices of the parameters of `model` among the parameters of all recordings.
+    - `number`: the recording of each sample, counted from 0 in order.
+    """
+
+    model: "AbstractModel"
+    places: Int[np.ndarray, "recordings parameters"]
+    number: Int[Numeric, " samples"]
+
+
 class AbstractModel(eqx.Module):
     """A quadrotor: a table of unknown parameters, a forcing, equations of motion and sensors.
 
@@ -112,14 +125,10 @@ class AbstractModel(eqx.Module):
         del forcing, parameters
         return tuple(jax.tree.leaves(state))
 
-    def by_recording(
-        self, stretch: Int[Numeric, " samples"] | None
-    ) -> "tuple[AbstractModel, Int[np.ndarray, 'recordings parameters'], Int[Numeric, ' samples']] | None":
-        """The parameters of each recording, if several in order have separate ones. `stretch`: see `Flight`.
+    def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> ByRecording | None:
+        """The model of one recording, if several in order have separate parameters. `stretch`: see `Flight`.
 
-        **Returns:** the model of a single recording, the same for all; for each recording, the indices of the
-        parameters of this model among the parameters of all recordings; and the recording of each sample, counted from
-        0 in order. `None`, the default: no recording has a parameter of its own.
+        `None`, the default: no recording has a parameter of its own.
         """
         del stretch
         return None

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from .._custom_types import Count, Numeric, Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
-from .abstract import PARAMETER_NAMES, AbstractModel, OfAirframe, Parameter
+from .abstract import PARAMETER_NAMES, AbstractModel, ByRecording, OfAirframe, Parameter
 from .os4 import CorrectedOS4
 from .rotors import Batch, Grid, measured_speeds, of_stretches, squared
 from .state import Forcing, Orientation, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
@@ -118,9 +118,7 @@ class FlightModel(AbstractModel):
         """Half the width of a bracket for each parameter: our choice, for small and large quadrotors."""
         return jnp.concatenate([self._rigid_body.half_width, self._of_terms(lambda parameter: parameter.half_width)])
 
-    def by_recording(
-        self, stretch: Int[Numeric, " samples"] | None
-    ) -> tuple[AbstractModel, Int[np.ndarray, "recordings parameters"], Int[Numeric, " samples"]] | None:
+    def by_recording(self, stretch: Int[Numeric, " samples"] | None) -> ByRecording | None:
         """See `AbstractModel`."""
         if stretch is None or max(self.recordings) == 0 or list(self.recordings) != sorted(self.recordings):
             return None
@@ -129,7 +127,7 @@ class FlightModel(AbstractModel):
             [names.index(name if name in names else f"{name}_{i + 1}") for name in one.parameter_names]
             for i in range(max(self.recordings) + 1)
         ]
-        return one, np.array(places), of_stretches(self.recordings, stretch)
+        return ByRecording(one, np.array(places), of_stretches(self.recordings, stretch))
 
     @property
     def gyroscopic_factor(self) -> Scalar:

@@ -175,7 +175,7 @@ def _pair(found: Float[np.ndarray, "delays pairs"]) -> int | None:
 
 def _response(flown: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
-    _, omega, rates = averages(flown.time, flown.omega, flown.states[:, RATES], step, held=flown.held)
+    _, omega, rates = averages(flown.time, flown.omega, flown.states[:, RATES], held=flown.held)(step)
     acceleration = np.diff(rates, axis=0) / step
     for i, axis in enumerate(excitation(flown).values()):
         if axis.verdict not in ("good", "weak"):

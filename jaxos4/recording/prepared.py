@@ -16,11 +16,12 @@ from ..logs import Recording
 from ..logs.table import counted
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
+from . import windows
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .sensor_errors import force_level, force_noise, vibrating_rates, without_noise
 from .stretches import Stretch, cut, end_of_tumble, nothing_usable
-from .windows import MOST, averaged, concatenate, fair_share, hold_out, whole_windows
+from .windows import averaged, concatenate, fair_share, hold_out, whole_windows
 
 HOLDOUT = 0.25
 """The share that is held out by default."""
@@ -233,9 +234,9 @@ def _usable(
     seconds, usable = (sum(each.length for each in every) for every in (chosen, parts))
     if seconds <= (1 - _SAME) * usable:
         notes.append(
-            f"{name}: {seconds:.1f} of {usable:.1f} usable s are fitted, because more than {MOST:,} samples take "
-            f"minutes: the {counted(len(chosen), 'part')} whose torques vary the most (a longer `sample_time` fits "
-            "more; `begin` and `end` choose another part)"
+            f"{name}: {seconds:.1f} of {usable:.1f} usable s are fitted, because more than {windows.MOST:,} samples "
+            f"take minutes: the {counted(len(chosen), 'part')} whose torques vary the most (a longer `sample_time` "
+            "fits more; `begin` and `end` choose another part)"
         )
     return [cut(recording, each) for each in chosen], notes
 

@@ -19,7 +19,7 @@ from ..logs import Recording, as_recording
 from ..logs.sampling import runs
 
 ON_GROUND, IDLE, LOST = "on the ground", "motors idle", "nothing was measured"
-_SATURATED = "rotors"  # this reason then names the rotors
+_SATURATED = "rotors"  # a placeholder: the final reason names the rotors
 
 Samples = Bool[np.ndarray, " samples"]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..flight import SIGNALS, Flight, Signal
 from ..logs import Recording, as_recording
@@ -82,15 +82,14 @@ def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
     A length that does not exceed the flight's own sample time leaves its samples as they are.
     """
     columns, found = flight.columns(), []
-    channels = np.column_stack([*columns.values()])
+    within = speeds_within(flight.time, flight.omega, held=flight.held)
+    average = averages(flight.time, flight.omega, np.column_stack([*columns.values()]), held=flight.held)
     for dt in steps:
         if dt <= flight.dt * (1 + _SAME):
-            within = speeds_within(flight.time, flight.omega, flight.time, flight.dt, held=flight.held)
-            found.append(flight._replace(within=within))
+            found.append(flight._replace(within=within(flight.time, flight.dt)))
             continue
-        time, omega, means = averages(flight.time, flight.omega, channels, dt, held=flight.held)
-        within = speeds_within(flight.time, flight.omega, time, dt, held=flight.held)
-        signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within}
+        time, omega, means = average(dt)
+        signals = signals_of(dict(zip(columns, means.T, strict=True))) | {"omega": omega, "within": within(time, dt)}
         # A mean of n instants has the same variance in time as a continuous mean over this shorter time.
         averaging_time = dt * math.sqrt(1 - (flight.dt / dt) ** 2)
         found.append(flight._replace(**signals, time=time, held=True, averaging_time=averaging_time))
@@ -171,6 +170,12 @@ def hold_out(
     if not held_out.any() or held_out.all():
         return recording, None
     measured = {name: getattr(recording, name) for name, signal in SIGNALS.items() if not signal.is_input}
-    fitted = {name: x if x is None else np.where(held_out[:, None], np.nan, x) for name, x in measured.items()}
-    tested = np.where(held_out[:, None], recording.states, np.nan)
-    return recording._replace(**fitted), recording._replace(states=tested)
+    fitted = {name: None if rows is None else _without(rows, held_out) for name, rows in measured.items()}
+    return recording._replace(**fitted), recording._replace(states=_without(recording.states, ~held_out))
+
+
+def _without(rows: np.ndarray, which: Bool[np.ndarray, " samples"]) -> np.ndarray:
+    """The rows of a signal, with NaN in the samples `which`."""
+    kept = rows.copy()
+    kept[which] = np.nan
+    return kept

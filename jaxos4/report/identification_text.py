@@ -23,7 +23,6 @@ from ..identification.verdict import (
 )
 from .text import DASH, Listing, plain, say
 
-_LATE = 0.005  # s; a `rotor_delay` below minus this means that motors are recorded late
 _WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
@@ -93,10 +92,8 @@ def warning_lines(found: Identification) -> list[str]:
 
 def notes_of(found: Identification) -> list[str]:
     """The notes on the data, and the clock of the motors if it is not the gyro's."""
-    notes, delay = list(found.provenance.notes), found.parameters.get("rotor_delay")
-    if delay is not None and delay.estimate is not None and delay.estimate <= -_LATE:
-        notes.append(f"motors are recorded {-1e3 * delay.estimate:.0f} ms late (rotor_delay)")
-    return notes
+    clock = [f"{found.motor_clock} (rotor_delay)"] if found.motor_clock else []
+    return [*found.provenance.notes, *clock]
 
 
 def _failure(found: Identification) -> Lines:
@@ -170,13 +167,13 @@ def _fit(found: OS4Identification) -> Lines:
 
 def why_no_value(row: Constant) -> str:
     """Why a constant of a rigid body is not among the physical quantities."""
-    return "below noise" if abs(row.estimate) <= row.half_width else "impossible"
+    return "below noise" if abs(row.estimate) <= row.margin else "impossible"
 
 
 def _inertias(found: Identification) -> Lines:
     body = found.rigid_body
     inertias = [
-        f"{name} {row.estimate:.4g} +- {row.half_width:.2g}{f' ({row.note})' if row.note else ''}"
+        f"{name} {row.estimate:.4g} +- {row.margin:.2g}{f' ({row.note})' if row.note else ''}"
         if name in possible(body)
         else f"{name} {why_no_value(row)}"
         for name, row in body.constants.items()

@@ -155,7 +155,7 @@ class Parts(NamedTuple):
 class LocalModel(NamedTuple):
     """The quadratic model of a cost around some unknowns, for one window or with the windows as first axis.
 
-    - `cost`, `feasible`: as `shooting.scans.shoot` returns them.
+    - `cost`: of the samples before the trajectory fails. `feasible`: whether it does not fail.
     - `gradient`, `information`: in the parameters, and then in a free initial state. The information is the Fisher
       information, J^T W^2 J for a shot.
     - `parts`: only of a likelihood whose parts are compared.

@@ -26,6 +26,7 @@ from .gains import (
     LogNoise,
     PerSegment,
     Series,
+    Step,
     basis,
     by_inputs,
     feedback_slopes,
@@ -95,11 +96,35 @@ class Segmented(NamedTuple):
 # predict; and their disturbances.
 Estimates = tuple[tuple[PerSegment, ...], tuple[PerSegment, ...]]
 
-# The unknowns at which a flight is filtered, common to all segments or of each segment: the parameters; the noise; the
-# feedthroughs, by which input innovations explain the innovations of the same samples; feedthroughs that were found
-# before, so that the innovations that they explain count as noise; and the gains of input innovations.
-OfChannels = tuple[Float[Array, "channels ..."], ...]
-Point = tuple[Float[Array, "parameters ..."], LogNoise, OfChannels, OfChannels, InputGains]
+
+class Point(NamedTuple):
+    """The unknowns at which a flight is filtered.
+
+    - `parameters`: common to all segments, or of each segment.
+    - `feedthrough`: the coefficients by which input innovations explain the innovations of the same samples.
+    - `noise_feedthrough`: feedthroughs that were found before; the innovations that they explain count as noise.
+    - `input_gains`: the gains of input innovations.
+    """
+
+    parameters: Float[Array, "parameters *segments"]
+    noise: LogNoise
+    feedthrough: tuple[Float[Array, " channels *segments"], ...]
+    noise_feedthrough: tuple[Float[Array, " channels *segments"], ...]
+    input_gains: InputGains
+
+
+class _Row(NamedTuple):
+    """One sample of all segments.
+
+    - `measured`: 0 for a missing measurement. `inputs`: the input innovations, 0 where nothing was measured.
+    - `restart`, `restart_next`: whether the filter of a segment restarts before this sample, or before the next.
+    """
+
+    measured: Channels
+    is_measured: Bool[Array, "channels segments"]
+    inputs: Float[Array, "feedthroughs channels segments"]
+    restart: Bool[Array, " segments"]
+    restart_next: Bool[Array, " segments"]
 
 
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
@@ -135,9 +160,6 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         same = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else jnp.repeat(leaf[:, None], segments, 1), same)
         return lanes_before_last(one, same)
 
-    def of_each_segment(one: Any, same: Any) -> Any:
-        return eqx.combine(jax.tree.map(repeated, one), same)
-
     own = jax.tree.map(repeated, moving)
 
     def each(which: int) -> Callable:
@@ -147,9 +169,10 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         return function
 
     rows = fixed_flight.rows if flight.rows is None else flight.rows.max()  # surplus rows of shorter lanes do not count
-    series = lanes_before_last(flight[:7], fixed_flight[:7])
-    dt, window = (of_each_segment(*pair) for pair in zip(flight[8:], fixed_flight[8:], strict=True))
-    flight = Segmented(*series, rows=rows, dt=dt, window=window)
+    series = lanes_before_last(*(part._replace(rows=None, dt=None, window=None) for part in (flight, fixed_flight)))
+    own_step, fixed_step = (flight.dt, flight.window), (fixed_flight.dt, fixed_flight.window)
+    dt, window = eqx.combine(jax.tree.map(repeated, own_step), fixed_step)
+    flight = series._replace(rows=rows, dt=dt, window=window)
     functions = each(0), each(1), each(2)
     found = _filter(functions, positions, flight, in_each_segment(at, fixed_at))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
@@ -157,62 +180,56 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
 
 def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """The innovations of one flight."""
-    own = None if at[0].ndim == 1 else 0
+    own = None if at.parameters.ndim == 1 else 0
     move, average, observe = (jax.vmap(function, in_axes=(0, 0, own)) for function in functions)
     return _filter((move, average, observe), positions, flight, at)
 
 
 def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
     """See `innovate`. `functions` act on all segments. Arrays in `at` may have segments as last axis."""
-    measured, restart, counts, known, inputs, forcing, forcing_tangents, rows, dt, window = flight
-    parameters, noise, feedthrough, noise_feedthrough, input_gains = at
-    (count, *own), (time, channels, segments) = parameters.shape, measured.shape
-    driving = count + len(jax.tree.leaves((noise, input_gains)))  # the unknowns that change the estimates
-    unknowns, levels = driving + len(feedthrough), slice(count, count + len(jax.tree.leaves(noise)))
-    scalars, units = tuple(parameters), tuple(np.eye(count, driving, dtype=parameters.dtype))
-    places = np.asarray(positions, int)
-    step, push = jax.linearize(lambda noise: step_of(noise, dt, window), noise)
-    steps = step, jax.vmap(push)(basis(noise))
-    covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
-    zero = jnp.zeros(segments, dtype=float)
-    start = (zero,) * RATE_COUNT if known is None else known
-    estimates = _emptied(((*start, *(zero,) * (channels - RATE_COUNT)), (zero,) * channels), restart[0])
+    (count, *own), (time, channels, segments) = at.parameters.shape, flight.measured.shape
+    driving = count + len(jax.tree.leaves((at.noise, at.input_gains)))  # the unknowns that change the estimates
+    unknowns, levels = driving + len(at.feedthrough), slice(count, count + len(jax.tree.leaves(at.noise)))
+    scalars, units = tuple(at.parameters), tuple(np.eye(count, driving, dtype=at.parameters.dtype))
+    places, (steps, first) = np.asarray(positions, int), _start(flight, at.noise, driving)
     shapes = (channels, unknowns), (channels, unknowns, unknowns), (channels, LAGS + 1)
-    nothing = zero, *(jnp.zeros((*shape, segments), dtype=float) for shape in shapes)
-    no_slopes = jax.tree.map(lambda _: jnp.zeros((driving, segments), dtype=float), estimates)
-    # Covariance and estimates have derivatives beside them, on the first axis: in the noise, and in `driving` unknowns.
-    first = (covariance, jax.vmap(push)(steps[1])), (estimates, no_slopes), jnp.ones(segments, dtype=bool)
-    missing, restart_next = jnp.isnan(measured), jnp.roll(restart, -1, axis=0)
-    known_rows = jnp.where(missing, 0.0, measured), ~missing, jnp.where(missing[:, None], 0.0, inputs)
-    data = (*known_rows, restart, restart_next), counts, forcing, forcing_tangents
+    nothing = tuple(jnp.zeros((*shape, segments), dtype=float) for shape in ((), *shapes))
+    missing = jnp.isnan(flight.measured)
+    row = _Row(
+        measured=jnp.where(missing, 0.0, flight.measured),
+        is_measured=~missing,
+        inputs=jnp.where(missing[:, None], 0.0, flight.inputs),
+        restart=flight.restart,
+        restart_next=jnp.roll(flight.restart, -1, axis=0),
+    )
+    data = row, flight.counts, flight.forcing, flight.forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
     def sample(carry, rows):
         """The filters one sample later, and the innovations of this sample with their derivatives."""
         (covariance, by_noise), (estimates, slopes), feasible = carry
-        forcing, tangents, (measured, is_measured, inputs, restart, restart_next) = rows
+        forcing, tangents, row = rows
         for x in estimates[0][:RATE_COUNT]:
             feasible = feasible & (jnp.abs(x) < FASTEST)
         (covariance, gains), push = jax.linearize(
-            lambda p, step: next_gains(p, step, is_measured, restart), covariance, steps[0]
+            lambda p, step: next_gains(p, step, row.is_measured, row.restart), covariance, steps[0]
         )
         by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
-        feedback = Feedback.of(gains, steps[0], input_gains)
+        feedback = Feedback.of(gains, steps[0], at.input_gains)
         # The noise acts only through the feedback, and the parameters do not act on the feedback.
-        by_unknowns = feedback_slopes(gain_slopes, steps[1], input_gains, count)
+        by_unknowns = feedback_slopes(gain_slopes, steps[1], at.input_gains, count)
 
         def filtered(estimates: Estimates, feedback: Feedback, scalars: tuple, forcing: Forcing = forcing):
-            after, errors = _advance(functions, estimates, forcing, scalars, feedback, measured, inputs, feasible)
-            return _emptied(after, restart_next), errors
+            return _advance(functions, estimates, forcing, scalars, feedback, row, feasible)
 
         def pushed(slopes: Estimates, feedback: Feedback, units: tuple, *others: Any) -> Any:
             return push(slopes, feedback, tuple(jnp.broadcast_to(unit, tuple(own)) for unit in units), *others)
 
-        at, directions = (estimates, feedback, scalars), (slopes, by_unknowns, units)
+        before, directions = (estimates, feedback, scalars), (slopes, by_unknowns, units)
         if tangents is not None:
             wide = jax.tree.map(lambda t: jnp.zeros((driving, segments), dtype=float).at[places].set(t), tangents)
-            at, directions = (*at, forcing), (*directions, wide)
-        (estimates, errors), push = jax.linearize(filtered, *at)
+            before, directions = (*before, forcing), (*directions, wide)
+        (estimates, errors), push = jax.linearize(filtered, *before)
         slopes, by_errors = jax.vmap(pushed)(*directions)  # pyright: ignore[reportArgumentType]
         found = tuple(map(jnp.stack, (errors, by_errors))), gains.variance, gain_slopes.variance
         return ((covariance, by_noise), (estimates, slopes), feasible), found
@@ -221,21 +238,38 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         """The filters after some more rows, the last standardised innovations, and the sums of the likelihood."""
         filters, last, sums = carry
         row, counts, forcing, tangents = jax.tree.map(lambda leaf: leaf[i], blocks)
-        _, is_measured, inputs, *_ = row
         filters, found = jax.lax.scan(sample, filters, (forcing, tangents, row))
         (errors, slopes), variance, variance_slopes = found
-        counts = is_measured & counts[:, None]
+        counts = row.is_measured & counts[:, None]
         # Known feedthroughs explain a part of the innovations that counts as noise; the others are estimated.
-        both = feedthrough, noise_feedthrough
-        explained, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(each, inputs) for each in both)
-        errors, slopes = errors - explained, jnp.concatenate([slopes, -jnp.moveaxis(inputs, 2, 1)], axis=2)
+        both = at.feedthrough, at.noise_feedthrough
+        explained, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(each, row.inputs) for each in both)
+        errors, slopes = errors - explained, jnp.concatenate([slopes, -jnp.moveaxis(row.inputs, 2, 1)], axis=2)
         squares = jnp.square(as_noise)
         found, last = _likelihood(counts, variance, variance_slopes, last, errors, slopes, squares, levels)
         return filters, last, jax.tree.map(jnp.add, sums, found)
 
     begin = first, jnp.zeros((LAGS, channels, segments), dtype=float), nothing
-    (*_, feasible), _, (cost, *sums) = jax.lax.fori_loop(0, -(-rows // BLOCK), block, begin)
+    (*_, feasible), _, (cost, *sums) = jax.lax.fori_loop(0, -(-flight.rows // BLOCK), block, begin)
     return Innovations(cost, feasible, *sums)
+
+
+def _start(flight: Segmented, noise: LogNoise, driving: int) -> tuple[tuple[Step, Step], tuple]:
+    """The disturbance over a sample with its derivatives in the noise, and the filters before the first sample.
+
+    The filters are covariance, estimates, and which segments are feasible. The covariance stands with its derivatives
+    in the noise, the estimates with theirs in the `driving` unknowns; derivatives are on the first axis.
+    """
+    _, channels, segments = flight.measured.shape
+    step, push = jax.linearize(lambda noise: step_of(noise, flight.dt, flight.window), noise)
+    steps = step, jax.vmap(push)(basis(noise))
+    covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
+    zero = jnp.zeros(segments, dtype=float)
+    start = (zero,) * RATE_COUNT if flight.known is None else flight.known
+    estimates = _emptied(((*start, *(zero,) * (channels - RATE_COUNT)), (zero,) * channels), flight.restart[0])
+    no_slopes = jax.tree.map(lambda _: jnp.zeros((driving, segments), dtype=float), estimates)
+    filters = (covariance, jax.vmap(push)(steps[1])), (estimates, no_slopes), jnp.ones(segments, dtype=bool)
+    return steps, filters
 
 
 def _advance(
@@ -244,14 +278,12 @@ def _advance(
     forcing: Forcing,
     scalars: Scalars,
     feedback: Feedback,
-    measured: Channels,
-    inputs: Float[Array, "feedthroughs channels segments"],
+    row: _Row,
     going: Bool[Array, " segments"],
 ) -> tuple[Estimates, tuple[PerSegment, ...]]:
     """The estimates one sample later, and the innovations of this sample. `going`: the segments that have not diverged.
 
-    `measured`, `inputs`: 0 where nothing was measured. Innovations, rates and their derivatives are computed once,
-    although several results need them.
+    Innovations, rates and their derivatives are computed once, although several results need them.
     """
     move, average, observe = functions
     before, disturbance = estimates
@@ -263,19 +295,19 @@ def _advance(
         outputs = observe(State(rates), forcing, scalars)
         forces = zip(outputs, feedback.driven_seen, before, seen, strict=True)
         outputs = (*outputs[:RATE_COUNT], *(h + share * x + a for h, share, x, a in [*forces][RATE_COUNT:]))
-        return tuple(z - h for z, h in zip(measured, outputs, strict=True))
+        return tuple(z - h for z, h in zip(row.measured, outputs, strict=True))
 
     errors = computed_once(going, compared)
     # A missing measurement has a gain of 0.
     driven = tuple(x + gain * e for x, gain, e in zip(before, feedback.driven, errors, strict=True))
     rates = computed_once(going, lambda: move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates)
     driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
-    added = tuple(by_inputs(gains, inputs) for gains in feedback.input_gains)
+    added = tuple(by_inputs(gains, row.inputs) for gains in feedback.input_gains)
     later = zip(driven, feedback.reach, disturbance, feedback.driven_later, errors, added[0], strict=True)
     driven = tuple(x + a * d + gain * e + v for x, a, d, gain, e, v in later)
     faded = zip(feedback.kept, disturbance, feedback.disturbance_later, errors, added[1], strict=True)
     disturbance = tuple(share * d + gain * e + v for share, d, gain, e, v in faded)
-    return (driven, disturbance), errors
+    return _emptied((driven, disturbance), row.restart_next), errors
 
 
 def _emptied(estimates: Estimates, where: Bool[Array, " segments"]) -> Estimates:

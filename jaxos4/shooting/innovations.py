@@ -22,11 +22,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._custom_types import Count, Numeric, Parameters, as_float
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, Flight
-from ..models.abstract import AbstractModel
+from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
-from .filters import LAGS, Innovations, Segmented, innovate
+from .filters import LAGS, Innovations, Point, Segmented, innovate
 from .gains import INSTANT, LogNoise
 from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, joined, levels, own_names, placed, with_noise
@@ -94,8 +94,8 @@ class InnovationsProblem(AbstractProblem):
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
         self.problem, self.segments, self.settling = problem.restrict("rates"), segments, settling
         each = self._by_recording
-        if each is not None and segments <= len(each[1]):
-            raise ValueError(f"`segments` must be more than the {len(each[1])} recordings, got {segments}.")
+        if each is not None and segments <= len(each.places):
+            raise ValueError(f"`segments` must be more than the {len(each.places)} recordings, got {segments}.")
         # Always an array, so that all starts share one program.
         channels, samples = self.problem.columns.size, problem.flight.time.shape[-1]
         nothing = np.zeros((samples, 0, channels))
@@ -137,9 +137,8 @@ class InnovationsProblem(AbstractProblem):
         capacity, length, each = self.flight.time.shape[0], self.problem.length, self._by_recording
         begins = np.zeros(1, int)
         if each is not None:
-            _, places, number = each
-            numpy = np if isinstance(number, np.ndarray) else jnp
-            begins = numpy.searchsorted(number, np.arange(len(places)))
+            numpy = np if isinstance(each.number, np.ndarray) else jnp
+            begins = numpy.searchsorted(each.number, np.arange(len(each.places)))
         if isinstance(length, Tracer) or isinstance(begins, jax.Array):
             edges = jnp.append(jnp.asarray(begins), capacity if length is None else length)
         else:  # known numbers need no compiled program
@@ -147,8 +146,7 @@ class InnovationsProblem(AbstractProblem):
         return Segments.of(self.segments, capacity, edges, self.settling)
 
     @property
-    def _by_recording(self):
-        """See `AbstractModel.by_recording`."""
+    def _by_recording(self) -> ByRecording | None:
         stretch = self.flight.stretch
         is_known = stretch is not None and not isinstance(stretch, Tracer)
         return self.model.by_recording(np.asarray(stretch) if is_known else stretch)
@@ -247,9 +245,8 @@ class InnovationsProblem(AbstractProblem):
         count, free = self.problem.unknowns.count, unknowns.free
         both, places = free & free[:, None], None
         if (each := self._by_recording) is not None:  # indices of each segment's unknowns
-            _, own, _ = each
             others = np.broadcast_to(np.arange(count, free.size), (self.segments, free.size - count))
-            places = jnp.concatenate([jnp.asarray(own)[self.segmentation.recording], others], axis=1)
+            places = jnp.concatenate([jnp.asarray(each.places)[self.segmentation.recording], others], axis=1)
 
         def at(noise_feedthrough: Float[Array, "channels feedthroughs"], row: WindowUnknowns) -> LocalModel:
             values = row[0]
@@ -293,23 +290,23 @@ class InnovationsProblem(AbstractProblem):
         problem, forced, each = self.problem, self._forced(), self._by_recording
         places = None
         if each is not None:
-            one, places, _ = each
-            problem = dataclasses.replace(problem, model=one)
-            places = jnp.asarray(places)[self.segmentation.recording].T
+            problem = dataclasses.replace(problem, model=each.model)
+            places = jnp.asarray(each.places)[self.segmentation.recording].T
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
-        flight, window = self.flight, INSTANT
-        if flight.within is not None:  # measurements are means
-            window = (flight.dt - flight.averaging_time) / 2, flight.averaging_time
-        fixed = self.segmentation.rows, flight.dt, window
+        rows, dt, window = self.segmentation.rows, self.flight.dt, INSTANT
+        if self.flight.within is not None:  # measurements are means
+            window = (dt - self.flight.averaging_time) / 2, self.flight.averaging_time
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
         def at(parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array) -> Innovations:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
-            flight = Segmented(*observed, inputs, forcing, tangents, *fixed)
+            flight = Segmented(
+                **observed, inputs=inputs, forcing=forcing, forcing_tangents=tangents, rows=rows, dt=dt, window=window
+            )
             driven, disturbance, feedthrough = (tuple(each.T) for each in input_unknowns)
-            point = own, noise, feedthrough, tuple(noise_feedthrough.T), (driven, disturbance)
+            point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), (driven, disturbance))
             return innovate(functions, model.forcing_parameters, flight, point)
 
         return at

@@ -85,15 +85,8 @@ class Segments(NamedTuple):
         return cls(place, owned, rows if isinstance(rows, jax.Array) else int(rows), recording)
 
 
-def observe_in_segments(
-    problem: "InnovationsProblem",
-) -> tuple[
-    Float[Array, "time channels segments"],
-    Bool[Array, "time segments"],
-    Bool[Array, "time segments"],
-    Float[Array, "3 segments"] | None,
-]:
-    """The first four fields of `Segmented`: measurements, where filters restart, what counts, and known rates.
+def observe_in_segments(problem: "InnovationsProblem") -> dict[str, Any]:
+    """The fields `measured`, `restart`, `counts` and `known` of `Segmented`.
 
     A filter restarts in a gap, and where a stretch begins. Its innovations do not count until it has settled. Only a
     flight without stretches counts from its first sample, because a simulation begins at rest.
@@ -113,9 +106,10 @@ def observe_in_segments(
         begins = begins & ~is_first
         rates = initial_state[CASCADE_ORDER[: CHANNELS["rates"]]]
         known = jnp.where(is_first, rates[:, None], 0.0)
-    restarts = in_segments(restart) | begins | ~exists
+    restart = in_segments(restart) | begins | ~exists
     measured = jnp.where(exists[:, None], in_segments(measured), jnp.nan)
-    return measured, restarts, in_segments(settled) & segments.owned.T, known
+    counts = in_segments(settled) & segments.owned.T
+    return {"measured": measured, "restart": restart, "counts": counts, "known": known}
 
 
 def _restarts(

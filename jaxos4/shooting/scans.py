@@ -142,10 +142,23 @@ def shot_with_derivatives(
     return with_batch(alone, together, problem.advance, length, problem.weights)
 
 
-# A linearised shot up to some sample: its state; the tangents of the unknowns that act on rates or attitude, and of the
-# late ones, which act on the translation alone; its cost, and whether it is feasible; its gradient in both kinds of
-# unknowns; and its information, in panels of rows, each with the columns of both kinds up to its diagonal block.
-_Carry = tuple[State, State, Translation | None, Lanes, Bool[Array, "*lanes"], list[Array], list[list[Array]]]
+class _Carried(NamedTuple):
+    """A linearised shot up to some sample.
+
+    - `late`: the tangents of the unknowns that act on the translation alone. `tangent`: those of all other unknowns.
+    - `cost`, `feasible`: see `shoot`.
+    - `gradient`: in the unknowns of `tangent`, and then of `late`.
+    - `information`: in panels of rows, each in the columns of `tangent`, and then of `late`. Columns to the right of
+      the rows' diagonal block are left out.
+    """
+
+    state: State
+    tangent: State
+    late: Translation | None
+    cost: Lanes
+    feasible: Bool[Array, "*lanes"]
+    gradient: list[Array]
+    information: list[list[Array]]
 
 
 def _linearised_shot(
@@ -173,35 +186,19 @@ def _linearised_shot(
     # NumPy, so that they are constants of the program.
     parameter_tangents = tuple(np.eye(count, first_late, dtype=parameters.dtype))
 
-    def step(i: Count, carry: _Carry) -> _Carry:
-        state, tangent, late, cost, feasible, gradient, information = carry
+    def step(i: Count, carry: _Carried) -> _Carried:
         row = jax.tree.map(lambda leaf: leaf[i], rows)
-        feasible = feasible & _is_feasible(state)
+        feasible = carry.feasible & _is_feasible(carry.state)
         # After a failure the state is 0, so that no derivative overflows.
-        state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), state)
+        state = jax.tree.map(lambda x: jnp.where(feasible, x, 0.0), carry.state)
         forcing = jax.tree.map(along_lanes, row.forcing)
-
-        def sample() -> tuple[State, Callable, Callable | None, Lanes, list[Lanes], list[Lanes]]:
-            """The next state, its derivatives in all and in the translation, cost, weighted errors, squared weights."""
-            if row.forcing_tangents is None:
-                linear = jax.linearize(functools.partial(advance, forcing), state, scalars)
-            else:
-                linear = jax.linearize(advance, forcing, state, scalars)
-            (following, predicted), push = linear
-            errors = _errors(row, predicted, weights, feasible)
-            known = [jnp.where(jnp.isnan(y) | ~feasible, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
-            pull = [w * e for w, e in zip(known, errors, strict=True)]
-            push_late = None
-            if late is not None:
-                _, push_late = jax.linearize(
-                    lambda t: advance(forcing, state._replace(translation=t), scalars), state.translation
-                )
-            return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 
         # If only the rates are simulated, repeating them is cheaper.
         repeated = not lanes or state.attitude is None
-        following, push, push_late, more, pull, squares = sample() if repeated else computed_once(feasible, sample)
-        directions = [tangent, parameter_tangents]
+        at, late = (forcing, state, scalars), carry.late
+        sample = functools.partial(_linearised_sample, advance, row, at, weights, feasible, late is not None)
+        following, push, push_late, cost, pull, squares = sample() if repeated else computed_once(feasible, sample)
+        directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
             nothing, positions = jnp.zeros((first_late, *lanes), parameters.dtype), np.asarray(forcing_parameters)
             wide = jax.tree.map(lambda slope: nothing.at[positions].set(slope), row.forcing_tangents)
@@ -215,21 +212,21 @@ def _linearised_shot(
             moved, of_late = jax.vmap(push_late)(late)
             late, slopes = moved.translation, [*slopes, of_late]
 
-        gradient = [g - sum(map(operator.mul, pull, s)) for g, s in zip(gradient, slopes, strict=True)]
+        gradient = [g - sum(map(operator.mul, pull, s)) for g, s in zip(carry.gradient, slopes, strict=True)]
         information = [
             _added(blocks, panel, first_late, squares, slopes)
-            for panel, blocks in zip(panels, information, strict=True)
+            for panel, blocks in zip(panels, carry.information, strict=True)
         ]
-        return following, tangent, late, cost + more, feasible, gradient, information
+        return _Carried(following, tangent, late, carry.cost + cost, feasible, gradient, information)
 
     samples = rows.forcing.roll.shape[0] if length is None else length
     first = _before(initial_state, count, first_late, panels)
-    *_, cost, feasible, gradient, information = jax.lax.fori_loop(0, samples, step, first)
-    whole = symmetric(tuple(jnp.concatenate(blocks, axis=1) for blocks in information))
-    return LocalModel(cost, feasible, jnp.concatenate(gradient), whole)
+    last = jax.lax.fori_loop(0, samples, step, first)
+    information = symmetric(tuple(jnp.concatenate(blocks, axis=1) for blocks in last.information))
+    return LocalModel(last.cost, last.feasible, jnp.concatenate(last.gradient), information)
 
 
-def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: int, panels: list[Panel]) -> _Carry:
+def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: int, panels: list[Panel]) -> _Carried:
     """The carry before the first sample, for `count` parameters. The unknowns before `first_late` have a `tangent`."""
     (size, *lanes), unknowns, dtype = initial_state.shape, panels[-1][1], initial_state.dtype
     own = np.eye(size, unknowns, count, dtype=dtype).reshape(size, unknowns, *(1 for _ in lanes))
@@ -241,14 +238,14 @@ def _before(initial_state: Float[Array, "size *lanes"], count: int, first_late: 
     def blocks(top: int, end: int) -> list[Array]:
         return [zeros(end - top, width) for width in ([end] if top < first_late else [first_late, end - first_late])]
 
-    return (
-        unstack(initial_state),
-        unstack(tangents[:, :first_late]),
-        unstack(tangents[:, first_late:]).translation if first_late < unknowns else None,
-        zeros(),
-        jnp.ones(tuple(lanes), dtype=bool),
-        [zeros(width) for width in (first_late, unknowns - first_late) if width],
-        [blocks(top, end) for top, end, _ in panels],
+    return _Carried(
+        state=unstack(initial_state),
+        tangent=unstack(tangents[:, :first_late]),
+        late=unstack(tangents[:, first_late:]).translation if first_late < unknowns else None,
+        cost=zeros(),
+        feasible=jnp.ones(tuple(lanes), dtype=bool),
+        gradient=[zeros(width) for width in (first_late, unknowns - first_late) if width],
+        information=[blocks(top, end) for top, end, _ in panels],
     )
 
 
@@ -260,6 +257,35 @@ def _added(
     own = slice(top - first_late * late, end - first_late * late)
     rows = [(i, (squares[i] * slopes[late][i][own])[:, None]) for i in outputs]
     return [b + sum(row * s[i][: b.shape[1]] for i, row in rows) for b, s in zip(blocks, slopes, strict=False)]
+
+
+def _linearised_sample(
+    advance: Advance,
+    row: Rows,
+    at: tuple[Forcing, State, tuple[Lanes, ...]],
+    weights: tuple[Lanes, ...],
+    feasible: Bool[Array, "*lanes"],
+    has_late: bool,
+) -> tuple[State, Callable, Callable | None, Lanes, list[Lanes], list[Lanes]]:
+    """The next state, the derivative of `advance`, the cost, and the weighted errors and squared weights.
+
+    The second derivative is in the translation alone; `None` unless `has_late`.
+    """
+    forcing, state, scalars = at
+    if row.forcing_tangents is None:
+        linear = jax.linearize(functools.partial(advance, forcing), state, scalars)
+    else:
+        linear = jax.linearize(advance, forcing, state, scalars)
+    (following, predicted), push = linear
+    errors = _errors(row, predicted, weights, feasible)
+    known = [jnp.where(jnp.isnan(y) | ~feasible, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
+    pull = [w * e for w, e in zip(known, errors, strict=True)]
+    push_late = None
+    if has_late:
+        _, push_late = jax.linearize(
+            lambda t: advance(forcing, state._replace(translation=t), scalars), state.translation
+        )
+    return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 
 
 def _is_feasible(state: State) -> Bool[Array, " *lanes"]:

@@ -165,9 +165,8 @@ def roofline(case: Case, *, size: int = 1024, stream: int = 1 << 24) -> Callable
     XLA counts the operations and bytes of one step of `LANES` shots: state and parameters are read, and the next state
     is written. Inside of a scan the state stays in registers and caches, so that the bytes are an upper limit.
     """
-    from experiments.speed.run import (
-        timed,
-    )  # with all that prints tables, which no other contender's memory should hold
+    # Imported here: it loads all that prints tables, which the memory of no other contender should hold.
+    from experiments.speed.run import timed
 
     problem = problem_of(case)
     rows = jax.tree.map(lambda leaf: leaf[0, 0], problem.rows())

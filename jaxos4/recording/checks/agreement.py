@@ -70,10 +70,10 @@ def wrong_scale(evidence: Evidence) -> Finding | None:
 def _gyro_or_time(evidence: Evidence, scale: float) -> str:
     """The cause if the attitude is right: the gyro or the time stamps. A measured velocity tells them apart."""
     if evidence.velocity is not None:
-        slope, unlike = float(evidence.velocity[0, 0]), VELOCITY_ERROR
-        if abs(slope / scale - 1) < unlike < abs(slope - 1):
+        (slope, _), _ = evidence.velocity
+        if abs(slope / scale - 1) < VELOCITY_ERROR < abs(slope - 1):
             return "the time stamps are wrong, as the velocity changes by as much"
-        if abs(slope - 1) < unlike < abs(slope / scale - 1):
+        if abs(slope - 1) < VELOCITY_ERROR < abs(slope / scale - 1):
             return "the gyro's scale is wrong"
     return "the gyro's scale or the time stamps are wrong"
 
@@ -83,7 +83,8 @@ def wrong_axes(evidence: Evidence) -> Finding | None:
     turns = evidence.turns
     if turns is None:
         return None
-    matrix, error = turns.matrix[0], STANDARD_ERRORS * turns.matrix[1]
+    matrix, errors = turns.matrix
+    error = STANDARD_ERRORS * errors
     opposite = [axis for axis, m, e in zip(MOTIONS, np.diagonal(matrix), np.diagonal(error), strict=True) if m + e < 0]
     tilts = matrix[:2, :2]
     follows = float(turns.explained[:2].max())
@@ -168,19 +169,19 @@ def _delays(evidence: Evidence) -> tuple[list[tuple[tuple[int, int, int, int], f
         delays.append(((-1, 0, 1, 0), late, math.hypot(error, FILTERS)))
         differ |= abs(late) > max(LATE_ATTITUDE, STANDARD_ERRORS * error)
     if response is not None and response.explained[:2].max() > EXPLAINED[0]:
-        gyro, _, between = response.delays.T.tolist()
+        (gyro, gyro_error), _, (between, between_error) = response.delays.T.tolist()
         answered = ANSWERED * (1 - float(response.explained[:2].mean()))
-        late, usual = _beyond(gyro[0], answered), DAMPING
+        late, usual = _beyond(gyro, answered), DAMPING
         if response.lag:  # commands: the rotors' own lag and delay are unknown
-            late, usual = gyro[0] + response.lag - USUAL_LAG, LAGS
-        delays.append(((1, 0, 0, -1), late, math.hypot(gyro[1], usual)))
-        before = min(gyro[0] + response.lag, 0.0) if response.lag else late
-        differ |= abs(before) > max(LATE, STANDARD_ERRORS * gyro[1])
-        felt = response.explained[2] > EXPLAINED[1] and math.isfinite(between[1])
+            late, usual = gyro + response.lag - USUAL_LAG, LAGS
+        delays.append(((1, 0, 0, -1), late, math.hypot(gyro_error, usual)))
+        before = min(gyro + response.lag, 0.0) if response.lag else late
+        differ |= abs(before) > max(LATE, STANDARD_ERRORS * gyro_error)
+        felt = response.explained[2] > EXPLAINED[1] and math.isfinite(between_error)
         if felt and not tilted_force(evidence):  # the force along another axis is not the thrust's
-            late, error = _beyond(between[0], answered + DAMPING), between[1]
-            delays.append(((1, -1, 0, 0), late, math.hypot(error, DAMPING)))
-            differ |= abs(late) > max(DELAY, STANDARD_ERRORS * error)
+            late = _beyond(between, answered + DAMPING)
+            delays.append(((1, -1, 0, 0), late, math.hypot(between_error, DAMPING)))
+            differ |= abs(late) > max(DELAY, STANDARD_ERRORS * between_error)
     return delays, differ
 
 
@@ -194,13 +195,13 @@ def velocity_axes(evidence: Evidence) -> Finding | None:
 
     A fault of the attitude, the force or a clock makes the velocity differ too.
     """
-    slopes = evidence.velocity
-    if slopes is None:
+    if evidence.velocity is None:
         return None
-    (along, across), errors = slopes[0], STANDARD_ERRORS * slopes[1]
+    (along, across), errors = evidence.velocity
+    limits = STANDARD_ERRORS * errors
     angle, scale = math.atan2(across, along), math.hypot(along, across)
-    turned = abs(angle) > ANGLE and abs(across) > errors[1] and scale > errors.max()
-    if not turned and abs(scale - 1) <= max(VELOCITY_ERROR, errors[0]):
+    turned = abs(angle) > ANGLE and abs(across) > limits[1] and scale > limits.max()
+    if not turned and abs(scale - 1) <= max(VELOCITY_ERROR, limits[0]):
         return None
     if any(check(evidence) for check in (wrong_scale, earth_axes, sensor_clocks)):
         return None
@@ -209,7 +210,7 @@ def velocity_axes(evidence: Evidence) -> Finding | None:
         cause = (
             "velocity and attitude have other horizontal axes: one of them is turned about the vertical, or has z down"
         )
-    elif scale > errors.max():
+    elif scale > limits.max():
         cause = "the velocity does not change as much as specific force and attitude say: one of them has a wrong unit"
     return Finding(
         "velocity_axes",

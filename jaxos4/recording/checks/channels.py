@@ -37,7 +37,7 @@ def uneven_time(evidence: Evidence) -> Finding | None:
 
 def impossible_values(evidence: Evidence) -> Finding | None:
     """Single values far from all others."""
-    _, found, _ = evidence.plausible
+    found = evidence.plausible.impossible
     if not found:
         return None
     return Finding(
@@ -55,7 +55,7 @@ MANY_CLIPPED = 0.1  # share of clipped values above which a channel cannot be us
 
 def clipped_values(evidence: Evidence) -> Finding | None:
     """Values at the end of a sensor's range."""
-    _, _, found = evidence.plausible
+    found = evidence.plausible.clipped
     if not found:
         return None
     each = [f"{n}: {count} ({percent(share)}) at {end:.4g} {UNITS[n]}" for n, (count, share, end) in found.items()]

@@ -67,8 +67,8 @@ def attitude_turns(stretches: Sequence[Recording]) -> Turns | None:
         matrix, delay, _ = _fit(products)
         return np.append(matrix, delay)
 
-    found = jackknife(sums, fit)
-    return Turns(found[:, :9].reshape(2, 3, 3), found[:, 9], _fit(sums.sum(axis=0))[2])
+    found, (_, _, explained) = jackknife(sums, fit), _fit(sums.sum(axis=0))
+    return Turns(found[:, :9].reshape(2, 3, 3), found[:, 9], explained)
 
 
 def scaled_angles(stretches: Sequence[Recording], turns: Turns) -> float:
@@ -79,10 +79,11 @@ def scaled_angles(stretches: Sequence[Recording], turns: Turns) -> float:
     **Returns:** how much better the gyro agrees with the scaled angles than with the scaled rates, in standard errors;
     negative if worse, 0 if unknown.
     """
-    scale = np.diagonal(turns.matrix[0])
+    (matrix, _), (delay, _) = turns.matrix, turns.delay
+    scale = np.diagonal(matrix)
     if (scale <= 0).any():
         return 0.0
-    better, shift = [], round(float(turns.delay[0]) / _STEP)
+    better, shift = [], round(float(delay) / _STEP)
     for (as_logged, gyro), (scaled, _) in zip(_turned(stretches), _turned(stretches, scale), strict=True):
         first, last = max(shift, 0), len(gyro) + min(shift, 0)
         gyro = gyro[first - shift : last - shift]
@@ -226,7 +227,7 @@ def _slopes(
             continue
         own = max(step, flown.dt)
         columns = np.hstack([states[:, :3], flown.specific_force, states[:, 3:]])
-        _, _, means = averages(flown.time, flown.omega, columns, own, held=flown.held)
+        _, _, means = averages(flown.time, flown.omega, columns, held=flown.held)(own)
         given, found = vectors(*np.split(means, 3, axis=1), own)
         known = np.isfinite(given).all(axis=1) & np.isfinite(found).all(axis=1)
         if known.any():

@@ -16,7 +16,7 @@ from ...airframe import GRAVITY, Airframe
 from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
-from ...logs.values import Clipped, Impossible, plausible
+from ...logs.values import Plausible, plausible
 from ..motion import PAIRS, in_body_axes
 from ..stretches import MARGIN, MIN_STRETCH, Stretch, cut, stretches
 from ..windows import richest
@@ -75,14 +75,14 @@ class Evidence:
         self.logged, self.airframe, self.seconds = recording, airframe, seconds
 
     @functools.cached_property
-    def plausible(self) -> tuple[Recording, Impossible, Clipped]:
+    def plausible(self) -> Plausible:
         """The recording without faulty values, along the sensors' axes, and these values."""
         return plausible(self.logged)
 
     @functools.cached_property
     def recording(self) -> Recording:
         """The recording without faulty values, along the body's axes."""
-        return in_body_axes(self.plausible[0], self.airframe)
+        return in_body_axes(self.plausible.recording, self.airframe)
 
     @functools.cached_property
     def every(self) -> tuple[Stretch, ...]:

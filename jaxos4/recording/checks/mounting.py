@@ -1,6 +1,7 @@
 """Checks of the sensors' mounting by the rotors, the attitude and the thrust in hover; and checks of the thrust."""
 
 import math
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -80,8 +81,10 @@ def _by_rotors(evidence: Evidence) -> tuple[float, float] | None:
     response = evidence.response
     if response is None or response.explained[:2].sum() < EXPLAINED[0]:
         return None
-    turning, errors = response.turning / np.hypot(*response.turning[0])
-    (a, b), (c, d) = turning
+    turning, errors = response.turning
+    sizes = np.hypot(*turning)
+    (a, b), (c, d) = turning / sizes
+    errors = errors / sizes
     apart = abs(math.remainder(math.atan2(-c, a) - math.atan2(b, d), math.tau))
     across = math.hypot(errors[0, 1], errors[1, 0])
     if not apart < max(SAME_ANGLE, STANDARD_ERRORS * across) or across > UNCERTAIN:
@@ -109,7 +112,7 @@ def earth_axes(evidence: Evidence) -> Finding | None:
     """Specific force along the axes of the earth: its horizontal part follows the tilt."""
     if evidence.tilt is None:
         return None
-    slope, error = evidence.tilt[:, 0].tolist()
+    (slope, _), (error, _) = evidence.tilt
     if slope < max(ALONG_EARTH, STANDARD_ERRORS * error):
         return None
     return Finding(
@@ -233,9 +236,9 @@ def different_thrust(every: Sequence[Evidence]) -> Finding | None:
         ratios = [ratio for evidence in every if (ratio := _thrust_ratio(evidence)) is not None]
     if len(ratios) < 2:
         return None
-    least, most = (choose(ratios, key=lambda ratio: float(ratio[0])) for choose in (min, max))
-    apart = float(most[0] / least[0]) - 1
-    error = STANDARD_ERRORS * np.hypot(least[1] / least[0], most[1] / most[0])
+    (least, least_error), (most, most_error) = (choose(ratios, key=operator.itemgetter(0)) for choose in (min, max))
+    apart = float(most / least) - 1
+    error = STANDARD_ERRORS * np.hypot(least_error / least, most_error / most)
     commanded = any(evidence.logged.commanded for evidence in every)
     if apart < max(VEHICLES, error):
         return None

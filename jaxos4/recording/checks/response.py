@@ -76,7 +76,8 @@ def rotor_response(stretches: Sequence[Recording], airframe: Airframe) -> Respon
     found = jackknife(turns[lag], lambda products: np.append(*_answer(products, flown[0].dt)[:2]))
     turning, late = found[:, :4].reshape(2, 2, 2), found[:, 4:]
     felt, share = _felt([averaged(each, [max(FORCE_STEP, step)])[0] for each in stretches], airframe, lag)
-    between = np.stack([late[0] - felt[0], np.hypot(late[1], felt[1])])
+    (gyro, gyro_error), (force, force_error) = late, felt
+    between = np.stack([gyro - force, np.hypot(gyro_error, force_error)])
     return Response(turning, np.hstack([late, felt, between]), np.append(answers[lag][2], share), lag)
 
 
