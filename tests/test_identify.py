@@ -14,7 +14,7 @@ from sign_flights import flown, turned
 
 import jaxos4
 from jaxos4.estimators import ESTIMATORS
-from jaxos4.export.vehicle import ESTIMATE
+from jaxos4.export.spread import ESTIMATE
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
 

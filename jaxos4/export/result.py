@@ -18,7 +18,8 @@ from ..flight import RATES, STATE_NAMES
 from ..identification.results import Identification, VehicleIdentification
 from ..models.flight_model import without_recording
 from ..result_file import vehicle_result
-from .vehicle import CARRIED, DRAG, ESTIMATE, NOT_NEGATIVE, RigidVehicle, rigid_vehicle, spread_of
+from .spread import DRAG, ESTIMATE, spread_of
+from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # Why some parameters are not carried; notes on the rotors' inertia name alpha2 and alpha5. All others have one note.
 _NOT_CARRIED = {
