@@ -30,7 +30,7 @@ from experiments.shared import End, Estimators, Flights, Out, Report, flight_fil
 from experiments.verdicts.faults import thinned
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.flight import RATES
-from jaxos4.forecast.flight_prediction import Measured
+from jaxos4.forecast.measured import Measured
 from jaxos4.recording import Recording, read_recording
 from jaxos4.results import NINETY_FIVE
 from jaxos4.rotations import deviation

@@ -159,7 +159,7 @@ def known_at_samples(
     The forcing has no velocity: a prediction has its own.
 
     - `length`: the samples of the flight that are no padding.
-    - `measured`: states, accelerations and the white noise of velocity, see `flight_prediction.Measured`.
+    - `measured`: states, accelerations and the white noise of velocity: see `jaxos4.forecast.measured.Measured`.
     - `noise`: levels of the filters. `prior`: the standard deviation of each offset before the flight.
     """
     state, accelerations, velocity_noise = measured

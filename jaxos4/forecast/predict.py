@@ -27,7 +27,8 @@ from ..result_file import vehicle_result
 from ..rotations import rotated
 from ..shooting import capacity_of, pad_flight
 from ..shooting.gains import Covariance, LogNoise
-from .flight_prediction import FlightPrediction, Measured, constant_rates, regressed
+from .flight_prediction import FlightPrediction
+from .measured import Measured, constant_rates, regressed
 from .motion import PARTS, PUSH, Futures, fly_chunk, known_at_samples, settled
 
 DRAWS = 64  # futures of a start for the band
