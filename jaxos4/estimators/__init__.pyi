@@ -3,10 +3,7 @@ from .equation_error import EquationError as EquationError, RecursiveLeastSquare
 from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS
 from .kalman import JointEKF as JointEKF
-from .levenberg_marquardt import (
-    FilterError as FilterError,
-    LevenbergMarquardt as LevenbergMarquardt,
-    OutputError as OutputError,
-)
+from .levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
+from .output_and_filter_error import FilterError as FilterError, OutputError as OutputError
 from .registry import ESTIMATORS as ESTIMATORS, make_estimator as make_estimator
 from .svsf import SVSF as SVSF

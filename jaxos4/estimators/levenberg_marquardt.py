@@ -1,19 +1,14 @@
-"""Levenberg-Marquardt, and the two estimators that use it: output error and filter error.
+"""Levenberg-Marquardt: damped Gauss-Newton steps on any likelihood, corrected by secants.
 
-The steps are damped Gauss-Newton steps on any likelihood, corrected by secants. Gauss-Newton ignores the second
-derivatives of the residuals. So its steps are too long along some unknowns, such as a delay, and damping shortens them
-along all unknowns. The change of the gradient over the last step, a secant, shows by how much the information misjudges
-the curvature along that step.
-
-Output error models sensor noise only, filter error disturbances too (`InnovationsProblem`). Both are maximum likelihood
-by these steps.
+Gauss-Newton ignores the second derivatives of the residuals. So its steps are too long along some unknowns, such as a
+delay, and damping shortens them along all unknowns. The change of the gradient over the last step, a secant, shows by
+how much the information misjudges the curvature along that step.
 
 References: Marquardt 1963, SIAM J. Appl. Math. 11(2); compare Dennis, Gay and Welsch 1981, ACM Trans. Math.
-Softw. 7(3). On output and filter error: Ljung, System Identification, ch. 7 and 13; Jategaonkar, Flight Vehicle System
-Identification, ch. 4 and 5.
+Softw. 7(3).
 """
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,20 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar, integer, setting
-from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, as_estimate, fit_start
+from ..estimate import REACH
 from ..linalg import joint_factor, limited, movable, slopes_along
-from ..results import RESULTS
-from ..shooting import (
-    AbstractProblem,
-    InnovationsProblem,
-    LocalModel,
-    ShootingProblem,
-    Stage,
-    WindowUnknowns,
-    in_blocks,
-)
-from .solver import AbstractSolver, Found, chosen, cost_of, solve
+from ..shooting import LocalModel, Stage, WindowUnknowns
+from .solver import AbstractSolver, Found, chosen, cost_of
 
 _COARSE = 1e-3  # the smallest `step_tolerance` of all stages except the last
 _FACTOR = 10.0  # by which the damping falls after a step that succeeded, and rises after one that failed
@@ -248,89 +233,3 @@ def _flatter(
     new = jnp.outer(change, change) / jnp.where(applies, seen, 1.0)
     old = jnp.outer(predicted, predicted) / jnp.where(applies, expected, 1.0)
     return jnp.where(applies, new - old, 0.0)
-
-
-class OutputError(AbstractEstimator):
-    """Levenberg-Marquardt on the weighted residuals, from the bracket's center: first the rates, then all channels.
-
-    - `tolerance`: the search ends with a step that moves no unknown by more than this share of its half-width.
-    - `max_steps`: for each stage.
-    - `long`: in a flight of this many samples or more, the rates are first fitted to its first 10 %. Errors grow with
-      time, so a search on the whole flight from a wide bracket takes many short steps.
-    """
-
-    looks_at: ClassVar[str] = "all"
-    shoots: ClassVar[bool] = True
-
-    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-5)
-    max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
-    long: int = eqx.field(converter=integer("long", 1, static=True), static=True, default=2000)
-
-    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. `rollouts` counts trials and tangents. Raises `ValueError` for a wrong bracket."""
-        shares = (1.0,) if problem.flight.time.size < self.long else (0.1, 1.0)
-        solver = LevenbergMarquardt(step_tolerance=self.tolerance, max_steps=self.max_steps, shares=shares)
-        return solver(problem, bracket)
-
-
-class FilterError(AbstractEstimator):
-    """Maximum likelihood of the innovations of Kalman filters, by damped Gauss-Newton steps from the bracket's center.
-
-    It compares the body rates, and specific force if the model predicts it. The disturbance and the sensor noise of
-    each channel are estimated too, see `InnovationsProblem`. The bracket is a Gaussian prior, whose standard deviation
-    is the bracket's half-width.
-
-    - `tolerance`: the search ends with a step that promises to lower the cost by less. An error of one standard
-      deviation costs 0.5.
-    - `max_steps`: the most steps of the search from one time constant of the disturbance.
-    """
-
-    looks_at: ClassVar[str] = "rates"
-    shoots: ClassVar[bool] = False
-    prior: ClassVar[float] = GAUSSIAN_PRIOR
-    in_closed_loop: ClassVar[bool] = True
-
-    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=3e-3)
-    max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=200)
-
-    @property
-    def solver(self) -> LevenbergMarquardt:
-        """The solver. Its damping is relative, because the noise levels have no bracket."""
-        return LevenbergMarquardt(
-            step_tolerance=0.0,
-            gain_tolerance=self.tolerance,
-            flat=0.05,
-            max_steps=self.max_steps,
-            is_relative=True,
-            damping=1e-2,
-            least_damping=1e-4,
-        )
-
-    @eqx.filter_jit
-    def __call__(self, problem: ShootingProblem | InnovationsProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. Raises `ValueError` for a bracket of another length than the model's parameters.
-
-        The estimate for a shooting problem has the model's parameters alone, and the cost of a simulation. The estimate
-        for an `InnovationsProblem` has all unknowns, and their cost.
-        """
-        return in_blocks(self._identify, problem.within(bracket))
-
-    def _identify(self, problem: AbstractProblem) -> Estimate:
-        """One flight, or a block of flights."""
-        if not isinstance(problem, ShootingProblem):
-            return solve(self.solver, problem)
-        found, count = solve(self.solver, InnovationsProblem(problem)), problem.unknowns.count
-        parameters = found.parameters[:count]
-        first, cost, feasible, rollouts = fit_start(problem, parameters)
-        return as_estimate(
-            problem,
-            parameters=parameters,
-            covariance=found.covariance[:count, :count],
-            initial_state=first,
-            cost=cost,
-            rollouts=rollouts + found.rollouts,
-            sweeps=found.sweeps,
-            feasible=feasible & jnp.isfinite(found.cost),
-            done=found.result != RESULTS.max_sweeps,
-            prior=self.prior,
-        )
