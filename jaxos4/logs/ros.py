@@ -28,6 +28,7 @@ _ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format
 _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it
 _FIELD = re.compile(r"[^.\[\]]+")
 _STAMPS = ("timestamp_sample", "timestamp")  # of PX4 [us]
+_RECORDED, _STAMPED = "recorded", "stamp"  # the times of a message; the names of fields have a dot
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
 _REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
 _LONGEST_DEFINITIONS = 1 << 16  # characters: usual definitions have a few thousand, and their parser is slow
@@ -131,46 +132,52 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
             refuse(path, f"{what}: say in a column map which hold rates and motors, and give that map as `columns`")
         notes.append(f"columns are those of the preset {columns.name}")
     chosen = columns.chosen(path, held, topics)
-    messages = _messages(path, reader, {*chosen.values()}, notes, recorded=columns.recorded)
-    return _table(Messages(path, messages, _REMEDY, notes, prefixed=False), columns, chosen)
+    found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
+    return _table(Messages(path, found, _REMEDY, notes, prefixed=False), columns, chosen)
 
 
-def _messages(
-    path: LogPath, reader: Any, places: set[str], notes: list[str], *, recorded: bool, clock: float = 0.5
-) -> dict[str, dict[int, Fields]]:
-    """The fields at these places, by topic, as `Messages` holds them. Raises `InputError`.
-
-    Times are stamps if all topics have some of one clock (to `clock` [s]), or else times of the recorder.
-    """
+def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, dict[str, list[float]]]:
+    """By topic: the fields at these places, the stamps, and the times of the recorder [ns]. Raises `InputError`."""
     getters: dict[str, dict[str, Callable[[Any], float]]] = {}
     for place in sorted(places):
         topic, _, field = place.partition(".")
-        getters.setdefault(topic, {})[place] = _getter(path, place, field)
-    logged: dict[str, list[list[float]]] = {topic: [[] for _ in range(2 + len(getters[topic]))] for topic in getters}
+        getters.setdefault(topic, {_STAMPED: _stamp})[place] = _getter(path, place, field)
+    found: dict[str, dict[str, list[float]]] = {
+        topic: {name: [] for name in (_RECORDED, *fields)} for topic, fields in getters.items()
+    }
     wanted = [each for each in reader.connections if each.topic in getters]
     with _damage(path):
         decode = _decoder(path, wanted, ros1=type(reader).__module__.startswith("rosbags.rosbag1"))
         for number, (connection, at, content) in enumerate(reader.messages(connections=wanted)):
             if number > MAX_ROWS:
                 refuse(path, f"has more than {MAX_ROWS:,} messages of these topics; cut it into flights")
-            message, topic = decode(content, connection.msgtype), connection.topic
-            # In SQLite, a time can be of any type.
-            values = float(at), _stamp(message), *(get(message) for get in getters[topic].values())
-            for column, value in zip(logged[topic], values, strict=True):
-                column.append(value)
-    every = {topic: columns for topic, columns in logged.items() if columns[0]}
-    times = [(np.array(at, float), np.array(stamps, float)) for at, stamps, *_ in every.values()]
+            message, values = decode(content, connection.msgtype), found[connection.topic]
+            values[_RECORDED].append(float(at))  # in SQLite, a time can be of any type
+            for name, get in getters[connection.topic].items():
+                values[name].append(get(message))
+    return found
+
+
+def _timed(
+    found: dict[str, dict[str, list[float]]], notes: list[str], *, recorded: bool, clock: float = 0.5
+) -> dict[str, dict[int, Fields]]:
+    """The topics as `Messages` holds them, with stamps if all have some of one clock (to `clock` [s]).
+
+    Else the times are those of the recorder.
+    """
+    found = {topic: values for topic, values in found.items() if values[_RECORDED]}
+    times = [(np.array(each[_RECORDED], float), np.array(each[_STAMPED], float)) for each in found.values()]
     apart = [float(np.median(stamps - at)) for at, stamps in times]
     stamped = all((stamps > 0).all() for _, stamps in times)
     if not recorded and not (stamped and np.ptp(apart or [0.0]) < clock * 1e9):
         notes.append("times are those of the recorder, because not all topics have stamps of one clock")
         recorded = True
-    begin = min((min(at if recorded else stamps) for at, stamps, *_ in every.values()), default=0)
+    kind = _RECORDED if recorded else _STAMPED
+    begin = min((min(values[kind]) for values in found.values()), default=0)
     messages = {}
-    for topic, (at, stamps, *columns) in every.items():
-        fields = {place: np.array(x, float) for place, x in zip(getters[topic], columns, strict=True)}
-        t = 1e-9 * np.array([each - begin for each in (at if recorded else stamps)], float)
-        messages[topic] = {0: fields | {"t": t}}
+    for topic, values in found.items():
+        fields = {name: np.array(x, float) for name, x in values.items() if name not in (_RECORDED, _STAMPED)}
+        messages[topic] = {0: fields | {"t": 1e-9 * np.array([each - begin for each in values[kind]], float)}}
     return messages
 
 
