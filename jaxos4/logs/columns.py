@@ -1,5 +1,6 @@
 """Column maps: which column or topic of a log holds which quantity, and its unit, sign and frame. See docs/logs.md."""
 
+import functools
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +18,6 @@ from .values import COLUMNS, PWM, PWM_ZERO, ColumnLimits
 ColumnsGiven = LogPath | Mapping[str, Any] | None
 """A column map as users give it: the path of a TOML file, the name of a preset, or the table in such a file."""
 
-PRESETS: dict[str, Any] = read_toml(Path(__file__).with_name("presets.toml"))
 QUATERNION = ("qw", "qx", "qy", "qz")
 _QUATERNION = ColumnLimits("of a quaternion", -math.inf, math.inf, "")
 _COLUMNS = COLUMNS | dict.fromkeys(QUATERNION, _QUATERNION)
@@ -75,6 +75,12 @@ class ColumnMap(NamedTuple):
         return np.clip(values, 0.0, 1.0) if source.zero else values
 
 
+@functools.cache
+def presets() -> dict[str, Any]:
+    """The tables of the presets by name, read when they are first asked for."""
+    return read_toml(Path(__file__).with_name("presets.toml"))
+
+
 def column_map(given: ColumnsGiven) -> ColumnMap:
     """A checked column map; `None`: the columns of the flight CSV. Raises `InputError`, one line, or `OSError`."""
     if given is None:
@@ -85,13 +91,13 @@ def column_map(given: ColumnsGiven) -> ColumnMap:
     else:
         name = os.fspath(given)
         try:
-            table = dict(PRESETS.get(name) or read_toml(given))
+            table = dict(presets().get(name) or read_toml(given))
         except FileNotFoundError:
-            refuse(name, f"neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}")
+            refuse(name, f"neither a file nor a preset; give a TOML file or one of {', '.join(presets())}")
         if not table:
             refuse(name, "names no column; a column map has a table [columns]")
     columns = table.pop("columns", {})
-    settings = {"preset": ("", *PRESETS), "frame": ("FLU", "FRD"), "time": ("stamp", "recorded")}
+    settings = {"preset": ("", *presets()), "frame": ("FLU", "FRD"), "time": ("stamp", "recorded")}
     preset, frame, time = chosen = [table.pop(key, values[0]) for key, values in settings.items()]
     for (key, values), value in zip(settings.items(), chosen, strict=True):
         if value not in values:
@@ -103,7 +109,7 @@ def column_map(given: ColumnsGiven) -> ColumnMap:
     sources = begin.sources | {column: _source(name, column, value) for column, value in columns.items()}
     for column in _TURNED & (columns.keys() if preset else _TURNED) if frame == "FRD" else ():
         sources[column] = sources[column]._replace(factor=-sources[column].factor)
-    needed = () if name in PRESETS else columns
+    needed = () if name in presets() else columns
     return ColumnMap(quoted(name), sources, frozenset(needed), time == "recorded")
 
 

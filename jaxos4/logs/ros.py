@@ -18,7 +18,7 @@ from .._files import reading
 from ..errors import shortened
 from ..flight import ANGLE_NAMES, COMMAND_NAMES, RATE_NAMES, SPEED_NAMES
 from ..rotations import euler_angles
-from .columns import PRESETS, QUATERNION, ColumnMap, column_map
+from .columns import QUATERNION, ColumnMap, column_map, presets
 from .compression import check_part, check_sizes
 from .messages import Fields, Messages, Rotors
 from .sampling import Series
@@ -123,12 +123,12 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
 
     notes: list[str] = []
     if columns is None:
-        for columns in map(column_map, PRESETS):
+        for columns in map(column_map, presets()):
             found = columns.chosen(path, held, topics).keys()
             if found >= {*RATE_NAMES} and found & {"omega1", "command1"}:
                 break
         else:
-            what = f"is for none of its presets ({', '.join(PRESETS)}). Its topics are {listed(topics) or 'none'}"
+            what = f"is for none of its presets ({', '.join(presets())}). Its topics are {listed(topics) or 'none'}"
             refuse(path, f"{what}: say in a column map which hold rates and motors, and give that map as `columns`")
         notes.append(f"columns are those of the preset {columns.name}")
     chosen = columns.chosen(path, held, topics)
