@@ -15,6 +15,7 @@ from jaxos4.design import Envelope
 from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
 from jaxos4.design.rotor_speeds import drawn, fly_finely
 from jaxos4.design.task import CRITERIA, criterion_of, design as search
+from jaxos4.flight import RATES
 from jaxos4.study import load_study
 from jaxos4.study.cell import setup_of
 
@@ -159,6 +160,22 @@ def test_a_designed_input_is_at_least_as_good_as_all_standard_ones_by_its_criter
     own = np.square(relative(found.designed)).mean()
     assert own < 0.25 * min(np.square(relative(one)).mean() for one in found.standard.values())
     assert max(found.designed.uses.values()) <= 1
+
+
+def test_a_search_watches_the_vehicle_that_uses_most_of_a_limit(speeds):
+    task = speeds.task
+    coefficients = 0.01 * jax.random.normal(jax.random.key(1), (task.size,))
+    fly = jax.vmap(lambda a: jaxos4.simulate(MODEL, a, task._omega(coefficients), dt=0.01).states[:, RATES[0]])
+    most = task.fleet[jnp.abs(fly(task.fleet)).max(axis=1).argmax()]
+    assert (task.watching(coefficients).watched == most).all(axis=1).any()
+
+
+@pytest.mark.slow
+def test_vehicles_that_would_turn_over_are_watched_from_the_start():
+    """If they are watched only after two stages, this search ends at 0.62 of the multisine's bounds."""
+    gain, excited = design.design_input(MODEL, compare=True, key=1).gain("multisine")
+    assert excited == 8
+    assert gain < 0.2
 
 
 @pytest.mark.slow

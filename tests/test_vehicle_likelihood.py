@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.identification import answers, intervals, prepare_vehicle as preparation
-from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification import answers, fit, intervals, prepare_vehicle as preparation
+from jaxos4.identification.answers import VehicleAnswer, vehicle_constants
+from jaxos4.identification.data import Data
 from jaxos4.identification.fit import chosen_place, moved, sample_time_of, search_sample_times
 from jaxos4.identification.intervals import corrected
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
@@ -121,6 +122,50 @@ def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(rows, place):
 )
 def test_the_shortest_samples_hold_single_rows_of_speeds_and_two_new_commands(logged, commands, shortest):
     assert finest(logged, commands=commands) == pytest.approx(shortest)
+
+
+KINDS = {
+    "white": ((0.1, 0.0), (0.0, 0.0), "Bb", "bB"),
+    "only the shorter is white": ((0.0, 0.15), (0.0, 0.0), "Bb", "bB"),
+    "near white": ((0.15, 0.15), (0.0, 0.0), "BbDd", "dD"),
+    "far from white": ((0.0, 0.5), (0.0, 0.0), "BDd", "dD"),
+    "no kind is white": ((0.2, 0.5), (0.3, 0.3), "BDdb", "bB"),
+    "the other is less far": ((0.4, 0.5), (0.3, 0.3), "BDdb", "dD"),
+    "no answer": ((0.4, 1.0), (0.0, 0.0), "BbDd", "dD"),
+    "one kind": ((0.4, 0.5), (), "Bb", "bB"),
+}
+
+
+class Named(Data, VehicleAnswer):
+    """Data with a name, and their answer."""
+
+    hides_answers = False
+
+    def __init__(self, name):
+        self.__dict__.update(name=name, hides_answers=name in "dD")
+
+
+@pytest.mark.parametrize(("answered", "hidden", "order", "kept"), KINDS.values(), ids=KINDS)
+def test_kinds_of_samples_are_fitted_in_order_until_one_has_white_innovations(
+    monkeypatch, answered, hidden, order, kept
+):
+    """There are two kinds; capitals are the longest samples. Correlations are those of the shorter and the longest."""
+    names = dict(zip("bBdD", (*answered, *hidden), strict=False))
+    fitted = []
+
+    def searched(several, solver, progress):
+        for data in reversed(several):
+            fitted.append(data.name)
+            yield data
+
+    monkeypatch.setattr(fit, "search_sample_times", searched)
+    monkeypatch.setattr(fit, "corrected", lambda data: data)
+    monkeypatch.setattr(
+        fit, "sample_time_of", lambda data: table((() if names[data.name] == 1.0 else A, names[data.name]))[0]
+    )
+    found, rows = fit.fit_sample_times([*map(Named, names)], SOLVER, choose=True, progress=lambda _: None)
+    assert ("".join(fitted), "".join(each.name for each in found)) == (order, kept)
+    assert [row.correlation for row in rows] == [names[name] for name in kept]
 
 
 def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():

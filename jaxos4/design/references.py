@@ -110,6 +110,7 @@ class ReferenceTask(task.AbstractTask):
     vehicles: ClassVar[int] = LANES
     starts: ClassVar[int] = 8
     first: ClassVar[float] = 0.85
+    steps: ClassVar[int] = 100
 
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)

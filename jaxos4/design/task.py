@@ -39,10 +39,12 @@ Progress = Callable[[str], None]
 CRITERIA = ("A", "D", "worst")
 # The weight of the penalty in each stage of a search. The last ones let other vehicles keep the limits too.
 _PENALTIES = (10.0, 50.0, 250.0, 1250.0, 6000.0, 6000.0, 6000.0, 6000.0)
+# The number of stages after which only the best search continues.
+_COMPARED = 2
 # The usual size of a coefficient: the moves of the first stage.
 _UNIT = 0.1
-# A stage ends after this many steps, or if a step changes neither the cost nor a coefficient by this share.
-_STEPS, _TOLERANCE = 100, 1e-6
+# A stage ends if a step changes neither the cost nor a coefficient by this share.
+_TOLERANCE = 1e-6
 _REFERENCE_NAMES = ("roll_reference", "pitch_reference", "yaw_reference", "az_reference")
 # The largest error of a sample time in a file, as a share of it.
 _PRECISION = 1e-3
@@ -88,8 +90,8 @@ class AbstractTask(eqx.Module):
     """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
-    - `starts`: the number of searches, of which the best goes on after two stages. `first`: the length of their first
-      coefficients, which are random.
+    - `starts`: the number of searches; after `_COMPARED` stages, the best continues alone. `first`: the length of their
+      first coefficients, which are random. `steps`: the most BFGS steps of a stage.
     - `names`, `units`: of each parameter, the targets first.
     - `scale`: for each target, a size of which accuracies are shares. `unexcited`: a parameter whose bound is not below
       this counts as not excited.
@@ -100,6 +102,7 @@ class AbstractTask(eqx.Module):
     vehicles: ClassVar[int]
     starts: ClassVar[int]
     first: ClassVar[float]
+    steps: ClassVar[int]
     envelope: eqx.AbstractVar[Envelope]
     names: eqx.AbstractVar[tuple[str, ...]]
     units: eqx.AbstractVar[tuple[str, ...]]
@@ -169,43 +172,52 @@ def design(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -
     **Raises:** `InputError` if the criterion is not finite: there is nothing to search for.
     """
     progress("compiling the search")
-    searched, searches = task, _started(jax.random.fold_in(key, 2), task)
-    best = searches[0]
-    for stage, penalty in enumerate(_PENALTIES):
-        if stage == 2:
-            searches = [best]
-        searches = [_minimise(searched, search, as_float(penalty)) for search in searches]
+    searches = _started(jax.random.fold_in(key, 2), task)
+    for stage, penalty in enumerate(_PENALTIES, start=1):
+        searches = [_minimise(search.watching(), as_float(penalty)) for search in searches]
         best = min(searches, key=lambda search: search.cost)
         if not np.isfinite(best.cost):
             remedy = "narrow the bracket, or give stronger gusts for a vehicle under a controller"
             raise InputError(f"the accuracy after these {task.kind} is not a finite number; {remedy}.")
-        progress(f"search, stage {stage + 1} of {len(_PENALTIES)}")
-        if stage:
-            searched = searched.watching(best.coefficients)
+        if stage == _COMPARED:
+            searches = [best]
+        progress(f"search, stage {stage} of {len(_PENALTIES)}")
     progress(f"flying {task.vehicles} vehicles")
-    flown = {"designed": task.flown(np.asarray(best.coefficients))}
+    (found,) = searches
+    flown = {"designed": task.flown(np.asarray(found.coefficients))}
     progress("bounds")
     judged = task.judged(flown | (task.standard() if compare else {}))
     return Design(task, judged.pop("designed"), judged)
 
 
 class _Search(NamedTuple):
-    """The state of a search. `basis`: moves along which the cost is about equally curved, as BFGS found."""
+    """The state of a search.
 
+    - `task`: with the vehicles whose limits it watches.
+    - `basis`: moves along which the cost is about equally curved, as BFGS found.
+    - `cost`: the criterion, and the penalty of the vehicles that this search watches.
+    """
+
+    task: AbstractTask
     coefficients: Coefficients
     basis: Float[Array, "coefficients coefficients"]
     cost: Scalar
+
+    def watching(self) -> "_Search":
+        """The search that watches the vehicles which now use the most of the limits."""
+        return self._replace(task=self.task.watching(self.coefficients))
 
 
 @quick_jit
 def _started(key: Key, task: AbstractTask) -> list[_Search]:
     starts = task.first / math.sqrt(task.size) * jax.random.normal(key, (task.starts, task.size), dtype=float)
-    return [_Search(start, _UNIT * jnp.eye(task.size), jnp.zeros(())) for start in starts]
+    return [_Search(task, start, _UNIT * jnp.eye(task.size), jnp.zeros(())) for start in starts]
 
 
 @quick_jit
-def _minimise(task: AbstractTask, search: _Search, penalty: Scalar) -> _Search:
+def _minimise(search: _Search, penalty: Scalar) -> _Search:
     """One stage of a search. BFGS begins with a unit matrix, so its unknowns are moves along the basis found before."""
+    task = search.task
 
     def moved(moves: Coefficients) -> Coefficients:
         return search.coefficients + search.basis @ moves
@@ -216,10 +228,10 @@ def _minimise(task: AbstractTask, search: _Search, penalty: Scalar) -> _Search:
         return task.objective(moved(moves)) + penalty / 2 * excess
 
     solver, still = optimistix.BFGS(_TOLERANCE, _TOLERANCE), jnp.zeros(task.size)
-    found = optimistix.minimise(cost, solver, still, max_steps=_STEPS, throw=False)
+    found = optimistix.minimise(cost, solver, still, max_steps=task.steps, throw=False)
     end = found.state.f_info
     basis = search.basis @ jnp.linalg.cholesky(end.hessian_inv.as_matrix())
-    return _Search(moved(found.value), basis, jnp.where(jnp.isnan(end.f), jnp.inf, end.f))
+    return _Search(task, moved(found.value), basis, jnp.where(jnp.isnan(end.f), jnp.inf, end.f))
 
 
 def criterion_of(

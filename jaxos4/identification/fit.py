@@ -12,7 +12,7 @@ import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -44,6 +44,7 @@ SETTLED = 0.2  # relative change of a noise level that ends the passes; such wei
 TOLERANCE = 1e-3  # of `FilterError`: it stops within 0.05 standard deviations of the minimum
 WHITE = 0.06  # largest correlation of innovations that count as white, in addition to chance
 CHANCE = 3.0  # standard errors of a correlation; the largest of 24 (3 rates, 8 lags) is compared
+FAR = 2.0  # times the limit for white innovations; beyond it, shorter samples are unlikely to be white
 AGREE = 2.0  # most standard deviations between two answers that agree
 DISCRETE = 0.03  # relative error of discretisation
 WIDER = 1.5  # intervals wider than at twice the sample time by this factor would agree with anything
@@ -115,7 +116,7 @@ def fit_vehicle(
 ) -> tuple[VehicleAnswer, tuple[SampleTime, ...]]:
     """The parameters and the disturbances at the chosen sample time.
 
-    `FilterError` searches at all sample times. Any other estimator then searches at the chosen one.
+    `FilterError` searches at the sample times. Any other estimator then searches at the chosen one.
 
     **Arguments:** `several`: the data, the shortest sample time first. `choose`: whether to choose a sample time;
     otherwise the first is used. `seed`: random seed for training a network.
@@ -124,7 +125,7 @@ def fit_vehicle(
     """
     solver, is_default = FilterError(tolerance=TOLERANCE), estimator == DEFAULT
     compared = several if is_default or len(several) > 1 else ()
-    answers, rows = fit_sample_times(compared, solver, choose=choose, progress=progress)
+    answers, rows = fit_sample_times(compared, solver, choose=choose, progress=progress) if compared else ([], [])
     place = chosen_place(rows) if choose and rows else 0
     if is_default:
         answer = answers[place]
@@ -165,51 +166,58 @@ def fit_sample_times(
     """The answers at the sample times that can be compared, the shortest first, and a row for each.
 
     Samples that hold the controller's answers as commands are a kind of their own: feedthroughs explain most of their
-    innovations. They are fitted only if the other kind has no white innovations. The kind with the least correlated
-    innovations is returned.
+    innovations. They are fitted only if the other kind has no white innovations, and before its shorter samples if its
+    longest ones are far from white. The first kind with white innovations ends the fits. The kind with the least
+    correlated innovations is returned.
 
     `choose`: whether to choose the sample time; otherwise only the kind of the first is fitted.
     """
     kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
-    answers, rows = [], []
-    for some in filter(None, kinds):
-        if not choose and some[0] is not several[0]:
-            continue
-        optima = search_sample_times(some, solver, progress=progress)
-        progress("computing intervals")
-        found = [corrected(optimum) for optimum in optima]
-        own = [sample_time_of(answer) for answer in found]
-        if not rows or _least_correlation(own) < _least_correlation(rows):
-            answers, rows = found, own
-        if any(row.constants and is_white(row) for row in own):
-            break
-    return answers, rows
+    kinds = [some for some in kinds if some and (choose or some[0] is several[0])]
+    searches = [search_sample_times(some, solver, progress=progress) for some in kinds]
+    fitted: list[list[tuple[VehicleAnswer, SampleTime]]] = [[] for _ in kinds]
+
+    def fit_next(kind: int, most: int | None = None) -> bool:
+        """Fits more sample times of a kind. Whether any of this kind has white innovations."""
+        for optimum in itertools.islice(searches[kind], most):
+            progress("computing intervals")
+            answer = corrected(optimum)
+            fitted[kind].insert(0, (answer, sample_time_of(answer)))
+        return any(row.constants and is_white(row) for _, row in fitted[kind])
+
+    order = [*range(len(kinds))]
+    fit_next(0, 1)
+    (longest,) = (row for _, row in fitted[0])
+    if longest.constants and not is_white(longest, FAR):
+        order.reverse()
+    any(fit_next(kind) for kind in order)
+    answers, rows = zip(*min(fitted, key=_least_correlation), strict=True)
+    return list(answers), list(rows)
 
 
-def _least_correlation(rows: Sequence[SampleTime]) -> float:
-    return min((abs(row.correlation) for row in rows if row.constants), default=math.inf)
+def _least_correlation(fitted: Sequence[tuple[VehicleAnswer, SampleTime]]) -> float:
+    return min((abs(row.correlation) for _, row in fitted if row.constants), default=math.inf)
 
 
 def search_sample_times(
     several: Sequence[Data[InnovationsProblem]], estimator: AbstractEstimator, *, progress: Progress = silent
-) -> list[Optimum]:
-    """The optimum at each sample time.
+) -> Iterator[Optimum]:
+    """The optimum at each sample time, the longest first.
 
     Each search starts at the answer for the next longer sample time, if that is a minimum. It starts at the bracket's
     centre where feedthroughs are no longer estimated.
 
     **Arguments:** `several`: one flight at several sample times, each twice the one before.
     """
-    optimum, optima = None, []
-    for number, data in enumerate(reversed(several), start=1):
+    optimum = None
+    for data in reversed(several):
         step = 1e3 * float(data.problem.flight.dt)
-        progress(f"fitting samples of {step:.3g} ms ({number} of {len(several)} sample times)")
+        progress(f"fitting samples of {step:.3g} ms")
         start, own, compared = None, data.likelihood, None
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
             start, compared = start_of(own, optimum.unrestricted), optimum.compared_delay
         optimum = search(estimator, data, start=start, compared_delay=compared)
-        optima.insert(0, optimum)
-    return optima
+        yield optimum
 
 
 def start_of(likelihood: InnovationsProblem, found: Estimate) -> Float[np.ndarray, " unknowns"] | None:
@@ -230,9 +238,9 @@ def chosen_place(rows: Sequence[SampleTime]) -> int:
     return next((i for i in clean[:-1] if _agree(rows[i], rows[longer[i]])), clean[0])
 
 
-def is_white(row: SampleTime) -> bool:
-    """Whether innovations are nearly white."""
-    return abs(row.correlation) <= WHITE + CHANCE / math.sqrt(max(row.samples, 1))
+def is_white(row: SampleTime, far: float = 1.0) -> bool:
+    """Whether the largest correlation of innovations is at most `far` times the limit for nearly white ones."""
+    return abs(row.correlation) <= far * (WHITE + CHANCE / math.sqrt(max(row.samples, 1)))
 
 
 def _agree(row: SampleTime, other: SampleTime) -> bool:

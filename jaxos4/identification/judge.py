@@ -152,7 +152,7 @@ def judge_vehicle(
 ) -> VehicleIdentification:
     """The result of a vehicle, checked against the airframe, other sample times, and measurements that were not fitted.
 
-    `sample_times`: all that were fitted, including the answer's. `estimator`: the estimator's name.
+    `sample_times`: those of `fit_vehicle`, including the answer's. `estimator`: the estimator's name.
     """
     progress("checking the answer")
     search, data = str(result_names(answer.estimate.result)), answer.optimum.data
