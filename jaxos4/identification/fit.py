@@ -124,8 +124,9 @@ def fit_vehicle(
     **Returns:** the answer, and a row for each sample time that belongs to it.
     """
     solver, is_default = FilterError(tolerance=TOLERANCE), estimator == DEFAULT
-    compared = several if is_default or len(several) > 1 else ()
-    answers, rows = fit_sample_times(compared, solver, choose=choose, progress=progress) if compared else ([], [])
+    answers, rows = [], []
+    if is_default or len(several) > 1:
+        answers, rows = fit_sample_times(several, solver, choose=choose, progress=progress)
     place = chosen_place(rows) if choose and rows else 0
     if is_default:
         answer = answers[place]
@@ -187,10 +188,12 @@ def fit_sample_times(
 
     order = [*range(len(kinds))]
     fit_next(0, 1)
-    (longest,) = (row for _, row in fitted[0])
+    _, longest = fitted[0][0]
     if longest.constants and not is_white(longest, FAR):
         order.reverse()
-    any(fit_next(kind) for kind in order)
+    for kind in order:
+        if fit_next(kind):
+            break
     answers, rows = zip(*min(fitted, key=_least_correlation), strict=True)
     return list(answers), list(rows)
 
