@@ -5,6 +5,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 from scipy.special import chdtri
@@ -81,6 +82,15 @@ def test_nothing_speaks_against_a_good_estimate_and_one_without_roll_and_pitch_i
     parameters["alpha6"] = parameter(10.0, 5.0)
     found = issues_of_values(VEHICLE, parameters, {"Iz": constants["Iz"]})
     assert [str(issue).split()[0] for issue in found] == ["roll", "pitch"]
+
+
+@pytest.mark.parametrize(("curve", "is_unusual"), [(0.74, False), (1.04, False), (0.6, True), (1.1, True)])
+def test_a_motor_is_unusual_beyond_two_standard_deviations_of_its_prior(curve, is_unusual):
+    parameters, constants = believable()
+    parameters["thrust_curve"] = msgspec.structs.replace(parameter(curve, 0.02), bracket=(0.75, 0.95))
+    found = [str(issue) for issue in issues_of_values(VEHICLE, parameters, constants)]
+    expected = f"thrust_curve = {curve} is unusual (expected: 0.65 to 1.05); log rotor speeds"
+    assert found == [expected] * is_unusual
 
 
 @pytest.mark.parametrize(

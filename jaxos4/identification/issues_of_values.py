@@ -13,7 +13,18 @@ from ..models.terms import DAMPED
 from ..recording.checks.evidence import HELD
 from .answers import Answer, drag_error, thrust_excess
 from .results import Constant, ParameterEstimate, RigidBody
-from .verdict import CONTRADICTION, IMPROBABLE, MAX_PRIOR, RESERVATION, RIGID_BODY, SIGNIFICANT, Issue, Move, Moves
+from .verdict import (
+    CONTRADICTION,
+    IMPROBABLE,
+    MAX_PRIOR,
+    RESERVATION,
+    RIGID_BODY,
+    SIGNIFICANT,
+    UNUSUAL,
+    Issue,
+    Move,
+    Moves,
+)
 
 Estimated = Mapping[str, tuple[float, float]]
 """Value and standard deviation of each parameter that has an estimate."""
@@ -40,7 +51,7 @@ def issues_of_alphas(table: Mapping[str, ParameterEstimate], body: RigidBody) ->
         row = table[name]
         if row.estimate is not None and row.std is not None and abs(row.estimate) - SIGNIFICANT * row.std > 1:
             cause = f"{name} = {row.estimate:.3g} is not between -1 and 1, as in every rigid body"
-            yield Issue(CONTRADICTION, cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket))
+            yield Issue(CONTRADICTION, cause, gyro, moves | dict.fromkeys([name] * row.is_outside_bracket()))
     rotor, largest = body.constants.get("J_R"), body.constants.get(YAW.inertia)
     if rotor is not None and largest is not None:
         remedy, margin = "check `rotor_spins`, and which rotor is which", SIGNIFICANT * rotor.std
@@ -94,17 +105,17 @@ def _odd_motors(
     wrong: Mapping[Parameter, Issue],
     follow: Consequences,
 ) -> Iterator[Issue]:
-    """Motor parameters outside their brackets: an unusual value may be a fault of the model."""
+    """Motor parameters far outside their brackets: an unusual value may be a fault of the model."""
     for parameter in (each for each in model.parameters if each.in_forcing and each not in wrong):
         row = parameters.get(parameter.name)
-        if row is not None and row.is_outside_bracket and row.estimate is not None and isinstance(row.bracket, tuple):
-            usual = float(np.clip(row.estimate, *row.bracket))
+        usual = None if row is None or not row.is_outside_bracket(UNUSUAL) else row.wider_bracket(UNUSUAL)
+        if row is not None and row.estimate is not None and usual is not None:
+            least, most = max(usual[0], 0.0) if parameter.nonnegative else usual[0], usual[1]
             yield Issue(
                 RESERVATION,
-                f"{parameter.name} = {row.estimate:.2g} is unusual (expected: {row.bracket[0]:.2g} to "
-                f"{row.bracket[1]:.2g})",
+                f"{parameter.name} = {row.estimate:.2g} is unusual (expected: {least:.3g} to {most:.3g})",
                 "log rotor speeds",
-                follow(parameter.name, usual),
+                follow(parameter.name, float(np.clip(row.estimate, least, most))),
             )
 
 

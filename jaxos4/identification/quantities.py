@@ -12,7 +12,7 @@ from .answers import Answer, drag_error
 from .intervals import PRIOR_NOTE
 from .issues_of_values import MEASURE
 from .results import OS4Identification, ParameterEstimate, PredictionSkill, VehicleIdentification
-from .verdict import MAX_PRIOR, PREDICTIONS, RIGID_BODY, Quantity
+from .verdict import MAX_PRIOR, PREDICTIONS, RIGID_BODY, UNUSUAL, Quantity
 
 
 def vehicle_quantities(answer: Answer, found: VehicleIdentification, still: Sequence[str]) -> dict[str, Quantity]:
@@ -67,15 +67,15 @@ def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str,
     for name, row in rows.items():
         if name in answer.negative:
             found.append(f"{name} is negative, which is impossible; it is 0 here")
-        elif row.is_outside_bracket and name in guessed and row.estimate and isinstance(row.bracket, tuple):
+        elif row.is_outside_bracket() and name in guessed and row.estimate and isinstance(row.bracket, tuple):
             ratio = sum(row.bracket) / 2 / row.estimate
             check = (
                 "measure `drag_coefficient`" if guessed[name] == YAW.inertia else "check `mass` and `rotor_positions`"
             )
             found.append(f"{guessed[name]} is {ratio:.2g} times the guess; {check}, or give a wider `bracket`")
-        elif row.is_outside_bracket:
+        elif row.is_outside_bracket(1.0 if (given := name in (*PARAMETER_NAMES, *of_airframe)) else UNUSUAL):
             # Only an airframe that has such a constant can be wrong about it.
-            check = "check the airframe, or " if name in (*PARAMETER_NAMES, *of_airframe) else ""
+            check = "check the airframe, or " if given else ""
             found.append(f"{name} is outside its bracket; {check}give a wider `bracket`")
     resting = (name for name in rows if shares[name] > MAX_PRIOR)
     return *found, *(

@@ -49,13 +49,18 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     noise_limit: float | None | msgspec.UnsetType = msgspec.UNSET
     bracket: tuple[float, float] | None | msgspec.UnsetType = msgspec.UNSET
 
-    @property
-    def is_outside_bracket(self) -> bool:
-        """Whether the estimate lies outside the bracket, if there are both."""
-        if self.estimate is None or not isinstance(self.bracket, tuple):
-            return False
+    def is_outside_bracket(self, times: float = 1.0) -> bool:
+        """Whether the estimate lies outside the bracket, or one that is this many times as wide, if there are both."""
+        wider = self.wider_bracket(times)
+        return self.estimate is not None and wider is not None and not wider[0] <= self.estimate <= wider[1]
+
+    def wider_bracket(self, times: float) -> tuple[float, float] | None:
+        """The bracket, this many times as wide about its centre; `None` without one."""
+        if not isinstance(self.bracket, tuple):
+            return None
         lower, upper = self.bracket
-        return not lower <= self.estimate <= upper
+        more = (times - 1) * (upper - lower) / 2
+        return lower - more, upper + more
 
 
 class Constant(msgspec.Struct, frozen=True):

@@ -40,6 +40,7 @@ MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
 UNCERTAIN, TOO_UNCERTAIN = 0.1, 0.4
 ONLY_KNOWN_TO = "it is known to"  # begins the reason of a long interval
 MAX_PRIOR = 0.25  # share of the information about a parameter that its bracket may give without a reservation
+UNUSUAL = 2.0  # times the width of a prior's bracket; 5 % of usual values are outside
 SIGNIFICANT = 3.0  # standard deviations that exceed chance
 IMPROBABLE = 1e-3  # a smaller probability exceeds chance
 
