@@ -256,6 +256,14 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
     assert all(set(issue) == {"result", "cause", "remedy", "moves"} for issue in written["doubts"])
 
 
+def test_the_gain_of_the_thrust_has_the_error_of_the_accelerometers_scale(fitted):
+    place = fitted.problem.model.parameter_names.index("thrust_gain")
+    likely = float(np.asarray(fitted.estimate.std)[place])
+    found = judge_vehicle(fitted, (), "filter-error").parameters["thrust_gain"]
+    assert found.std == pytest.approx(np.hypot(likely, 0.01 * found.estimate))
+    assert found.ci95[1] - found.ci95[0] == pytest.approx(2 * 1.96 * found.std, rel=1e-3)
+
+
 def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
     table = dict.fromkeys(("alpha3", "alpha6", "alpha8", "thrust_gain", "rotor_delay"), row)

@@ -19,7 +19,7 @@ from ..models.abstract import PARAMETER_NAMES
 from ..models.flight_model import FlightModel
 from ..models.os4 import CorrectedOS4
 from ..models.terms import follows_commands
-from ..results import has_answer
+from ..results import NINETY_FIVE, has_answer
 from ..shooting import ShootingProblem
 from .data import Data
 from .results import Constant, Disturbance, FixedParameter, ParameterEstimate, RigidBody
@@ -128,6 +128,11 @@ def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {
     values, half_width = answer.parameters, np.asarray(unknowns.half_width)
     lower, upper = np.asarray(unknowns.bracket.lower), np.asarray(unknowns.bracket.upper)
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
+    # No likelihood shows an error of the accelerometer's scale.
+    scale = np.zeros_like(std)
+    for gain in _gains(answer):
+        scale[gain] = SCALE_ERROR * values[gain]
+    std, width = np.hypot(std, scale), np.hypot(width, NINETY_FIVE * scale)
 
     def row(i: int, name: str) -> ParameterEstimate:
         value, half, known = float(values[i]), float(width[i]), bool(identifiable[i])
@@ -193,8 +198,12 @@ def thrust_excess(answer: Answer) -> float:
     model, values = answer.problem.model, answer.parameters
     if isinstance(model, FlightModel) and follows_commands(model.terms):
         return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
-    gains = [values[i] for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
-    return float(np.prod(gains)) - 1
+    return float(np.prod(values[_gains(answer)])) - 1
+
+
+def _gains(answer: Answer) -> list[int]:
+    """The places of the parameters that scale all torques."""
+    return [i for i, parameter in enumerate(answer.problem.model.parameters) if parameter.scales_torque]
 
 
 def drag_error(answer: Answer) -> float:
@@ -217,7 +226,7 @@ def vehicle_constants(answer: Answer) -> RigidBody:
     model, free, values = answer.problem.model, answer.free, answer.parameters
     known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), answer.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
-    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
+    gains = _gains(answer)
     for gain in gains:
         # Torques exceed the airframe's by this factor, even if the factor is hardly known.
         for place in INVERSES:
@@ -227,7 +236,7 @@ def vehicle_constants(answer: Answer) -> RigidBody:
     unknown = np.where(known, 0.0, (UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = np.asarray(answer.estimate.covariance)[: values.size, : values.size]
     covariance = slopes @ covariance @ slopes.T + np.diag(unknown)
-    # No likelihood shows an error of the accelerometer's scale, which makes all inertias wrong by one factor.
+    # An error of the accelerometer's scale makes all inertias wrong by one factor.
     scale = SCALE_ERROR * bool(gains)
     shared = scale * np.where(np.isin(np.arange(8), INVERSES), alpha, 0.0)
     covariance += shared[:, None] * shared

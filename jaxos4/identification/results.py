@@ -32,7 +32,8 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     """One estimated parameter.
 
     - `estimate`, `ci95`: the estimate and its 95 % interval; `None` if the parameter is not identifiable.
-    - `std`: standard deviation of the estimate; `None` if it is not finite.
+    - `std`: standard deviation of the estimate; `None` if it is not finite. That of `thrust_gain` includes 1 % for the
+      accelerometer's scale.
     - `bound`: the Cramer-Rao bound at the estimated noise levels, as a standard deviation.
     - `unit`: the unit of these fields. `note`: a warning, or an empty string.
     - `bracket`: where the parameter was searched; for a vehicle, a prior with this centre and half-width.
