@@ -343,22 +343,6 @@ def test_no_torque_before_an_instant_answers_what_is_measured_at_it():
     assert own.likelihood.input_innovations.shape == longer.likelihood.input_innovations.shape
 
 
-def test_the_past_holds_the_rate_of_an_instant_and_not_its_specific_force():
-    """If it held the specific force too, inertias were 4 % smaller in twelve flights of RotorPy in gusts."""
-    flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0, logged="speeds"), duration=16.0, seed=0)
-    data = prepare_vehicle(as_recordings(flight), CINERAT, jaxos4.VehicleSettings())[0]
-    flown, measured = data.problem.flight, data.problem.recorded()
-    torque = np.square(np.asarray(flown.within)) @ np.asarray(CINERAT.mixer).T
-    found = np.asarray(data.likelihood.input_innovations)[: data.time.size, 0]
-    for axis, is_first in enumerate([True, True, True, False]):
-        past = torque[:, :, axis], measured[:, axis], np.asarray(flown.stretch_numbers), float(flown.dt), 1
-        expected, other = (
-            input_innovations(*past, means=MEANS, measured_first=first)[:, 0] for first in (is_first, not is_first)
-        )
-        np.testing.assert_allclose(found[:, axis], expected, atol=1e-9)
-        assert np.abs(found[:, axis] - other).max() > 1e-3
-
-
 @pytest.mark.slow
 def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias():
     """Commands every 4 ms, samples of 8 ms, a gyro with a noise of 0.05 rad/s.

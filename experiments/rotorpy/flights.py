@@ -116,7 +116,8 @@ def fly(gust: float, duration: float, seed: int, i: int, *, captured: bool = Fal
     if captured:
         states[:, POSITION] = position + random.normal(0, POSITION_NOISE, position.shape)
         states[:, VELOCITY] = velocity + random.normal(0, VELOCITY_NOISE, velocity.shape)
-    return jaxos4.Flight(time=DT * np.arange(len(omega)), omega=omega, states=states, specific_force=force)
+    signals = {"omega": omega, "states": states, "specific_force": force}
+    return jaxos4.Flight(time=DT * np.arange(len(omega)), **signals, held=False)
 
 
 def recorded(folder: Path, i: int, gust: float, duration: float, seed: int, *, captured: bool = False) -> Path:

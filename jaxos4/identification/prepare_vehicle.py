@@ -194,9 +194,7 @@ def _input_innovations(
         if axis is not None:
             torque, count = inputs[:, :, axis], counts[axis]
             some = 1 if is_lagged else count
-            # A rate does not depend on the torque at its instant. A specific force shows the thrust at its instant.
-            first = measured_first and axis < 3
-            own = input_innovations(torque, measured, stretch, dt, some, means=means, measured_first=first)
+            own = input_innovations(torque, measured, stretch, dt, some, means=means, measured_first=measured_first)
             found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
     return found
 
