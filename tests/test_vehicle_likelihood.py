@@ -21,7 +21,7 @@ from jaxos4.identification.fit import chosen_place, moved, sample_time_of, searc
 from jaxos4.identification.intervals import corrected
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
-from jaxos4.identification.search import USUAL_DELAY_OF_COMMANDS, _lowest_in_delay
+from jaxos4.identification.search import USUAL_DELAY_OF_COMMANDS, Optimum, _lowest_in_delay, _without_negative
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
 from jaxos4.recording.prepared import finest, prepare
@@ -278,6 +278,27 @@ def test_the_search_begins_again_near_the_usual_delay(delay, compared, cost, cho
     if starts:
         assert [free for free, _ in starts] == [False, True]
         assert starts[1][1] == USUAL_DELAY_OF_COMMANDS
+
+
+@pytest.mark.parametrize("result", [RESULTS.successful, RESULTS.nonfinite_trajectory])
+def test_what_came_out_negative_is_kept_if_a_search_without_it_fails(result):
+    terms = jaxos4.VehicleSettings(terms=("offset", "damping", "lag", "delay"), sample_time=DT)
+    data = prepare_vehicle(as_recordings(flown()), CRAZYFLIE, terms)[0]
+    likelihood, unknowns = data.likelihood, data.problem.unknowns
+    counts, covariance = (jnp.zeros(()), jnp.asarray(5), jnp.asarray(1)), jnp.eye(likelihood.unknowns.count)
+
+    def estimate(damping, result):
+        values = jnp.zeros(likelihood.unknowns.count).at[unknowns.names.index("roll_damping")].set(damping)
+        return jaxos4.Estimate(values, covariance, jnp.zeros(0), *counts, result)
+
+    before = Optimum(data, likelihood, *2 * [estimate(-3.0, RESULTS.successful)], unknowns, 0)
+    after = _without_negative(lambda likelihood: estimate(0.0, result), before, lambda said: None)
+    assert after.rollouts == 5
+    if result == RESULTS.successful:
+        assert after.negative == {"roll_damping": (-3.0, 1.0)}
+    else:
+        assert after.negative == {}
+        assert after.estimate is before.estimate
 
 
 @pytest.mark.slow

@@ -27,6 +27,8 @@ LOWER = 0.1  # a cost that is lower by more belongs to another minimum
 # The usual delay [s] of measured speeds, and of commands. The cost has a minimum in the delay for each row of the log.
 USUAL_DELAY, USUAL_DELAY_OF_COMMANDS = 0.0, 0.002
 
+Search = Callable[[InnovationsProblem], Estimate]
+
 
 class Optimum(NamedTuple):
     """The optimum that a search found with the likelihood of innovations.
@@ -98,7 +100,7 @@ class Optimum(NamedTuple):
 
     def restricted(
         self,
-        estimator: Callable[[InnovationsProblem], Estimate],
+        estimator: Search,
         values: Mapping[str, float],
         start: Float[np.ndarray, " unknowns"] | None = None,
     ) -> "Optimum":
@@ -140,7 +142,7 @@ def search(
 
 
 def _lowest_in_delay(
-    estimator: Callable[[InnovationsProblem], Estimate],
+    estimator: Search,
     likelihood: InnovationsProblem,
     first: Estimate,
     usual: float,
@@ -170,8 +172,8 @@ def _lowest_in_delay(
     return other if is_lower else first, None if is_lower else delay, int(near.rollouts) + int(other.rollouts)
 
 
-def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
-    """The parameters that are negative, though physics forbids it, fixed at 0."""
+def _without_negative(estimator: Search, before: Optimum, progress: Progress) -> Optimum:
+    """The parameters that are negative, though physics forbids it, fixed at 0, if that leaves an answer."""
     negative = {
         row.name: (value, std) for row, value, std in _rows(before) if row.nonnegative and value < -NEGATIVE * std
     }
@@ -182,10 +184,12 @@ def _without_negative(estimator: AbstractEstimator, before: Optimum, progress: P
     covariance = np.asarray(before.estimate.covariance)
     freed = covariance[:, places] @ np.linalg.pinv(covariance[np.ix_(places, places)]) @ covariance[places]
     after = before.restricted(estimator, dict.fromkeys(negative, 0.0))
+    if not has_answer(after.estimate.result):
+        return before._replace(rollouts=after.rollouts)
     return after._replace(negative=negative, freed=freed)
 
 
-def _at_nominal_values(estimator: AbstractEstimator, before: Optimum, progress: Progress) -> Optimum:
+def _at_nominal_values(estimator: Search, before: Optimum, progress: Progress) -> Optimum:
     """The parameters near their nominal values fixed there, unless that clearly raises the cost."""
     nominal = {
         row.name: row.nominal
