@@ -27,7 +27,7 @@ _CHUNK = 4 * _BLOCK
 
 
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *first: Any) -> Callable:
-    """`function` with its `first` arguments, as a function of the others: arrays. `of_batch` computes it in `jax.vmap`.
+    """`function` with its `first` arguments, as a function of the others: arrays. `jax.vmap` calls `of_batch` instead.
 
     `of_batch` takes the number of lanes and two trees of all arguments. The first holds those that differ between
     lanes, with the lanes first; the second holds those that all lanes share. In each, the others are `None`. It returns
@@ -62,7 +62,7 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *fi
 
 
 def in_blocks(function: Callable, *arguments: Any) -> Any:
-    """`function(*arguments)`, of which `jax.vmap` computes a batch in blocks, one after the other; on a CPU only.
+    """`function(*arguments)`. On a CPU, `jax.vmap` of it computes a batch in blocks, one after the other.
 
     A slow flight then holds up its block only. `function` may be a method; its module's arrays are batched too.
     """

@@ -122,7 +122,7 @@ def sweep_widths(problem: jaxos4.ShootingProblem) -> np.ndarray:
     """Half-widths of the brackets as each sweep of IBSS opens them: of each parameter, sweep by sweep."""
     solver, count, widths = jaxos4.IBSS(), problem.unknowns.count, []
     stages = problem.stages(solver.shares)
-    found = before_search(problem, stages)
+    found = before_search(problem)
     for number in range(stages.number):
         stage = stages.at(number, found.unknowns)
         stage = stage._replace(local_model=jax.jit(stage.local_model))

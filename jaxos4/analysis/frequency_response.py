@@ -24,7 +24,7 @@ _BOUNDLESS = 700.0  # a logarithm whose factor is still a number
 
 LOW, HIGH = 4.0, 20.0  # Hz; the band in which the model is compared
 HIGHEST = 40.0  # Hz; few vehicles move faster
-UNCLEAR = 0.5  # standard deviation of a gain, as a share of the model's, from which on the gain does not count
+UNCLEAR = 0.5  # a gain does not count if its standard deviation exceeds this share of the model's
 
 
 class Agreement(NamedTuple):
@@ -103,7 +103,7 @@ class AxisResponse(Arrays, frozen=True, eq=False):
 
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
-        """Whether the gain at each frequency is known to half of the model's, whatever the gain."""
+        """Whether the standard deviation of the gain at each frequency is below half of the model's gain."""
         return self.gain * self.error < UNCLEAR
 
 
@@ -216,7 +216,7 @@ def response(
         """The logarithm of the response, its derivatives times the standard deviations, and the disturbance's power."""
         regressors = np.hstack([off[before[:, 1:]], u[before[:, first:]], np.ones((rows.size, 1))])
         sizes, directions = np.linalg.eigh(regressors.T @ regressors)
-        # An input that hardly moves tells nothing.
+        # An input that hardly varies carries no information.
         inverse_root = directions / np.sqrt(np.maximum(sizes, 0) + _RIDGE * sizes.sum())
         found = inverse_root @ (inverse_root.T @ (regressors.T @ off[rows]))
         variance = np.square(off[rows] - regressors @ found).sum() / (rows.size - found.size)

@@ -14,12 +14,7 @@ from .._custom_types import Count, Scalar, integer, setting
 from ..bracket import GAUSSIAN_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, as_estimate, fit_start
 from ..results import RESULTS
-from ..shooting import (
-    AbstractProblem,
-    InnovationsProblem,
-    ShootingProblem,
-    in_blocks,
-)
+from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem, in_blocks
 from .levenberg_marquardt import LevenbergMarquardt
 from .solver import solve
 

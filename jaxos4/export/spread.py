@@ -108,7 +108,10 @@ def _slopes(
 def _sizes(
     file: VehicleIdentification, mean: Mapping[str, float], parameters: Sequence[str]
 ) -> dict[str, tuple[str, float, float]]:
-    """The verdict on each moment of inertia and parameter, of what its moves are shares, and how wide a guess is."""
+    """The name of its verdict, the size that its moves are shares of, and the width of a guess, by name.
+
+    The names are those of moments of inertia and parameters.
+    """
     terms = {x.name: (term.verdict, x.half_width) for term in TERMS.values() for x in term.parameters}
     sizes = {name: (name, mean[name], _GUESS * mean[name]) for name in INERTIAS}
     for name in parameters:

@@ -74,6 +74,11 @@ class Answer:
         """The indices of the parameters that are estimated."""
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.fixed]
 
+    @property
+    def gains(self) -> list[int]:
+        """The indices of the parameters that scale all torques."""
+        return [i for i, parameter in enumerate(self.problem.model.parameters) if parameter.scales_torque]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OS4Answer(Answer):
@@ -130,7 +135,7 @@ def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
     # No likelihood shows an error of the accelerometer's scale.
     scale = np.zeros_like(std)
-    for gain in _gains(answer):
+    for gain in answer.gains:
         scale[gain] = SCALE_ERROR * values[gain]
     std, width = np.hypot(std, scale), np.hypot(width, NINETY_FIVE * scale)
 
@@ -198,12 +203,7 @@ def thrust_excess(answer: Answer) -> float:
     model, values = answer.problem.model, answer.parameters
     if isinstance(model, FlightModel) and follows_commands(model.terms):
         return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
-    return float(np.prod(values[_gains(answer)])) - 1
-
-
-def _gains(answer: Answer) -> list[int]:
-    """The places of the parameters that scale all torques."""
-    return [i for i, parameter in enumerate(answer.problem.model.parameters) if parameter.scales_torque]
+    return float(np.prod(values[answer.gains])) - 1
 
 
 def drag_error(answer: Answer) -> float:
@@ -226,7 +226,7 @@ def vehicle_constants(answer: Answer) -> RigidBody:
     model, free, values = answer.problem.model, answer.free, answer.parameters
     known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), answer.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
-    gains = _gains(answer)
+    gains = answer.gains
     for gain in gains:
         # Torques exceed the airframe's by this factor, even if the factor is hardly known.
         for place in INVERSES:

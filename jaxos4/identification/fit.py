@@ -265,8 +265,7 @@ def moved(row: SampleTime, other: SampleTime) -> list[str]:
 
 def sample_time_of(answer: VehicleAnswer) -> SampleTime:
     """The answer at one sample time. Without a thrust, torques have no scale, so there is no answer."""
-    scales = [each.name for each in answer.problem.model.parameters if each.scales_torque]
-    answered = answer.answered and not any(name in answer.fixed for name in scales)
+    answered = answer.answered and {*answer.gains} <= {*answer.free}
     constants = vehicle_constants(answer).constants if answered else {}
     if answered and YAW.motion in dominated(answer):
         constants = {name: row for name, row in constants.items() if name != YAW.inertia}

@@ -167,8 +167,7 @@ def consequences(
     if str(result_names(other.estimate.result)) not in ("successful", "at_bound"):
         return dict.fromkeys((*constants, *others))
     moved, std = other.values, deviations(answer.estimate.covariance)
-    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
-    factor = np.prod(moved[gains] / values[gains])
+    factor = np.prod(moved[answer.gains] / values[answer.gains])
     moves: dict[str, Move | None] = {}
     for axis in AXES:
         if (row := constants.get(axis.inertia)) is not None:

@@ -33,7 +33,7 @@ Search = Callable[[InnovationsProblem], Estimate]
 class Optimum(NamedTuple):
     """The optimum that a search found with the likelihood of innovations.
 
-    - `data`: that were searched. `likelihood`: theirs, with what is fixed.
+    - `data`: of the search. `likelihood`: theirs, with some parameters fixed.
     - `estimate`: of all its unknowns, with the covariance of the search.
     - `unrestricted`, `unknowns`: the estimate and the parameters before any parameter was fixed.
     - `rollouts`: of all searches together.
@@ -104,7 +104,7 @@ class Optimum(NamedTuple):
         values: Mapping[str, float],
         start: Float[np.ndarray, " unknowns"] | None = None,
     ) -> "Optimum":
-        """All others searched again with some parameters fixed. `start`: of the search; by default this optimum."""
+        """Another search with some parameters fixed. `start`: where it starts; by default at this optimum."""
         fixed = self.likelihood.fix({name: np.asarray(value) for name, value in values.items()})
         likelihood = fixed.starting_from(self.values if start is None else start)
         found = jax.block_until_ready(estimator(likelihood))
@@ -121,7 +121,7 @@ def search(
 ) -> Optimum:
     """The optimum without the parameters that came out negative, or near their nominal values.
 
-    **Arguments:** `start`: of the search; by default that of the likelihood, also if there is no answer from `start`.
+    **Arguments:** `start`: where the search starts; by default, or without an answer from there, at the likelihood's.
     `compared_delay`: that of the optimum for longer samples.
     """
     likelihood, first, spent = data.likelihood, None, 0

@@ -8,7 +8,7 @@ import functools
 import io
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -40,18 +40,11 @@ _OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other 
 _REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 
 
-class _Protocol(NamedTuple):
-    """The values of motors' outputs at idle and at full speed; parameters that hold others within `limits`."""
-
-    ends: tuple[float, float]
-    parameters: tuple[str, ...] = ()
-    limits: tuple[float, float] = (0.0, 0.0)
-
-
-_PROTOCOLS = {
-    "PWM": _Protocol(ends=(1000.0, 2000.0), parameters=("{bank}_", "PWM_"), limits=(800.0, 2200.0)),
-    "UAVCAN": _Protocol(ends=(1.0, 8191.0), parameters=("UAVCAN_EC_",), limits=(0.0, 8191.0)),
-    "DShot": _Protocol(ends=(0.0, 1999.0)),
+# By protocol: the values of motors' outputs at idle and at full speed, the parameters that hold others, their limits.
+_PROTOCOLS: dict[str, tuple[tuple[float, float], tuple[str, ...], tuple[float, float]]] = {
+    "PWM": ((1000.0, 2000.0), ("{bank}_", "PWM_"), (800.0, 2200.0)),
+    "UAVCAN": ((1.0, 8191.0), ("UAVCAN_EC_",), (0.0, 8191.0)),
+    "DShot": ((0.0, 1999.0), (), (0.0, 0.0)),
 }
 _LINKS = {4: "UAVCAN", 5: "DShot"}  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
 _DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TIM0 and so on
@@ -234,7 +227,7 @@ def _bank_of_motors(log: Messages) -> tuple[str, list[int]] | None:
 def _limits(log: Messages, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
     """The protocol, and the values of each output at which its motor idles and is at full speed."""
     turning, get = values[values > 1], log.parameters.get
-    shortest, longest = _PROTOCOLS["PWM"].limits  # us
+    _, _, (shortest, longest) = _PROTOCOLS["PWM"]  # us
     small, link = (turning < shortest).any(), _LINKS.get(int(log.latest("esc_status", "esc_connectiontype") or 0))
     timers = {get(f"{bank}_TIM{i}") for i in range(8)}
     kind = "PWM"
@@ -242,14 +235,13 @@ def _limits(log: Messages, values: np.ndarray, bank: str, channels: list[int]) -
         kind = "UAVCAN"
     elif small or link == "DShot" or get("DSHOT_CONFIG", 0.0) > 0 or timers & {*_DSHOT_TIMERS}:
         kind = "DShot"
-    protocol = _PROTOCOLS[kind]
-    ends, (least, most) = protocol.ends, protocol.limits
+    ends, parameters, (least, most) = _PROTOCOLS[kind]
     if kind == "DShot" and 0 <= (idle := get("DSHOT_MIN", 0.0)) < 0.5:
         ends = ends[1] * idle, ends[1]
 
     def known(end: int, channel: int) -> float:
         """By the output's number, else of the bank, else the default."""
-        names = [f"{name.format(bank=bank)}{('MIN', 'MAX')[end]}" for name in protocol.parameters]
+        names = [f"{name.format(bank=bank)}{('MIN', 'MAX')[end]}" for name in parameters]
         every = [get(f"{name}{number}") for name in names for number in (channel + 1, "")]
         return next((each for each in every if each is not None and least <= each <= most), ends[end])
 

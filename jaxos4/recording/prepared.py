@@ -49,7 +49,7 @@ class Prepared(NamedTuple):
     - `tested`: the same samples with only the held-out measurements; `None`: nothing is held out.
     - `recordings`: for each stretch, the number of its recording, from 0.
     - `time`: the time of each sample in its log [s].
-    - `length`: the number of samples of a window.
+    - `windows`: the number of windows; each lies in one stretch.
     - `available`: the data that every recording offers to the terms of a model, see `Term.needs`.
     - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `force_level`.
       `None`: unknown.
@@ -66,7 +66,7 @@ class Prepared(NamedTuple):
     tested: Flight | None
     recordings: tuple[int, ...]
     time: Float[np.ndarray, " samples"]
-    length: int
+    windows: int
     available: frozenset[str]
     level: tuple[float, float] | None
     force_noise: Float[np.ndarray, "3"]
@@ -76,11 +76,6 @@ class Prepared(NamedTuple):
     log_step: float = 0.0
     motor_step: float = 0.0
     vibrates: Mapping[str, float] = MappingProxyType({})
-
-    @property
-    def windows(self) -> int:
-        """The number of windows; each lies in one stretch."""
-        return self.fitted.time.shape[0] // self.length
 
     @property
     def battery_voltage(self) -> float | None:
@@ -309,7 +304,7 @@ def _sampled(
         tested=None if tested is None else tested.flight,
         recordings=numbers,
         time=np.concatenate([each.time for each in flown]),
-        length=length,
+        windows=everything.time.size // length,
         available=_available_inputs(everything, flown, airframe),
         level=force_level(fitted, ups, rests, float(airframe.gravity)),
         force_noise=noise / math.sqrt(step),

@@ -16,6 +16,7 @@ from ..airframe import INERTIAS, MOTIONS
 from ..analysis.frequency_response import HIGHEST
 from ..analysis.prediction import decisive_horizon
 from ..errors import InputError
+from ..flight import RATE_NAMES
 from ..identification.results import Identification, VehicleIdentification
 from ..identification.tables import physical_quantities
 from .identification_figures import gain
@@ -106,9 +107,6 @@ def _look(mark: Line) -> dict[str, Any]:
     return look | ({"markerfacecolor": "none"} if mark.hollow else {})
 
 
-_RATES = ("p", "q", "r")
-
-
 class Plots(NamedTuple):
     """Figures of an identification. Each method draws on `ax`, or a new one, and returns it, or raises `InputError`."""
 
@@ -124,7 +122,7 @@ class Plots(NamedTuple):
             raise InputError(
                 "the result has no predictions of data that were not fitted; give `holdout` or `validate`."
             )
-        column = _place("rate", rate, _RATES)
+        column = _place("rate", rate, RATE_NAMES)
         known = np.isfinite(ahead.measured).any(axis=(0, 2))
         far = None if horizon is None else np.abs(ahead.horizons - horizon)
         nearest = decisive_horizon(ahead.horizons, known) if far is None else int(far.argmin())

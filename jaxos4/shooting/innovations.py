@@ -57,8 +57,8 @@ class InnovationsProblem(AbstractProblem):
     - `input_innovations`: for each channel, the part of torque or thrust within a sample that the past does not
       predict, see `jaxos4.shooting.feedthrough`. By default none: the controller knows no more than the log.
     - `answers_within`: whether the controller answers a rate within its sample; otherwise feedthroughs are 0.
-    - `lagged`: whether input innovations after the first are those of samples before, see `feedthrough.lagged`. They
-      get no gain on the disturbance of a rate: one sample later, it is the same disturbance less a step of the rate.
+    - `lagged`: whether input innovations after the first belong to earlier samples, see `feedthrough.lagged`. They get
+      no gain on the disturbance of a rate, which would repeat a gain of the earlier sample, less a step of the rate.
     - `noise_feedthrough`: feedthroughs that were found before. What they explain still counts as noise. NaN (default):
       unknown. A search then has two stages: the first finds them, the second counts what they explain.
     - `start`: where searches start. NaN (default): the center of the bracket, with each of several time constants.
@@ -159,7 +159,7 @@ class InnovationsProblem(AbstractProblem):
 
     @property
     def initial_guess(self) -> InitialGuess:
-        """`start` where it is not NaN, so that a complete one makes all starts equal. Filters find their own states."""
+        """`start` where it is not NaN; a complete one makes all starts equal. Filters estimate the initial state."""
         unknowns, count = self.unknowns.usable, self.problem.unknowns.count
         place, times = np.arange(unknowns.count) - count, jnp.log(jnp.asarray(TIMES))
         is_time = (place >= 0) & (place % len(self._own) == 1)

@@ -11,16 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import (
-    Count,
-    InitialState,
-    InitialStates,
-    Numeric,
-    Parameters,
-    Scalar,
-    StateVector,
-    as_float,
-)
+from .._custom_types import Count, InitialState, InitialStates, Numeric, Parameters, Scalar, StateVector, as_float
 from ..batching import in_blocks
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight

@@ -191,7 +191,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         return scenario._replace(channels=channels, **shared) if kind.needs_network else None
 
     def seed_channels(self, scenario: Scenario) -> str:
-        """The channels that a hybrid's network looks at: it only says where to shoot."""
+        """The channels of a hybrid's network, which only gives the start of the search."""
         return min(scenario.seen, self.network.hybrid_channels, key=CHANNELS.__getitem__)
 
     def jobs(self) -> dict[Scenario, int]:
