@@ -206,7 +206,7 @@ def test_four_sample_times_and_the_profile_need_one_program(chosen):
     assert answer.constants == found.rigid_body.constants
     noted = {name for name, row in found.parameters.items() if "times as long, by the profile" in row.note}
     longer = {name for name, row in found.parameters.items() if row.std is not None and row.std >= 1.002 * row.bound}
-    assert longer == noted | set(found.widened)
+    assert longer == noted | set(found.widened) | {"thrust_gain"}  # by the error of the accelerometer's scale
     assert set() < noted <= {"alpha3", "alpha6", "alpha8"}
 
 
