@@ -118,9 +118,9 @@ def shoot(
 def shot_with_derivatives(
     problem: "ShootingProblem", length: Length
 ) -> Callable[[Rows, Parameters, InitialState], LocalModel]:
-    """What `shoot` computes, with gradient and information in the parameters and a free initial state.
+    """`shoot` with derivatives: gradient and information in the parameters and a free initial state.
 
-    It has a loop of its own, `_linearised_shot`. A batch runs in lanes.
+    It runs `_linearised_shot`, which computes a batch in lanes.
     """
     places, is_free = problem.model.forcing_parameters, problem.initial_state is None
     alone = functools.partial(_linearised_shot, forcing_parameters=places, initial_state_is_free=is_free)
