@@ -34,7 +34,7 @@ from .answers import OS4Answer, VehicleAnswer, dominated, vehicle_constants
 from .data import Data, Progress, name_and_class, silent
 from .intervals import at_lowest, corrected
 from .results import COLOURED, Constant, SampleTime
-from .search import Optimum, search
+from .search import Optimum, search, search_all
 
 DEFAULT = "filter-error"
 """The estimator of a vehicle, which flies in closed loop."""
@@ -167,35 +167,37 @@ def fit_sample_times(
     """The answers at the sample times that can be compared, the shortest first, and a row for each.
 
     Samples that hold the controller's answers as commands are a kind of their own: feedthroughs explain most of their
-    innovations. They are fitted only if the other kind has no white innovations, and before its shorter samples if its
-    longest ones are far from white. The first kind with white innovations ends the fits. The kind with the least
-    correlated innovations is returned.
+    innovations. They are fitted only if the other kind has no white innovations, and first if a search of all
+    parameters at its longest samples shows that these are far from white. The first kind with white innovations ends
+    the fits. The kind with the least correlated innovations is returned.
 
     `choose`: whether to choose the sample time; otherwise only the kind of the first is fitted.
     """
     kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
-    kinds = [some for some in kinds if some and (choose or some[0] is several[0])]
-    searches = [search_sample_times(some, solver, progress=progress) for some in kinds]
-    fitted: list[list[tuple[VehicleAnswer, SampleTime]]] = [[] for _ in kinds]
-
-    def fit_next(kind: int, most: int | None = None) -> bool:
-        """Fits more sample times of a kind. Whether any of this kind has white innovations."""
-        for optimum in itertools.islice(searches[kind], most):
+    kinds = [(some, None) for some in kinds if some and (choose or some[0] is several[0])]
+    if len(kinds) > 1:
+        (some, _), other = kinds
+        progress(_fitting(some[-1]))
+        longest = search_all(solver, some[-1])
+        row = sample_time_of(corrected(longest))
+        is_far = row.constants and not is_white(row, FAR)
+        kinds = [other, (some, longest)] if is_far else [(some, longest), other]
+    fitted = []
+    for some, longest in kinds:
+        answers = []
+        for optimum in search_sample_times(some, solver, longest=longest, progress=progress):
             progress("computing intervals")
             answer = corrected(optimum)
-            fitted[kind].insert(0, (answer, sample_time_of(answer)))
-        return any(row.constants and is_white(row) for _, row in fitted[kind])
-
-    order = [*range(len(kinds))]
-    fit_next(0, 1)
-    _, longest = fitted[0][0]
-    if longest.constants and not is_white(longest, FAR):
-        order.reverse()
-    for kind in order:
-        if fit_next(kind):
+            answers.insert(0, (answer, sample_time_of(answer)))
+        fitted.append(answers)
+        if any(row.constants and is_white(row) for _, row in answers):
             break
     answers, rows = zip(*min(fitted, key=_least_correlation), strict=True)
     return list(answers), list(rows)
+
+
+def _fitting(data: Data[InnovationsProblem]) -> str:
+    return f"fitting samples of {1e3 * float(data.problem.flight.dt):.3g} ms"
 
 
 def _least_correlation(fitted: Sequence[tuple[VehicleAnswer, SampleTime]]) -> float:
@@ -203,23 +205,28 @@ def _least_correlation(fitted: Sequence[tuple[VehicleAnswer, SampleTime]]) -> fl
 
 
 def search_sample_times(
-    several: Sequence[Data[InnovationsProblem]], estimator: AbstractEstimator, *, progress: Progress = silent
+    several: Sequence[Data[InnovationsProblem]],
+    estimator: AbstractEstimator,
+    *,
+    longest: Optimum | None = None,
+    progress: Progress = silent,
 ) -> Iterator[Optimum]:
     """The optimum at each sample time, the longest first.
 
     Each search starts at the answer for the next longer sample time, if that is a minimum. It starts at the bracket's
     centre where feedthroughs are no longer estimated.
 
-    **Arguments:** `several`: one flight at several sample times, each twice the one before.
+    **Arguments:** `several`: one flight at several sample times, each twice the one before. `longest`: the result of
+    `search_all` for the longest samples, if it is known.
     """
-    optimum = None
+    optimum, first = None, longest
     for data in reversed(several):
-        step = 1e3 * float(data.problem.flight.dt)
-        progress(f"fitting samples of {step:.3g} ms")
+        if first is None:
+            progress(_fitting(data))
         start, own, compared = None, data.likelihood, None
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
             start, compared = start_of(own, optimum.unrestricted), optimum.compared_delay
-        optimum = search(estimator, data, start=start, compared_delay=compared)
+        optimum, first = search(estimator, data, start=start, first=first, compared_delay=compared), None
         yield optimum
 
 

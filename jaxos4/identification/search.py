@@ -116,60 +116,67 @@ def search(
     data: Data[InnovationsProblem],
     *,
     start: Float[np.ndarray, " unknowns"] | None = None,
+    first: Optimum | None = None,
     compared_delay: float | None = None,
     progress: Progress = silent,
 ) -> Optimum:
     """The optimum without the parameters that came out negative, or near their nominal values.
 
-    **Arguments:** `start`: where the search starts; by default, or without an answer from there, at the likelihood's.
-    `compared_delay`: that of the optimum for longer samples.
+    **Arguments:** `start`: see `search_all`. `first`: the result of `search_all`, if it is known. `compared_delay`:
+    that of the optimum for longer samples.
     """
-    likelihood, first, spent = data.likelihood, None, 0
-    if start is not None:
-        first = jax.block_until_ready(estimator(likelihood.starting_from(start)))
-        spent = int(first.rollouts)
-    if first is None or not has_answer(first.result):
-        first = jax.block_until_ready(estimator(likelihood))
-        spent += int(first.rollouts)
+    first = search_all(estimator, data, start=start) if first is None else first
     usual = USUAL_DELAY_OF_COMMANDS if data.follows_commands else USUAL_DELAY
-    first, compared, more = _lowest_in_delay(estimator, likelihood, first, usual, compared_delay, progress)
-    optimum = Optimum(
-        data, likelihood, first, first, likelihood.problem.unknowns, spent + more, compared_delay=compared
-    )
-    optimum = optimum._replace(likelihood=likelihood.with_noise_feedthrough(optimum.by_segment.noise_feedthrough))
+    optimum = _lowest_in_delay(estimator, first, usual, compared_delay, progress)
+    counted = optimum.by_segment.noise_feedthrough
+    optimum = optimum._replace(likelihood=optimum.likelihood.with_noise_feedthrough(counted))
     optimum = _without_negative(estimator, optimum, progress)
     return _at_nominal_values(estimator, optimum, progress)
 
 
-def _lowest_in_delay(
-    estimator: Search,
-    likelihood: InnovationsProblem,
-    first: Estimate,
-    usual: float,
-    compared: float | None = None,
-    progress: Progress = silent,
-) -> tuple[Estimate, float | None, int]:
-    """The estimate, or a lower minimum near the `usual` delay of the rotors [s].
+def search_all(
+    estimator: Search, data: Data[InnovationsProblem], *, start: Float[np.ndarray, " unknowns"] | None = None
+) -> Optimum:
+    """The optimum of all parameters.
 
-    **Returns:** also the delay, if the search stays there after a comparison, and the rollouts that this took. A delay
-    near the one that was `compared` for longer samples is not compared again.
+    `start`: where the search starts; by default, or without an answer from there, at the likelihood's.
     """
-    names = likelihood.problem.unknowns.names
-    if likelihood.answers_within or "rotor_delay" not in names or not has_answer(first.result):
-        return first, None, 0
-    delay, near_it = float(first.parameters[names.index("rotor_delay")]), float(likelihood.flight.dt) / 2
+    likelihood, found, spent = data.likelihood, None, 0
+    if start is not None:
+        found = jax.block_until_ready(estimator(likelihood.starting_from(start)))
+        spent = int(found.rollouts)
+    if found is None or not has_answer(found.result):
+        found = jax.block_until_ready(estimator(likelihood))
+        spent += int(found.rollouts)
+    return Optimum(data, likelihood, found, found, likelihood.problem.unknowns, spent)
+
+
+def _lowest_in_delay(
+    estimator: Search, first: Optimum, usual: float, compared: float | None = None, progress: Progress = silent
+) -> Optimum:
+    """The optimum, or a lower minimum near the `usual` delay of the rotors [s].
+
+    A delay near the one that was `compared` for longer samples is not compared again.
+    """
+    likelihood, found, names = first.likelihood, first.estimate, first.unknowns.names
+    if likelihood.answers_within or "rotor_delay" not in names or not has_answer(found.result):
+        return first
+    delay, near_it = float(found.parameters[names.index("rotor_delay")]), float(likelihood.flight.dt) / 2
     if abs(delay - usual) <= near_it:
-        return first, None, 0
+        return first
     if compared is not None and abs(delay - compared) <= near_it:
-        return first, compared, 0
+        return first._replace(compared_delay=compared)
     progress("fitting again near the usual delay of the rotors")
     at_usual = likelihood.fix({"rotor_delay": np.asarray(usual)})
-    near = jax.block_until_ready(estimator(at_usual.starting_from(first.parameters)))
+    near = jax.block_until_ready(estimator(at_usual.starting_from(found.parameters)))
+    spent = first.rollouts + int(near.rollouts)
     if not has_answer(near.result):
-        return first, None, int(near.rollouts)
+        return first._replace(rollouts=spent)
     other = jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
-    is_lower = has_answer(other.result) and float(first.cost) - float(other.cost) > LOWER
-    return other if is_lower else first, None if is_lower else delay, int(near.rollouts) + int(other.rollouts)
+    spent += int(other.rollouts)
+    if has_answer(other.result) and float(found.cost) - float(other.cost) > LOWER:
+        return first._replace(estimate=other, unrestricted=other, rollouts=spent)
+    return first._replace(compared_delay=delay, rollouts=spent)
 
 
 def _without_negative(estimator: Search, before: Optimum, progress: Progress) -> Optimum:
