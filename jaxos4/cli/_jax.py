@@ -22,6 +22,8 @@ def prepare(*, batch: bool) -> None:
     """
     if not batch:
         add_flags(quick=True)
+    # Matrices have at most some hundred columns: threads of OpenBLAS would wait for longer than they compute.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
     import jax
 
