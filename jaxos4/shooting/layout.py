@@ -154,7 +154,10 @@ def capacity_of(samples: int) -> int:
 
 
 def pad_flight(flight: Flight, capacity: int) -> Flight:
-    """The flight with more rows, up to `capacity`, in which nothing was measured and the inputs stay as they were."""
+    """The flight with more rows, up to `capacity`, in which nothing was measured and the inputs stay as they were.
+
+    `commanded` and `held`, which no model reads, have their defaults: they are static, and would divide programs.
+    """
     samples = flight.time.shape[0]
 
     def pad(name: str, signal: Signal) -> jax.Array | None:
@@ -168,5 +171,7 @@ def pad_flight(flight: Flight, capacity: int) -> Flight:
     return dataclasses.replace(
         flight,
         time=np.asarray(flight.time)[0] + float(flight.dt) * np.arange(capacity),
+        commanded=False,
+        held=True,
         **{name: pad(name, signal) for name, signal in SIGNALS.items()},
     )
