@@ -161,7 +161,7 @@ def _lowest_in_delay(
     likelihood, found, names = first.likelihood, first.estimate, first.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(found.result):
         return first
-    delay, near_it = float(found.parameters[names.index("rotor_delay")]), float(likelihood.flight.dt) / 2
+    delay, near_it = float(first.values[names.index("rotor_delay")]), float(likelihood.flight.dt) / 2
     if abs(delay - usual) <= near_it:
         return first
     if compared is not None and abs(delay - compared) <= near_it:

@@ -7,6 +7,7 @@ with alpha by `alpha_from_inertia`; (14) `STATE_NAMES`.
 import abc
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -35,11 +36,13 @@ class AbstractOS4(AbstractModel):
         return tuple(map(Parameter, PARAMETER_NAMES, units))
 
     @property
+    @eqx.filter_jit  # one program instead of a dozen small ones
     def alpha(self) -> Float[Array, "8"]:
         """alpha_1..8 by the definitions below Eq. (13)."""
         return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
 
     @property
+    @eqx.filter_jit
     def half_width(self) -> Float[Array, "8"]:
         """`DEFAULT_HALF_WIDTH`, with the widths of alpha3, alpha6 and alpha8 scaled to the airframe's inertia."""
         os4, own = (alpha_from_inertia(airframe.inertia, jnp.zeros(())) for airframe in (OS4, self.airframe))

@@ -193,8 +193,8 @@ class InnovationsProblem(AbstractProblem):
     def _levels(self) -> int:
         return levels(self.problem.columns.size)
 
-    def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "channels own"]:
-        return jnp.asarray(unknowns)[self.problem.unknowns.count :].reshape(-1, len(self._own))
+    def _of_channels(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Numeric, "channels own"]:
+        return unknowns[self.problem.unknowns.count :].reshape(-1, len(self._own))
 
     def _input_unknowns(self, unknowns: Float[Numeric, " unknowns"]) -> Float[Array, "3 channels feedthroughs"]:
         """The gains of input innovations on rate and disturbance, then the feedthroughs."""
