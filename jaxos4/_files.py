@@ -10,40 +10,22 @@ import re
 import secrets
 import shutil
 import sys
-import tokenize
 import tomllib
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from .errors import InputError, in_words, printable, shortened
 
-# Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
-BROKEN = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
 
 @contextlib.contextmanager
-def reading(place: object, fault: str, remedy: str, *errors: type[Exception]) -> Iterator[None]:
-    """Raises what a reader raises for a damaged file as an `InputError`. `errors`: those besides `BROKEN`."""
+def reading(place: object, fault: str, remedy: str) -> Iterator[None]:
+    """Raises any error of the block as an `InputError`: a library raises anything if a file is damaged."""
     try:
         yield
     except InputError:
         raise
-    except (*BROKEN, *errors) as error:
+    except Exception as error:  # noqa: BLE001
         raise InputError(f"{place}: {fault} ({in_words(error)}); {remedy}.") from None
 
 

@@ -38,6 +38,7 @@ _TIMES = ("SampleUS", "TimeUS")
 _INSTANCES = ("I", "C", "Instance", "Inst")  # fields that number sensors, filters, motors or batteries
 _MOTORS, _MOTOR5 = range(33, 37), 37  # output functions
 _FAST = 1 | 1 << 18  # LOG_BITMASK: fast attitude, fast IMU
+_LARGEST, _MOST_DAMAGE = 1 << 30, 1000  # bytes; places
 _REMEDY = "the log is corrupt there: download it again, or choose another"
 
 
@@ -90,9 +91,9 @@ def _rotors(log: Messages, outputs: list[int]) -> Rotors | None:
     return Rotors(shares, [f"RCOU.C{output + 1}" for output in outputs], is_measured=False, note=note)
 
 
-def _decoded(path: LogPath, *, largest: int = 1 << 30, most_damage: int = 1000) -> Messages:
-    """The messages that are read. Raises `InputError` for more than `largest` bytes, or places of damage."""
-    content, at, notes = read_bytes(path, largest), 0, []
+def _decoded(path: LogPath) -> Messages:
+    """The messages that are read. Raises `InputError` for a file that is too large, or too damaged."""
+    content, at, notes = read_bytes(path, _LARGEST), 0, []
     sizes, layouts = {_FMT: _FMT_LENGTH}, {}
     places = {number: array.array("q") for number in range(256)}
     end, damaged = len(content), 0
@@ -104,8 +105,8 @@ def _decoded(path: LogPath, *, largest: int = 1 << 30, most_damage: int = 1000) 
         if not whole or not content.startswith(_HEAD[: end - following], following):
             following = content.find(_HEAD, at + 1)
             damaged += following > 0
-            if damaged > most_damage:
-                refuse(path, f"is damaged in more than {most_damage} places; {_REMEDY}")
+            if damaged > _MOST_DAMAGE:
+                refuse(path, f"is damaged in more than {_MOST_DAMAGE} places; {_REMEDY}")
             at = following if following > 0 else end
             continue
         if number == _FMT:

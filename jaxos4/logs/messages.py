@@ -24,6 +24,7 @@ from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, order_note, ref
 from .values import dropped, without_impossible
 
 _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
+_FASTER = 1.1  # times the rate of another source; a smaller difference does not count
 
 Names = tuple[str, ...]
 Fields = dict[str, np.ndarray]
@@ -112,20 +113,15 @@ class Messages:
             values = np.column_stack([raw[name].astype(float)[kept] for name in fields])
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
 
-    def fastest(
-        self, columns: Sequence[str], sources: Iterable[MessageSource], *, faster: float = 1.1
-    ) -> Series | None:
-        """The source that was logged most often, in our units and frame.
-
-        A later source replaces an earlier one only if its rate is `faster` times as high.
-        """
+    def fastest(self, columns: Sequence[str], sources: Iterable[MessageSource]) -> Series | None:
+        """The source that was logged most often, in our units and frame. The first of those with nearly equal rates."""
         best, found = 0.0, None
         for kind, fields, factor in sources:
             for instance in self.fields.get(kind, ()):
                 series = self.series(kind, fields, instance)
                 if series is None or not np.isfinite(series.values).any():
                     continue
-                if found is None or logged_rate(series.t) > faster * best:
+                if found is None or logged_rate(series.t) > _FASTER * best:
                     best, found = logged_rate(series.t), Series(series.t, series.values * factor)
                     self.name(columns, kind, fields)
         return found

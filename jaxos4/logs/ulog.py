@@ -253,13 +253,12 @@ def _decoded(path: LogPath) -> Messages:
     """The topics that are needed. Raises `InputError`, one line, for a file that cannot be decoded."""
     try:
         from pyulog.core import ULog
-        from pyulog.exceptions import ULogException
     except ImportError:
         refuse(path, "reading a ULog file needs pyulog; install jaxos4[ulog]")
     content = read_bytes(path, 1 << 31)
     if content.endswith(bytes(64)):  # a loss of power leaves zeros at the end
         content = content.rstrip(b"\0")
-    damage = reading(path, "cannot be decoded", "copy the log again from the vehicle", ULogException)
+    damage = reading(path, "cannot be decoded", "copy the log again from the vehicle")
     with damage, contextlib.redirect_stdout(io.StringIO()):
         _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
         topics = {topic for columns in _COLUMNS for topic, *_ in _sources(columns)}
@@ -290,18 +289,21 @@ class _Content(io.BytesIO):
         return super().seek(offset, whence)
 
 
-def _check_formats(formats: Mapping[str, Any], *, most: int = 1024, deepest: int = 3) -> None:
-    """Refuse formats with too many fields or levels, as pyulog makes an object of each; PX4 has about 200 fields."""
+MAX_FIELDS, DEEPEST = 1024, 3  # of a message, with those of messages in it; PX4 has about 200
+
+
+def _check_formats(formats: Mapping[str, Any]) -> None:
+    """Refuse formats with too many fields or levels, because pyulog makes an object of each."""
 
     @functools.cache
     def count(name: str, depth: int) -> int:
-        if depth > deepest:
+        if depth > DEEPEST:
             raise ValueError("messages are nested too deeply")
         total = sum(
             max(size, 1) * (count(kind, depth + 1) if kind in formats else 1) for kind, size, _ in formats[name].fields
         )
-        if total > most:
-            raise ValueError(f"a message has more than {most} fields")
+        if total > MAX_FIELDS:
+            raise ValueError(f"a message has more than {MAX_FIELDS} fields")
         return max(total, 1)
 
     for name in formats:

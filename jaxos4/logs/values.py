@@ -83,19 +83,20 @@ def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " sample
     return out
 
 
-def without_impossible(
-    table: Table, limits: Mapping[str, ColumnLimits] = COLUMNS, *, most: float = 0.01, farthest: float = 10.0
-) -> Table:
+MAX_IMPOSSIBLE = 0.01  # the share of the values of a column that can be impossible; more are a wrong unit
+FARTHEST = 10.0  # times the speed that a rotor exceeds for the share `MAX_IMPOSSIBLE` of its flight
+
+
+def without_impossible(table: Table, limits: Mapping[str, ColumnLimits] = COLUMNS) -> Table:
     """The table without the values outside of `limits`, or `dropped`: they count as not measured.
 
-    - `most`: the share of the values of a column that can be impossible. More are a wrong unit: `InputError`.
-    - `farthest`: a rotor turns at most this many times as fast as in all but this share of its flight.
+    Raises `InputError` if a column has more than the share `MAX_IMPOSSIBLE` of such values.
     """
     columns, impossible = dict(table.columns), dict(table.impossible)
     for name, limit in limits.items():
         values, largest = columns.get(name, np.empty(0)), limit.largest
         if name in SPEED_NAMES and (values > 0).any():
-            largest = min(largest, farthest * float(np.quantile(values[values > 0], 1 - most)))
+            largest = min(largest, FARTHEST * float(np.quantile(values[values > 0], 1 - MAX_IMPOSSIBLE)))
         beyond = (values < limit.least) | (values > largest)
         if not limit.zero and values.size:
             columns[name] = np.where(values > 0, values, np.nan)
@@ -104,9 +105,9 @@ def without_impossible(
             continue
         count, index = int(np.count_nonzero(beyond)), int(np.argmax(beyond if beyond.any() else wrong))
         first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
-        if count > most * every:
+        if count > MAX_IMPOSSIBLE * every:
             low = values[index] < limit.least
-            share = f"{count} of {every} values, more than {100 * most:g} %"
+            share = f"{count} of {every} values, more than {100 * MAX_IMPOSSIBLE:g} %"
             what = f"is {first}, beyond {limit.least if low else limit.largest:.4g} {limit.unit} ({share}); "
             advice = (low and limit.below) or table.remedy or limit.advice
             table.refuse(what + advice, index=index, column=name)

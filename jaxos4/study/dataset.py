@@ -23,7 +23,7 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
-from .._files import BROKEN, check_plain, read_json, reading, write_file
+from .._files import check_plain, read_json, reading, write_file
 from .._version import __version__
 from ..errors import InputError, shortened
 from ..models import MODELS
@@ -102,9 +102,9 @@ class Store:
         path = self.cell_file(index)
         if not path.exists():
             return None
-        with reading(path, "not a whole cell", _RUN_AGAIN):
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
+        content = io.BytesIO(path.read_bytes())
+        with reading(path, "not a whole cell", _RUN_AGAIN), np.load(content, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
 
     def read_network(self, number: int) -> TrainedNetwork | None:
         """A network, or `None` if it is not trained. Raises `InputError` if its file is damaged."""
@@ -149,8 +149,8 @@ def read_store(directory: Path) -> Store:
     path = directory / _SPECIFICATION
     if not path.exists():
         raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.")
+    header = read_json(path, "give another folder")
     with reading(path, "not the specification of a study", "give another folder"):
-        header = read_json(path, "give another folder")
         if (version := header["version"]) == __version__:
             return Store(directory, msgspec.convert(header["study"], Study), header["device"])
     raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {__version__}; give another folder.")
@@ -288,7 +288,7 @@ def read_results(directory: Path) -> xr.Dataset:
         raise InputError(f"{directory}: no such folder; {_REMEDY}.")
     if not path.is_file():
         raise InputError(f"{directory}: holds no {RESULTS_FILE}; {_REMEDY}.")
-    with reading(path, "not a netCDF file that can be read", "run the study again", OSError):
+    with reading(path, "not a netCDF file that can be read", "run the study again"):
         _probe(path)
         with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
             dataset = opened.load()
@@ -337,11 +337,8 @@ def _check_texts(path: Path, dataset: xr.Dataset) -> None:
     """Refuse texts of many lines, and cells that failed without saying which."""
     texts: dict[str, Any] = {name: dataset[name].values.ravel().tolist() for name in (*COORDINATES, "seen", "unit")}
     check_plain(path, texts | {name: str(each).splitlines() for name, each in dataset.attrs.items()}, _REMEDY)
-    try:
+    with reading(path, "`failures` is not a list of cells that failed", _REMEDY):
         failures = json.loads(dataset.attrs.get("failures", "[]"))
-        wrong = [each for each in failures if not {"cell", "message", *SCENARIO} <= each.keys()]
-    except BROKEN:
-        failures, wrong = [], [None]
-    if wrong:
-        raise InputError(f"{path}: `failures` is not a list of cells that failed; {_REMEDY}.")
+        if not all({"cell", "message", *SCENARIO} <= each.keys() for each in failures):
+            raise ValueError("a cell has no name or message")
     check_plain(path, failures, _REMEDY)
