@@ -64,7 +64,7 @@ ROS = LogFormat(
 
 
 def _reader(path: LogPath) -> Any:
-    """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for one that is far too large."""
+    """The reader of rosbags for a file or folder, before it is opened. Raises `InputError` if the bag is too large."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2.storage_mcap import McapReader
@@ -84,9 +84,9 @@ def _reader(path: LogPath) -> Any:
 
 @contextlib.contextmanager
 def _only_tables(path: LogPath) -> Iterator[None]:
-    """Databases that are opened inside must consist of tables, and answer in a time that their size explains.
+    """Refuses SQLite databases, opened in the block, that hold a view or take more steps than their size explains.
 
-    A view can have rows without end, and so can damaged pages. A sound bag takes less than two steps for a byte.
+    A view can have endless rows, and so can damaged pages. A sound bag takes less than two steps for each byte.
     """
     import apsw
 
@@ -135,7 +135,7 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
 
 
 def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, dict[str, list[float]]]:
-    """By topic: the fields at these places, the stamps, and the times of the recorder [ns]. Raises `InputError`."""
+    """For each topic, the values at these places, the stamps, and the recorder's times [ns]. Raises `InputError`."""
     getters: dict[str, dict[str, Callable[[Any], float]]] = {}
     for place in sorted(places):
         topic, _, field = place.partition(".")
@@ -180,7 +180,7 @@ def _timed(
 
 
 def _decoder(path: LogPath, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
-    """A function that decodes messages of these connections, by their definitions in the file, or by those of ROS 2."""
+    """A decoder of these connections' messages, by the definitions in the file or, without them, by those of ROS 2."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -257,7 +257,7 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[T
         return Series(t, np.column_stack([at(name) for name in names]))
 
     def rotors(names: Sequence[str]) -> Rotors | None:
-        """The samples with all four rotors; `None` if one of them never turns, also of commands: no vehicle flew so."""
+        """The samples that have all four rotors. `None` if a rotor, measured or commanded, never turns."""
         found = together(names)
         if found is None or not (found.values > 0).any(axis=0).all():
             return None

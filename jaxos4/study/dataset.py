@@ -185,7 +185,7 @@ def assemble(store: Store) -> xr.Dataset:
     study, coordinates, failures = store.study, _coordinates(store.study), []
     blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {
-        name: np.full([len(coordinates[dim][1]) for dim in dims], blank.get(name, np.nan), kind)
+        name: np.full([len(coordinates[dim]) for dim in dims], blank.get(name, np.nan), kind)
         for name, (dims, kind, *_) in OF_CELLS.items()
     }
     for cell in map(study.cell, range(study.count)):
@@ -208,25 +208,26 @@ def assemble(store: Store) -> xr.Dataset:
                 arrays[name][shared if name == "truth" else own] = found
             if not np.isin(results["result"], np.arange(len(OUTCOMES))).all():
                 raise ValueError("unknown result")
-    variables = {name: _described(name, values) for name, values in (arrays | _brackets(study)).items()}
     command = {"command": "jaxos4 study specification.toml --out .", "failures": json.dumps(failures)}
-    dataset = xr.Dataset(variables, coordinates, provenance(study, store.device) | command)
-    flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
-    dataset["result"].attrs |= flags
-    return dataset
+    attributes = provenance(study, store.device) | command
+    return xr.Dataset(described(arrays | _brackets(study)), described(coordinates), attributes)
 
 
-def _coordinates(study: Study) -> dict[str, tuple]:
+def _coordinates(study: Study) -> dict[str, Any]:
     model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
     values = [list(getattr(study, axis)) for axis in AXES]
     values += [np.arange(study.flights), list(model.parameter_names), list(LEVELS)]
-    known = dict(zip(COORDINATES, values, strict=True)) | {"unit": list(model.parameter_units)}
-    return {name: _described(name, some) for name, some in known.items()}
+    return dict(zip(COORDINATES, values, strict=True)) | {"unit": list(model.parameter_units)}
 
 
-def _described(name: str, values: Any) -> tuple[tuple[str, ...], Any, dict[str, str]]:
-    dims, _, units, about = SCHEMA[name]
-    return dims, values, {"long_name": about, "units": units}
+def described(arrays: dict[str, Any]) -> dict[str, tuple[tuple[str, ...], Any, dict[str, Any]]]:
+    """Arrays of a study's Dataset as xarray takes them, with their dimensions and attributes by `SCHEMA`."""
+    flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
+    found = {}
+    for name, values in arrays.items():
+        dims, _, units, about = SCHEMA[name]
+        found[name] = dims, values, {"long_name": about, "units": units} | (flags if name == "result" else {})
+    return found
 
 
 def provenance(study: Study, device: str) -> dict[str, str | int]:
