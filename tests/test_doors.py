@@ -14,7 +14,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from flight_csvs import csv, write_log
-from helpers import refused
+from helpers import output_of, refused
 from hypothesis import given, settings, strategies as st
 from recorded_logs import ACCIDENTS, damaged, outcome
 from small_study import AIRFRAME, SPECIFICATION
@@ -34,8 +34,7 @@ from jaxos4.networks.file import load_network
 from jaxos4.study import load_study
 from jaxos4.study.dataset import read_store
 
-MINE = "mass = 0.6\ninertia = [7e-3, 7e-3, 1.2e-2]\narm = 0.2\nthrust_coefficient = 3e-5\ndrag_coefficient = 7e-7\n"
-MINE += "rotor_inertia = 6e-5\nmax_rotor_speed = inf\n"
+MINE = AIRFRAME.replace("[airframe.mine]", "") + "max_rotor_speed = inf\n"
 STUDY = SPECIFICATION.replace("title", 'airframes = ["mine"]\ntitle') + AIRFRAME
 RESULT = predicting_result()
 NESTED = 250_000 * "["
@@ -208,8 +207,7 @@ def test_a_pipe_with_another_end_is_written_and_read_to_its_end(tmp_path):
 
 def test_a_name_with_a_line_break_writes_nothing_into_the_drafted_airframe(run, tmp_path):
     write_log(tmp_path / "a\nmass = 1\n.csv")
-    code, out, err = run("inspect", "a\nmass = 1\n.csv", "--airframe-out", "mine.toml")
-    assert (code, err) == (0, "")
+    out = output_of(run("inspect", "a\nmass = 1\n.csv", "--airframe-out", "mine.toml"))
     text = (tmp_path / "mine.toml").read_text(encoding="utf-8")
     assert text.startswith("# The airframe of a\\nmass = 1\\n.csv. SI units.\n")
     assert "\nmass" not in text
