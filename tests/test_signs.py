@@ -60,7 +60,7 @@ def test_a_fit_is_refused_with_the_remedy_unless_the_vehicle_does_not_turn():
     assert opposite_axes([still], turned(CRAZYFLIE, "rotor_spins")) == opposite_axes([], CRAZYFLIE) == []
     brief = cut(averaged(recording, [0.02])[0], Stretch(0.0, 1.5))  # too short for signals from 2 Hz on
     assert opposite_axes([brief], turned(CRAZYFLIE, "rotor_spins")) == []
-    assert (refused_note({}), opposite_yaw(None)) == ("", None)
+    assert (refused_note({}), opposite_yaw({})) == ("", None)
 
 
 @pytest.mark.parametrize("name", ["rollpitch", "yaw_a", "hover"])

@@ -70,7 +70,7 @@ ARDUPILOT = LogFormat("ArduPilot", "ArduPilot DataFlash log", _recognises, read_
 
 
 def _rotors(log: Messages, outputs: list[int]) -> Rotors | None:
-    """Measured speeds, or commands if there are none, or only rare ones."""
+    """Measured speeds; or commands, if speeds were not logged, or too rarely."""
     every = {f"ESC.RPM of output {output + 1}": log.series("ESC", ("RPM",), output) for output in outputs}
     escs = {name: each for name, each in every.items() if each is not None and (each.values > 0).any()}
     commands = log.series("RCOU", [f"C{output + 1}" for output in outputs])

@@ -76,9 +76,9 @@ def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[Rows]
 
 
 def speeds_within(t: Times, omega: Speeds, *, held: bool) -> Callable[[Rows, float], Float[np.ndarray, "rows parts 4"]]:
-    """Root mean square of each rotor's speed in the parts of the samples around rows, a function of rows and step [s].
+    """A function of rows and step [s]: the root mean square of each rotor's speed in the parts of samples around rows.
 
-    Arguments as of `averages`. Before the first time, rotors have the speeds of the first row.
+    Arguments as in `averages`. Before the first time, rotors have the speeds of the first row.
     """
     times, values = np.append(2 * t[0] - t[-1], t), np.concatenate([omega[:1], omega])
     speeds = root_mean_square(Series(times, values), linear=not held)
@@ -91,7 +91,7 @@ def speeds_within(t: Times, omega: Speeds, *, held: bool) -> Callable[[Rows, flo
 
 
 def averages(t: Times, omega: Speeds, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
-    """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
+    """A function that averages uniformly sampled rows to samples of a given length [s], from the first time on.
 
     Each measurement becomes the mean over a sample around its time, or NaN if less than about half of it was measured.
     The first sample begins half of a row before the first row, so that samples of whole rows share none. Each rotor

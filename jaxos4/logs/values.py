@@ -74,7 +74,7 @@ _RESTART = 0.1  # s; a rotor that has stopped needs longer to turn again
 
 
 def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Whether each speed is a 0 of the telemetry: the rotor turns so shortly before and after that it did not stop."""
+    """Whether each speed is a dropout: 0, though the rotor turns too shortly before and after to have stopped."""
     out, turning, zeros = np.zeros(speeds.size, dtype=bool), np.flatnonzero(speeds > 0), np.flatnonzero(speeds == 0)
     after = np.searchsorted(turning, zeros)
     between = (after > 0) & (after < turning.size)
@@ -172,7 +172,7 @@ MIN_VALUES = 20  # fewer have no range
 
 
 def _among_measured(values: Samples, check: Callable[[Samples], Places]) -> Bool[np.ndarray, " samples"]:
-    """Whether each value is among those that a check finds, which takes the measured ones."""
+    """Whether a check finds each value. The check takes the measured values only."""
     out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
     if known.size >= MIN_VALUES:
         out[known[check(values[known])]] = True

@@ -93,7 +93,7 @@ def prepare(
     holdout: float = HOLDOUT,
     predicted: bool = False,
 ) -> tuple[Prepared, ...]:
-    """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
+    """Make one flight of the usable stretches of one vehicle's recordings. Arguments as in `jaxos4.identify`.
 
     `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors, and
     messages do not name options of the fit.
@@ -162,8 +162,8 @@ def _cleaned(
 ) -> tuple[list[Recording], list[str], list[Finding]]:
     """The plausible stretches of one recording to fit, notes, and findings.
 
-    The findings are those that concern a moment of inertia, or contradict another quantity. All others become notes,
-    and so do those about the attitude alone. Raises `InputError` if it cannot be used.
+    Findings concern a moment of inertia, or contradict another quantity. All others, and those about the attitude
+    alone, become notes. Raises `InputError` if the recording cannot be used.
     """
     recording = evidence.logged
     name, facts = recording.name, recording.facts
@@ -177,7 +177,7 @@ def _cleaned(
     if refused := refused_note(opposite):
         raise InputError(f"{name}: {refused}.")
     notes, judged = [], []
-    for found in filter(None, (*findings(evidence), opposite_yaw(opposite.get("yaw")))):
+    for found in filter(None, (*findings(evidence), opposite_yaw(opposite))):
         found = msgspec.structs.replace(found, cause=f"{name}: {found.cause}")
         if {*found.quantities} & {*INERTIAS} or (found.contradicted and found.quantities != ("attitude",)):
             judged.append(found)

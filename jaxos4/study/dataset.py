@@ -283,7 +283,7 @@ _REMEDY = "give a folder that `jaxos4 study` wrote"
 
 
 def read_results(directory: Path) -> xr.Dataset:
-    """Reads the Dataset in a study's folder. Raises `InputError` if there is none, or it is not a study's."""
+    """Reads the Dataset in a study's folder. Raises `InputError` if it is missing, or no study wrote it."""
     path = directory / RESULTS_FILE
     if not directory.is_dir():
         raise InputError(f"{directory}: no such folder; {_REMEDY}.")

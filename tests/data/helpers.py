@@ -8,6 +8,8 @@ import pathlib
 import re
 import subprocess
 import sys
+import tracemalloc
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -248,6 +250,17 @@ def same(one, other):
         x.dtype == y.dtype and np.array_equal(x, y, equal_nan=x.dtype.kind == "f")
         for x, y in zip(leaves, others, strict=True)
     )
+
+
+@contextlib.contextmanager
+def memory_below(most: float) -> Iterator[None]:
+    """The block allocates less than this many bytes at a time."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
 
 
 def output_of(result: tuple[int, str, str]) -> str:
