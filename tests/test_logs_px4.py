@@ -133,22 +133,18 @@ def test_what_the_log_knows_of_a_quadrotor(save):
     assert (bare.rotor_positions, bare.rotor_spins, bare.landed) == (None, None, ())
 
 
-def test_the_land_detector_counts_as_the_ground(save, run, tmp_path):
+def test_the_land_detector_counts_as_the_ground(save, run):
     detected = states("vehicle_land_detected", [-2.0, 0.5, 2.4, 2.6], landed=[1, 0, 0, 1], ground_contact=[1, 0, 1, 1])
-    path = save(log(combined(grid(0.005)), escs(grid(0.01, 3.2, offset=-0.1)), detected))
+    path = save(log(combined(grid(0.005)), ROTORS, detected))
     landed = read_recording(path).facts.landed
     np.testing.assert_allclose(landed, [(0.0, 0.5), (2.4, 2.995)], atol=1e-6)
     out = output_of(run("inspect", path.name))
     assert out.count("on the ground") == 2
     assert "usable" in out
     never = states("vehicle_land_detected", [-2.0], landed=[1])
-    save(log(combined(grid(0.005)), escs(grid(0.01, 3.2, offset=-0.1)), never))
-    (tmp_path / "vehicle.toml").write_text(VEHICLE)
-    code, out, err = run("inspect", path.name)
+    save(log(combined(grid(0.005)), ROTORS, never))
     words = "the vehicle never flew (from 0.0 s to 3.0 s: on the ground); give the log of a flight"
-    assert out.splitlines()[1] == f"cannot identify a vehicle: {words}."
-    result = run("estimate", path.name, "--model", "flight", "--airframe", "vehicle.toml")
-    refused(result, f"jaxos4: {path.name}: {words}")
+    assert output_of(run("inspect", path.name)).splitlines()[1] == f"cannot identify a vehicle: {words}."
 
 
 # The file
