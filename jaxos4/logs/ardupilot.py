@@ -38,7 +38,7 @@ _TIMES = ("SampleUS", "TimeUS")
 _INSTANCES = ("I", "C", "Instance", "Inst")  # fields that number sensors, filters, motors or batteries
 _MOTORS, _MOTOR5 = range(33, 37), 37  # output functions
 _FAST = 1 | 1 << 18  # LOG_BITMASK: fast attitude, fast IMU
-_LARGEST, _MOST_DAMAGE = 1 << 30, 1000  # bytes; places
+_MAX_BYTES, _MAX_DAMAGE = 1 << 30, 1000  # of a log; in places
 _REMEDY = "the log is corrupt there: download it again, or choose another"
 
 
@@ -93,7 +93,7 @@ def _commands(log: Messages, outputs: list[int]) -> Rotors | None:
 
 def _decoded(path: LogPath) -> Messages:
     """The messages that are read. Raises `InputError` for a file that is too large, or too damaged."""
-    content, at, notes = read_bytes(path, _LARGEST), 0, []
+    content, at, notes = read_bytes(path, _MAX_BYTES), 0, []
     sizes, layouts = {_FMT: _FMT_LENGTH}, {}
     places = {number: array.array("q") for number in range(256)}
     end, damaged = len(content), 0
@@ -105,8 +105,8 @@ def _decoded(path: LogPath) -> Messages:
         if not whole or not content.startswith(_HEAD[: end - following], following):
             following = content.find(_HEAD, at + 1)
             damaged += following > 0
-            if damaged > _MOST_DAMAGE:
-                refuse(path, f"is damaged in more than {_MOST_DAMAGE} places; {_REMEDY}")
+            if damaged > _MAX_DAMAGE:
+                refuse(path, f"is damaged in more than {_MAX_DAMAGE} places; {_REMEDY}")
             at = following if following > 0 else end
             continue
         if number == _FMT:

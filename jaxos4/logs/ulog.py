@@ -284,7 +284,7 @@ class _Content(io.BytesIO):
         return super().seek(offset, whence)
 
 
-MAX_FIELDS, DEEPEST = 1024, 3  # of a message, with those of messages in it; PX4 has about 200
+MAX_FIELDS, MAX_DEPTH = 1024, 3  # of a message, with those of messages in it; PX4 has about 200
 
 
 def _check_formats(formats: Mapping[str, Any]) -> None:
@@ -292,7 +292,7 @@ def _check_formats(formats: Mapping[str, Any]) -> None:
 
     @functools.cache
     def count(name: str, depth: int) -> int:
-        if depth > DEEPEST:
+        if depth > MAX_DEPTH:
             raise ValueError("messages are nested too deeply")
         total = sum(
             max(size, 1) * (count(kind, depth + 1) if kind in formats else 1) for kind, size, _ in formats[name].fields

@@ -84,7 +84,7 @@ def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " sample
 
 
 MAX_IMPOSSIBLE = 0.01  # the share of the values of a column that can be impossible; more are a wrong unit
-FARTHEST = 10.0  # times the speed that a rotor exceeds for the share `MAX_IMPOSSIBLE` of its flight
+MAX_SPEED_RATIO = 10.0  # of a rotor, to the speed that it exceeds for the share `MAX_IMPOSSIBLE` of its flight
 
 
 def without_impossible(table: Table, limits: Mapping[str, ColumnLimits] = COLUMNS) -> Table:
@@ -96,7 +96,7 @@ def without_impossible(table: Table, limits: Mapping[str, ColumnLimits] = COLUMN
     for name, limit in limits.items():
         values, largest = columns.get(name, np.empty(0)), limit.largest
         if name in SPEED_NAMES and (values > 0).any():
-            largest = min(largest, FARTHEST * float(np.quantile(values[values > 0], 1 - MAX_IMPOSSIBLE)))
+            largest = min(largest, MAX_SPEED_RATIO * float(np.quantile(values[values > 0], 1 - MAX_IMPOSSIBLE)))
         beyond = (values < limit.least) | (values > largest)
         if not limit.zero and values.size:
             columns[name] = np.where(values > 0, values, np.nan)
