@@ -10,40 +10,22 @@ import re
 import secrets
 import shutil
 import sys
-import tokenize
 import tomllib
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from .errors import InputError, in_words, printable, shortened
 
-# Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
-BROKEN = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
 
 @contextlib.contextmanager
-def reading(place: object, fault: str, remedy: str, *errors: type[Exception]) -> Iterator[None]:
-    """Raises what a reader raises for a damaged file as an `InputError`. `errors`: those besides `BROKEN`."""
+def reading(place: object, fault: str, remedy: str) -> Iterator[None]:
+    """Raises any error of the block as an `InputError`: a library raises anything if a file is damaged."""
     try:
         yield
     except InputError:
         raise
-    except (*BROKEN, *errors) as error:
+    except Exception as error:  # noqa: BLE001
         raise InputError(f"{place}: {fault} ({in_words(error)}); {remedy}.") from None
 
 
@@ -52,9 +34,9 @@ _MOST_VALUES = {
     "JSON": 5_000_000,
     "TOML": 500_000,
 }  # of such a study; TOML takes 6 us for one, and inputs are CSV files
-# A key of TOML in 64 parts or more: the time and memory that `tomllib` takes for it grow with the square of the parts.
+# A key of TOML with 64 parts or more. The time and memory that `tomllib` takes grow with the square of their number.
 _LONG_KEY = re.compile(rb"""(?:\.[ \t]*(?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[\w-]+)[ \t]*){63}""")
-_LARGEST = sys.float_info.max  # of a number: a longer integer has no float, and Python does not print it
+_LARGEST = sys.float_info.max  # a larger integer cannot become a float, and Python refuses to print a long one
 
 
 @contextlib.contextmanager
@@ -118,7 +100,7 @@ def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None
 
 
 def at_once(path: str, flags: int) -> int:
-    """For `open(path, opener=at_once)`: a pipe that nobody writes is empty, where `open` would wait for ever."""
+    """For `open(path, opener=at_once)`: a pipe without a writer is empty, where `open` would wait for ever."""
     descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
     if hasattr(os, "O_NONBLOCK"):
         os.set_blocking(descriptor, True)
@@ -151,10 +133,10 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def read_json(path: str | os.PathLike[str], remedy: str, largest: float = _LARGEST) -> Any:
-    """The value in a JSON file. `largest`: of its numbers; if it is given, they must be finite too.
+    """The value in a JSON file. `largest`: a limit on the size of its numbers, which excludes infinity and NaN too.
 
-    **Raises:** `InputError`, which ends with the remedy, if it is no such file or `check_plain` refuses the value;
-    `OSError` if the file cannot be read.
+    **Raises:** `InputError`, which ends with the remedy, if the file is not JSON, or if `check_plain` refuses the
+    value; `OSError` if the file cannot be read.
     """
     return _read_text(path, json.loads, "JSON", remedy, largest)
 

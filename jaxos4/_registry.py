@@ -16,9 +16,9 @@ T = TypeVar("T")
 
 
 class Registry(UserDict[str, T], Generic[T]):
-    """Objects by name: those of the table, then those of installed packages, which replace none of the table.
+    """Objects by name: first the table's, then those of installed packages, which cannot replace the table's.
 
-    - `group`: of entry points, whose names are those in the table. Raises `InputError` if one cannot be imported.
+    - `group`: of the entry points, each named as its object. Raises `InputError` if one cannot be imported.
     - `own`: the table. An object given as `"module:Object"` of this package is imported when it is looked up.
     """
 

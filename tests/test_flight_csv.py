@@ -129,15 +129,16 @@ def test_paths_that_are_no_readable_file_and_too_many_rows(tmp_path, save, monke
 @pytest.mark.parametrize(
     ("row", "cell", "words"), [(3, "", ""), (6, " 1", ""), (7, "x", "row 7, column q"), (5, "1e999", "row 5")]
 )
-def test_plain_lines_are_read_together_up_to_the_first_that_is_not(row, cell, words, save):
+def test_plain_lines_are_read_together_up_to_the_first_that_is_not(row, cell, words, save, monkeypatch):
     """The numbers and the refusals are those of a file that is read row by row."""
     path, found = save(edited(row, "q", cell)), []
     for lines in (1, 2, 100):
+        monkeypatch.setattr(csv_module, "LINES_AT_ONCE", lines)
         if words:
             with pytest.raises(InputError, match=words):
-                csv_module.read_table(path, csv_module.COLUMNS, lines_at_once=lines)
+                csv_module.read_table(path, csv_module.COLUMNS)
         else:
-            table = csv_module.read_table(path, csv_module.COLUMNS, lines_at_once=lines)
+            table = csv_module.read_table(path, csv_module.COLUMNS)
             found.append(np.stack([*table.columns.values()]))
     assert all(np.array_equal(each, found[0], equal_nan=True) for each in found)
 

@@ -4,7 +4,6 @@ A file gives a usable flight or an `InputError` of one line, whatever it contain
 """
 
 import time
-import tracemalloc
 
 import ardupilot_logs as ardupilot
 import blackbox_logs as blackbox
@@ -15,7 +14,7 @@ import flight_csvs as flight_csv
 import numpy as np
 import px4_logs as ulog
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, memory_below
 from hypothesis import given, settings, strategies as st
 from recorded_logs import RPM, blackbox_csv, check, outcome, speeds, survives_damage
 
@@ -193,13 +192,9 @@ COSTLY["empty events"] = crazyflie.EMPTY_EVENTS
 @pytest.mark.parametrize("name", COSTLY)
 def test_a_few_bytes_cost_little_whatever_they_announce(name, save):
     path = save(COSTLY[name])
-    tracemalloc.start()
     begin = time.process_time()
-    result = outcome(read_log, path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert isinstance(result, str)
-    assert peak < (100e6 if name == "empty events" else 20e6)
+    with memory_below(100e6 if name == "empty events" else 20e6):
+        assert isinstance(outcome(read_log, path), str)
     assert time.process_time() - begin < 10
 
 

@@ -8,7 +8,7 @@ import px4_logs as ulog
 import pytest
 import recorded_logs
 from flight_csvs import csv, read_flight_and_notes
-from helpers import CRAZYFLIE, refused
+from helpers import CRAZYFLIE, output_of, refused
 from recorded_logs import FRD, RPM, VEHICLE, blackbox_csv, outcome, rates, speeds, table_csv
 
 from jaxos4.flight import STATE_NAMES
@@ -237,8 +237,7 @@ def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, 
     (tmp_path / "vehicle.toml").write_text(VEHICLE)
     name, remedy = save(kind(0.1)).name, REMEDIES[kind]
     words = f"the motors were logged at 10 Hz ({MOTORS_OF[kind]}), too rarely to identify a vehicle: "
-    code, out, err = run("inspect", name, "--airframe", "vehicle.toml", "--out", "found.json")
-    assert (code, err) == (0, "")
+    out = output_of(run("inspect", name, "--airframe", "vehicle.toml", "--out", "found.json"))
     first = out.splitlines()[1]
     assert first.startswith(f"cannot identify a vehicle: {words}")
     assert remedy in first

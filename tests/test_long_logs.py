@@ -1,10 +1,8 @@
 """Logs with more samples than a fit takes in a minute: the parts that tell the most are fitted, and a note says so."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, memory_below
 
 from jaxos4.flight import RATES
 from jaxos4.logs.values import plausible
@@ -119,8 +117,5 @@ def test_a_page_of_a_long_log_takes_less_memory_than_the_log(what):
         "signals": lambda: logged(long, found),
         "spectra": lambda: spectra([long], None),
     }[what]
-    tracemalloc.start()
-    make()
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < sum(x.nbytes for x in (long.time, long.omega, long.states, long.specific_force))
+    with memory_below(sum(x.nbytes for x in (long.time, long.omega, long.states, long.specific_force))):
+        make()

@@ -150,7 +150,6 @@ MISUSE = [
     ("`features` must be one of score, raw, got 'fourier'", lambda: fit(features="fourier")),
     ("`steps` must be an integer of at least 1", lambda: fit(steps=0)),
     ("`held_out` must be an integer of at least 1000", lambda: fit(held_out=10)),
-    ("`learning_rate` must be positive", lambda: fit(learning_rate=np.nan)),
     (r"`noise` must be \(lowest, highest\)", lambda: fit(noise=(1.0, 0.1))),
     ("`channels` 'attitude' are more than the problem's", lambda: fit(channels="attitude")),
     ("`bracket` of alpha3 must have", lambda: fit(FLAT)),
@@ -227,7 +226,7 @@ SETTINGS = [
     (jaxos4.AntColony, "archive", [1], "must be an integer of at least 2"),
     (jaxos4.AntColony, "ants", [0], "must be an integer of at least 1"),
     (jaxos4.AntColony, "q", [0.0, np.nan], "must be positive and finite"),
-    (jaxos4.NetworkEstimator, "learning_rate", [0.0, np.inf], "must be positive and finite"),
+    (jaxos4.NetworkEstimator, "learning_rate", [0.0, np.inf, np.nan], "must be positive and finite"),
     (jaxos4.NetworkEstimator, "architecture", ["rbf"], "must be one of mlp, cmac"),
     (jaxos4.NetworkEstimator, "cells", [1], "must be an integer of at least 2"),
 ]

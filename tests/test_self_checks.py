@@ -7,7 +7,7 @@ import equinox as eqx
 import msgspec
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, output_of
 from scipy.spatial.transform import Rotation
 
 import jaxos4
@@ -348,8 +348,7 @@ def test_little_or_nothing_measured_is_no_fault(flights):
 
 def test_inspect_prints_cause_size_and_remedy(flights, run, tmp_path):
     write_flight(with_fault("gyro scale", flights[1]).flight, tmp_path / "flight.csv", CRAZYFLIE)
-    code, out, err = run("inspect", "flight.csv", "--out", "found.json")
-    assert (code, err) == (0, "")
+    out = output_of(run("inspect", "flight.csv", "--out", "found.json"))
     assert "contradicts Ix, Iy, Iz: the attitude turns 2 times as much as the gyro says" in out
     (found,) = msgspec.json.decode((tmp_path / "found.json").read_bytes())["checks"]
     assert found["name"] == "gyro_or_time_scale"

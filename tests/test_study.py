@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import compiled_programs, refused
+from helpers import compiled_programs, output_of, refused
 from hypothesis import given, settings, strategies as st
 from small_study import AIRFRAME, run_study, specification
 
@@ -63,8 +63,7 @@ def test_a_dry_run_writes_nothing_and_counts(run, tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_NUM_CPU_DEVICES")
     text = "airframes = ['mine']\ntruth = 'drawn'\nflights = 1000\nbatch = 100\nestimators = ['ibss', 'kalman']\n"
     specification(tmp_path, text + AIRFRAME)
-    code, out, err = run("study", "spec.toml", "--out", "out", "--dry-run")
-    assert (code, err) == (0, "")
+    out = output_of(run("study", "spec.toml", "--out", "out", "--dry-run"))
     assert [path.name for path in tmp_path.iterdir()] == ["spec.toml"]
     rows = [line.split() for line in out.splitlines()]
     assert all([name, "30", "3000"] in rows for name in ("ibss", "kalman"))
@@ -208,8 +207,7 @@ def test_every_variable_has_a_name_and_a_unit_and_the_attributes_are_those_of_th
 @pytest.mark.slow
 def test_a_diverging_cell_is_counted_and_the_study_ends(run, tmp_path, dataset):
     specification(tmp_path, SPECIFICATION.replace("[1.0, 0.1]", "[1.0, 1e300]"))
-    code, out, err = run("study", "spec.toml", "--out", "out")
-    assert (code, err) == (0, "")
+    out = output_of(run("study", "spec.toml", "--out", "out"))
     with xr.open_dataset("out/results.nc") as found:
         diverged = found["result"].sel(scale=1e300)
         assert ((diverged != OUTCOMES.index("successful")) & (diverged < OUTCOMES.index("failed"))).all()
@@ -275,8 +273,7 @@ def cut(monkeypatch):
 @pytest.mark.usefixtures("cut")
 def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monkeypatch):
     with compiled_programs() as programs:
-        code, out, err = run("compare", "--quick", "--out", "here")
-    assert (code, err) == (0, "")
+        out = output_of(run("compare", "--quick", "--out", "here"))
     # Flights, their bounds, the network, and one search for IBSS and the hybrid.
     assert programs.count("jit(chunk)") == 4
     rows = ("noise x 0.1", "noise x 10", "bound, rates", "ibss", "network", "hybrid", "bracket centre")

@@ -101,7 +101,7 @@ def identify(
         kinds = "a model in alpha_1..8 or an airframe, which `jaxos4.load_airframe` reads"
         raise InputError(f"`subject`: must be {kinds}, got {type(subject).__name__}.")
     given = subject if isinstance(subject, Airframe) else subject.airframe
-    recordings = as_recordings(flights, airframe=given)
+    recordings = as_recordings(flights, given)
     if not recordings:
         raise InputError("`flights`: holds no flight; give one.")
     other = None if validate is None else as_recording(validate, "validation flight", given)

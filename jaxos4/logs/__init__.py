@@ -177,14 +177,12 @@ def _of_others(begin: bytes) -> LogFormat | None:
     return None
 
 
-def as_recordings(
-    flights: Source | Sequence[Source], name: str = "flight", airframe: Airframe | None = None
-) -> tuple[Recording, ...]:
+def as_recordings(flights: Source | Sequence[Source], airframe: Airframe | None = None) -> tuple[Recording, ...]:
     """One or several flights as recordings, see `as_recording`. The names of several are numbered from 1."""
     single = isinstance(flights, Recording | str) or not isinstance(flights, Sequence)
     every = [flights] if single else cast(Sequence[Any], flights)
-    names = [f"{name} {i + 1}" if len(every) > 1 else name for i in range(len(every))]
-    return tuple(as_recording(each, one, airframe) for each, one in zip(every, names, strict=True))
+    names = [f"flight {i}" for i in range(1, len(every) + 1)] if len(every) > 1 else ["flight"]
+    return tuple(as_recording(each, name, airframe) for each, name in zip(every, names, strict=True))
 
 
 def as_recording(flight: Source, name: str = "flight", airframe: Airframe | None = None) -> Recording:

@@ -83,8 +83,11 @@ def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
     return min(found, key=lambda each: each.rate, default=None)
 
 
-def _check_time(table: Table, *, shortest: float = 1e-6, longest: float = 2.0) -> float:
-    """The median time between rows [s], refused outside of `shortest` to `longest`, or if times do not increase."""
+MIN_STEP, MAX_STEP = 1e-6, 2.0  # s; the median time between rows of a flight
+
+
+def _check_time(table: Table) -> float:
+    """The median time between rows [s], refused outside of `MIN_STEP` to `MAX_STEP`, or if times do not increase."""
     t = table.columns["t"]
     _refuse_any(table, "t", np.isnan(t), "is empty; each row needs its time")
     _refuse_any(table, "t", np.abs(t) > COLUMNS["t"].largest, f"is {{:g}} s; {COLUMNS['t'].advice}")
@@ -97,9 +100,9 @@ def _check_time(table: Table, *, shortest: float = 1e-6, longest: float = 2.0) -
             what = f"repeats {t[index]:.9g} s of row {row}; time must increase: delete one of the two rows"
         table.refuse(what, index=index + 1, column="t")
     dt = float(np.median(step))
-    if dt < shortest:
+    if dt < MIN_STEP:
         table.refuse(f"has rows {dt:.3g} s apart, less than a microsecond; t is in seconds: multiply", column="t")
-    if dt > longest:
+    if dt > MAX_STEP:
         what = f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide"
         table.refuse(what, column="t")
     return dt

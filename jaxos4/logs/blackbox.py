@@ -36,7 +36,9 @@ _GYROS = ("gyroUnfilt", "gyroADCafterRpm", "gyroADC")
 _GYRO_SCALES = ("gyro.scale", "gyro_scale", "gyroScale")  # of Cleanflight, of its successors, in Explorer's exports
 _SPEEDS = ("omegaUnfiltered", "omega", "eRPM")  # of Indiflight in rad/s
 _ATTITUDES = {"quat": 4, "imuQuaternion": 3, "attitude": 3}  # of Indiflight, Betaflight, INAV: this many numbers
+_POLES = 14  # of the magnets of a motor, by default
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
+_BETWEEN = 1.0  # s; from one session to the next
 _VOLTAGE, _KNOWN_UNIT = "vbatLatest", re.compile(r"Betaflight ([4-9]|\d{2,})\.")
 _EXPORT = "export it as CSV by Blackbox Explorer"
 _DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
@@ -157,8 +159,8 @@ def _settings_above(path: LogPath) -> tuple[Settings, int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _decoded(path: LogPath, *, between: float = 1.0) -> _Log:
-    """A `.bbl` or `.BFL` file: all sessions, with a time `between` [s] them. Raises `InputError`."""
+def _decoded(path: LogPath) -> _Log:
+    """A `.bbl` or `.BFL` file: all sessions, one after the other. Raises `InputError`."""
     notes: list[str] = []
     found: list[tuple[Settings, Columns]] = []
     content = read_bytes(path, 1 << 29)  # more than an hour of flight
@@ -179,11 +181,11 @@ def _decoded(path: LogPath, *, between: float = 1.0) -> _Log:
         notes.append(f"{other} sessions are ignored: their settings are not those of the longest one")
     if len(same) > 1:
         lengths = ", ".join(f"{columns['time'][-1] / 1e6:.1f}" for columns in same)
-        notes.append(f"{len(same)} sessions, of {lengths} s, follow each other with {between:g} s between them")
+        notes.append(f"{len(same)} sessions, of {lengths} s, follow each other with {_BETWEEN:g} s between them")
     begin = 0.0
     for columns in same:
         columns["time"] += begin
-        begin = columns["time"][-1] + 1e6 * between
+        begin = columns["time"][-1] + 1e6 * _BETWEEN
     joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
     return _Log(path, longest, joined, notes=notes)
 
@@ -232,7 +234,7 @@ def _add_rates(log: _Log) -> None:
     log.add(names, unit / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0))
 
 
-def _add_rotors(log: _Log, *, usual: int = 14) -> None:
+def _add_rotors(log: _Log) -> None:
     raw = log.raw
     more = (each for name in (*_SPEEDS, "motor") for each in items(name, 8)[4:])
     if any(np.ptp(_finite(raw[name])) > 0 for name in more if name in raw):
@@ -243,8 +245,8 @@ def _add_rotors(log: _Log, *, usual: int = 14) -> None:
     if (field := next(turning, None)) is not None:
         poles = log.setting("motor_poles", 2, 100)
         if field == "eRPM" and poles is None:
-            log.notes.append(f"eRPM is turned into speeds with {usual} motor poles, the default: check the vehicle")
-        unit = 100 / ((poles or usual) / 2) * RPM if field == "eRPM" else 1.0
+            log.notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle")
+        unit = 100 / ((poles or _POLES) / 2) * RPM if field == "eRPM" else 1.0
         log.add(dict(zip(SPEED_NAMES, every[field], strict=True)), unit)
         return
     for name in commands:

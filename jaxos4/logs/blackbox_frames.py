@@ -94,7 +94,7 @@ def _numbers(text: str | None) -> list[int]:
 
 
 def _whole(text: str | None, default: int) -> int:
-    """The number at the beginning of a setting. If there is none, or it is 0, the default."""
+    """The number at the beginning of a setting; without a number, or with 0, the default."""
     match = re.match(r"\d{1,9}", text or "")
     return int(match[0]) or default if match else default
 
@@ -265,7 +265,7 @@ class _Stream:
         return self.steps[phase]
 
     def _values(self, letter: int) -> list[int] | None:
-        """The encoded numbers of a frame; `None` if it is none. Raises `IndexError` at the end of the data."""
+        """The encoded numbers of a frame; `None` for another letter. Raises `IndexError` at the end of the data."""
         values: list[int] = []
         if letter == _E:
             return values if self._event() else None

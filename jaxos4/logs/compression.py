@@ -1,5 +1,6 @@
 """Compressed parts of a bag, measured before they are decompressed: a small file must not fill memory or disk."""
 
+import io
 import pkgutil
 import re
 import struct
@@ -14,13 +15,8 @@ MAX_PART = 1 << 28  # bytes of a chunk or a message, in memory; recorders write 
 MAX_FILE = 1 << 34  # bytes, on the disk, of a file compressed as a whole; a bag of an hour has a few gigabytes
 MAX_TIMES, SMALL = 100, 1 << 29  # such a file may grow so many times, or to so many bytes; bags shrink 2 to 20 times
 MAX_METADATA = 1 << 19  # bytes of metadata.yaml, whose parser takes 14 s for a megabyte; a topic has about a kilobyte
-_STEP = 1 << 20  # bytes that are decompressed at a time
 _ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
-_DECOMPRESSORS = {
-    "bz2": "bz2:BZ2Decompressor",
-    "lz4": "lz4.frame:LZ4FrameDecompressor",
-    "zstd": f"{_ZSTD}:ZstdDecompressor",
-}
+_FILES = {"bz2": "bz2:BZ2File", "lz4": "lz4.frame:LZ4FrameFile", "zstd": f"{_ZSTD}:ZstdFile"}
 _MCAP, _CHUNK_OF_MCAP, _ATTACHMENT_OF_MCAP, _CHUNK_OF_ROS1 = b"\x89MCAP", 6, 9, b"\x05"
 
 
@@ -62,7 +58,7 @@ def _check_whole(path: Path, packed: IO[bytes]) -> None:
     most = min(MAX_FILE, max(SMALL, MAX_TIMES * path.stat().st_size))
     end = most + 1
     try:
-        with pkgutil.resolve_name(f"{_ZSTD}:ZstdFile")(packed) as file:
+        with pkgutil.resolve_name(_FILES["zstd"])(packed) as file:
             if file.read(8).startswith(_MCAP):
                 _check_mcap(path, file, end=end)
             too_large = file.seek(end) == end
@@ -80,19 +76,14 @@ def check_part(path: LogPath, kind: str, content: bytes) -> None:
 
     `kind`: the name of its compression. Any other name: the part is not compressed, or its reader refuses it.
     """
-    if kind not in _DECOMPRESSORS:
+    if kind not in _FILES:
         return
-    made = pkgutil.resolve_name(_DECOMPRESSORS[kind])
-    length, decompressor = 0, made()
     try:
-        while length <= MAX_PART and (content or not decompressor.needs_input):
-            length += len(decompressor.decompress(content, _STEP))
-            content = b""
-            if decompressor.eof:
-                content, decompressor = decompressor.unused_data or b"", made()
+        with pkgutil.resolve_name(_FILES[kind])(io.BytesIO(content)) as file:
+            too_large = file.seek(MAX_PART + 1) > MAX_PART
     except Exception:  # noqa: BLE001 - of a damaged part, a decompressor raises any
         return
-    if length > MAX_PART:
+    if too_large:
         _refuse_part(path)
 
 

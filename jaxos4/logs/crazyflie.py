@@ -23,6 +23,7 @@ _NAME = re.compile(rb"([^\0]{0,255})\0")
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")  # name, and letter of its type in NumPy
 _SETS = re.compile(rb"(.)(tick\(I\),(?:[\x20-\x27\x2a\x2b\x2d-\x7e]{1,80}\([bBhHiIqQefd]\),){1,255})", re.DOTALL)
 _FULL = 65535.0
+_MAX_TYPES, _MAX_VARIABLES = 64, 256  # of events, and of one event; more are damage
 _SOURCES = {
     RATE_NAMES: ([f"gyro.{axis}" for axis in "xyz"], DEGREE),
     ANGLE_NAMES: ([f"stateEstimate.{name}" for name in ("roll", "pitch", "yaw")], DEGREE * np.array([1, -1, 1])),
@@ -128,7 +129,7 @@ def _sets(path: LogPath, content: bytes, notes: list[str]) -> dict[str, dict[int
     return {"its data sets": {0: sets}} if rows.size > 1 else {}
 
 
-def _types(path: LogPath, content: bytes, *, most_types: int = 64, most_variables: int = 256) -> tuple[Types, int, int]:
+def _types(path: LogPath, content: bytes) -> tuple[Types, int, int]:
     """The types of events, the version, and the number of bytes of the header. Raises `InputError`."""
     at = 1
 
@@ -143,13 +144,13 @@ def _types(path: LogPath, content: bytes, *, most_types: int = 64, most_variable
     version, count = (int.from_bytes(each, "little") for each in take(_PAIR))
     if version not in (1, 2):
         refuse(path, f"is of version {version}, not 1 or 2; update jaxos4, or give another log")
-    if not 0 < count <= most_types:
+    if not 0 < count <= _MAX_TYPES:
         refuse(path, f"announces {count} event types: {_DAMAGED}")
     types: Types = {}
     for _ in range(count):
         number, name, size = take(_TYPE)
         number, size = int.from_bytes(number, "little"), int.from_bytes(size, "little")
-        if size > most_variables:
+        if size > _MAX_VARIABLES:
             refuse(path, f"announces {size} variables in an event: {_DAMAGED}")
         fields = [(" number", "<u2"), (" t", "<u4" if version == 1 else "<u8")]  # no variable begins with a blank
         for _ in range(size):

@@ -16,6 +16,7 @@ from .columns import ColumnMap, column_map, mapped_rows
 from .table import MAX_ROWS, LogFormat, LogPath, Recording, Table, counted, opened, quoted, refuse
 from .values import COLUMNS
 
+LINES_AT_ONCE = 10_000  # for the memory; it changes no number
 _LONGEST_LINE = 1 << 20
 _IN_NUMBERS = dict.fromkeys(map(ord, "-+.0123456789eE \t"))  # float() also reads "nan" and "1_0"
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
@@ -46,16 +47,13 @@ CSV = LogFormat(
 )
 
 
-def read_table(
-    path: LogPath, known: Collection[str], *, skip: int = 0, missing: Collection[str] = (), lines_at_once: int = 10_000
-) -> Table:
+def read_table(path: LogPath, known: Collection[str], *, skip: int = 0, missing: Collection[str] = ()) -> Table:
     """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
 
     The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored.
 
     - `skip`: number of lines before the header.
     - `missing`: cells that mean "not measured", in addition to the empty cell.
-    - `lines_at_once`: for the memory; it changes no number.
 
     **Raises:** `InputError`, one line with file, row and column, whatever the file contains.
     """
@@ -66,7 +64,7 @@ def read_table(
         header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
         wanted = {name: header.index(name) for name in header if name in known}
         rows = _rows(path, file, len(header), skip + 2)
-        while batch := list(itertools.islice(rows, lines_at_once)):
+        while batch := list(itertools.islice(rows, LINES_AT_ONCE)):
             cells = [*zip(*batch, strict=True)]
             columns = {name: cells[place] for name, place in wanted.items()}
             found.append(_numbers(path, columns, missing, skip + 2 + count))

@@ -20,10 +20,11 @@ from .sampling import (
     root_mean_square,
     unwrap,
 )
-from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, order_note, refuse
+from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, fast_enough, order_note, refuse
 from .values import dropped, without_impossible
 
 _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
+_FASTER = 1.1  # times the rate of another source; a smaller difference does not count
 
 Names = tuple[str, ...]
 Fields = dict[str, np.ndarray]
@@ -112,20 +113,15 @@ class Messages:
             values = np.column_stack([raw[name].astype(float)[kept] for name in fields])
         return Series(raw["t"][kept], np.where(np.isfinite(values), values, np.nan))
 
-    def fastest(
-        self, columns: Sequence[str], sources: Iterable[MessageSource], *, faster: float = 1.1
-    ) -> Series | None:
-        """The source that was logged most often, in our units and frame.
-
-        A later source replaces an earlier one only if its rate is `faster` times as high.
-        """
+    def fastest(self, columns: Sequence[str], sources: Iterable[MessageSource]) -> Series | None:
+        """The source that was logged most often, in our units and frame. The first of those with nearly equal rates."""
         best, found = 0.0, None
         for kind, fields, factor in sources:
             for instance in self.fields.get(kind, ()):
                 series = self.series(kind, fields, instance)
                 if series is None or not np.isfinite(series.values).any():
                     continue
-                if found is None or logged_rate(series.t) > faster * best:
+                if found is None or logged_rate(series.t) > _FASTER * best:
                     best, found = logged_rate(series.t), Series(series.t, series.values * factor)
                     self.name(columns, kind, fields)
         return found
@@ -139,6 +135,18 @@ class Messages:
             self.notes.append(f"impossible values count as not measured, in {source}: {count} (0 while it turns)")
         known = np.isfinite(values) & ~zeros
         return np.interp(t, series.t[known], values[known])
+
+    def fast_rotors(self, *found: Rotors | None) -> Rotors | None:
+        """The first that was logged fast enough, or the fastest; `None` without any. `found`: speeds first."""
+        every = [each for each in found if each is not None]
+        rates = [logged_rate(each.series.t) for each in every]
+        if not every:
+            return None
+        chosen = every[next((i for i, rate in enumerate(rates) if fast_enough(rate)), rates.index(max(rates)))]
+        if every[0].is_measured and not chosen.is_measured:
+            source = every[0].names[0].partition(".")[0]
+            self.notes.append(f"measured speeds ({source}) were logged at {rates[0]:.2g} Hz only: commands are used")
+        return chosen
 
     def name(self, columns: Sequence[str], kind: str, fields: Sequence[str]) -> None:
         """Note which fields hold these columns."""

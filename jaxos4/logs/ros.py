@@ -5,6 +5,7 @@ A column's source is `/topic.field.field[0]`. A topic may have a namespace befor
 
 import contextlib
 import functools
+import itertools
 import math
 import os
 import re
@@ -29,9 +30,11 @@ _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from i
 _FIELD = re.compile(r"[^.\[\]]+")
 _STAMPS = ("timestamp_sample", "timestamp")  # of PX4 [us]
 _RECORDED, _STAMPED = "recorded", "stamp"  # the times of a message; the names of fields have a dot
+_ONE_CLOCK = 0.5  # s; stamps of one clock differ by less from the times of the recorder
 _REPAIR = "copy it again, or repair it (`rosbag reindex`, `ros2 bag reindex`, `mcap recover`)"
 _REMEDY = 'correct unit or sign in the column map, or give time = "recorded" in it'
 _LONGEST_DEFINITIONS = 1 << 16  # characters: usual definitions have a few thousand, and their parser is slow
+_STEPS = 10_000  # of a database, between two looks at their number
 _NO_TYPES = "holds no definition of its messages; record it as MCAP (`ros2 bag record -s mcap`), or convert it"
 
 
@@ -61,7 +64,7 @@ ROS = LogFormat(
 
 
 def _reader(path: LogPath) -> Any:
-    """The reader of rosbags for a file or a folder, not open yet. Raises `InputError` for one that is far too large."""
+    """The reader of rosbags for a file or folder, before it is opened. Raises `InputError` if the bag is too large."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.rosbag2.storage_mcap import McapReader
@@ -81,21 +84,16 @@ def _reader(path: LogPath) -> Any:
 
 @contextlib.contextmanager
 def _only_tables(path: LogPath) -> Iterator[None]:
-    """Databases that are opened inside must consist of tables, and answer in a time that their size explains.
+    """Refuses SQLite databases, opened in the block, that hold a view or take more steps than their size explains.
 
-    A view can have rows without end, and so can damaged pages. A sound bag takes less than two steps for a byte.
+    A view can have endless rows, and so can damaged pages. A sound bag takes less than two steps for each byte.
     """
     import apsw
 
     def check(database: apsw.Connection) -> None:
-        most, done = 1_000_000 + 100 * os.path.getsize(database.filename), 0
-
-        def stop(*, steps: int = 10_000) -> bool:
-            nonlocal done
-            done += steps
-            return done > most
-
-        database.set_progress_handler(stop, 10_000)
+        most = 1_000_000 + 100 * os.path.getsize(database.filename)
+        done = itertools.count(_STEPS, _STEPS)
+        database.set_progress_handler(lambda: next(done) > most, _STEPS)
         tables = ("TABLE", "INDEX", "UNIQUE INDEX")
         others = " AND ".join(f"sql NOT LIKE 'CREATE {each} %'" for each in tables)
         for (name,) in database.execute(f"SELECT name FROM sqlite_schema WHERE {others}"):
@@ -109,7 +107,7 @@ def _only_tables(path: LogPath) -> Iterator[None]:
 
 
 def _damage(path: LogPath) -> contextlib.AbstractContextManager[None]:
-    return reading(path, "cannot be decoded", _REPAIR, Exception)  # of a damaged file, rosbags raises any
+    return reading(path, "cannot be decoded", _REPAIR)
 
 
 def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
@@ -137,7 +135,7 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
 
 
 def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, dict[str, list[float]]]:
-    """By topic: the fields at these places, the stamps, and the times of the recorder [ns]. Raises `InputError`."""
+    """For each topic, the values at these places, the stamps, and the recorder's times [ns]. Raises `InputError`."""
     getters: dict[str, dict[str, Callable[[Any], float]]] = {}
     for place in sorted(places):
         topic, _, field = place.partition(".")
@@ -159,17 +157,17 @@ def _messages(path: LogPath, reader: Any, places: set[str]) -> dict[str, dict[st
 
 
 def _timed(
-    found: dict[str, dict[str, list[float]]], notes: list[str], *, recorded: bool, clock: float = 0.5
+    found: dict[str, dict[str, list[float]]], notes: list[str], *, recorded: bool
 ) -> dict[str, dict[int, Fields]]:
-    """The topics as `Messages` holds them, with stamps if all have some of one clock (to `clock` [s]).
+    """The topics as `Messages` holds them. Times are stamps if all topics have stamps of one clock.
 
-    Else the times are those of the recorder.
+    Otherwise they are the times of the recorder.
     """
     found = {topic: values for topic, values in found.items() if values[_RECORDED]}
     times = [(np.array(each[_RECORDED], float), np.array(each[_STAMPED], float)) for each in found.values()]
     apart = [float(np.median(stamps - at)) for at, stamps in times]
     stamped = all((stamps > 0).all() for _, stamps in times)
-    if not recorded and not (stamped and np.ptp(apart or [0.0]) < clock * 1e9):
+    if not recorded and not (stamped and np.ptp(apart or [0.0]) < _ONE_CLOCK * 1e9):
         notes.append("times are those of the recorder, because not all topics have stamps of one clock")
         recorded = True
     kind = _RECORDED if recorded else _STAMPED
@@ -182,7 +180,7 @@ def _timed(
 
 
 def _decoder(path: LogPath, connections: list[Any], *, ros1: bool) -> Callable[[bytes, str], Any]:
-    """A function that decodes messages of these connections, by their definitions in the file, or by those of ROS 2."""
+    """A decoder of these connections' messages, by the definitions in the file or, without them, by those of ROS 2."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -259,7 +257,7 @@ def _table(log: Messages, columns: ColumnMap, chosen: dict[str, str]) -> tuple[T
         return Series(t, np.column_stack([at(name) for name in names]))
 
     def rotors(names: Sequence[str]) -> Rotors | None:
-        """The samples with all four rotors; `None` if one of them never turns, also of commands: no vehicle flew so."""
+        """The samples that have all four rotors. `None` if a rotor, measured or commanded, never turns."""
         found = together(names)
         if found is None or not (found.values > 0).any(axis=0).all():
             return None

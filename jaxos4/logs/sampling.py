@@ -76,9 +76,9 @@ def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[Rows]
 
 
 def speeds_within(t: Times, omega: Speeds, *, held: bool) -> Callable[[Rows, float], Float[np.ndarray, "rows parts 4"]]:
-    """Root mean square of each rotor's speed in the parts of the samples around rows, a function of rows and step [s].
+    """A function of rows and step [s]: the root mean square of each rotor's speed in the parts of samples around rows.
 
-    Arguments as of `averages`. Before the first time, rotors have the speeds of the first row.
+    Arguments as in `averages`. Before the first time, rotors have the speeds of the first row.
     """
     times, values = np.append(2 * t[0] - t[-1], t), np.concatenate([omega[:1], omega])
     speeds = root_mean_square(Series(times, values), linear=not held)
@@ -91,7 +91,7 @@ def speeds_within(t: Times, omega: Speeds, *, held: bool) -> Callable[[Rows, flo
 
 
 def averages(t: Times, omega: Speeds, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
-    """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
+    """A function that averages uniformly sampled rows to samples of a given length [s], from the first time on.
 
     Each measurement becomes the mean over a sample around its time, or NaN if less than about half of it was measured.
     The first sample begins half of a row before the first row, so that samples of whole rows share none. Each rotor
@@ -200,32 +200,42 @@ def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"
     return unwrapped, int(np.count_nonzero(np.abs(np.diff(angle[measured])) > math.pi))
 
 
-def in_order(t: Times, *, disorder: float = 0.01) -> Bool[np.ndarray, " samples"] | None:
-    """Whether each sample is later than all before it. `None` if the share `disorder` of them, or more, are not."""
+DISORDER = 0.01  # the share of late samples that can be ignored
+
+
+def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:
+    """Whether each sample is later than all before it. `None` if several are not, and more than `DISORDER`."""
     if not np.isfinite(t).all():
         return None
     later = np.ones(t.size, dtype=bool)
     later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
-    return later if np.count_nonzero(~later) <= max(disorder * t.size, 1) else None
+    return later if np.count_nonzero(~later) <= max(DISORDER * t.size, 1) else None
 
 
-def logged_rate(t: Times, *, pause: float = 0.9) -> float:
+PAUSE = 0.9  # s; a longer step is a pause between sessions
+
+
+def logged_rate(t: Times) -> float:
     """The rate [Hz] of samples at the times `t` [s]: for half of the time, they come at least this often."""
     steps = np.diff(t)
-    steps = np.sort(steps[(steps > 0) & (steps <= pause)] if (steps <= pause).any() else steps)
+    steps = np.sort(steps[(steps > 0) & (steps <= PAUSE)] if (steps <= PAUSE).any() else steps)
     total = np.cumsum(steps)
     if total.size == 0 or total[-1] <= 0:
         return 0.0
     return 1.0 / float(steps[np.searchsorted(total, total[-1] / 2)])
 
 
-def held_regularly(t: Times, *, fewest: int = 20, regular: float = 0.6) -> bool:
-    """Whether values that change at the times `t` [s] were written at a fixed rate: `fewest` steps, nearly equal."""
+MIN_STEPS = 20  # fewer show no rate
+REGULAR = 0.6  # of the median step; the steps of a fixed rate differ by less
+
+
+def held_regularly(t: Times) -> bool:
+    """Whether values that change at the times `t` [s] were written at a fixed rate: many steps, nearly equal."""
     steps = np.diff(t)
-    if steps.size < fewest:
+    if steps.size < MIN_STEPS:
         return False
     low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
-    return bool(high - low <= regular * middle)
+    return bool(high - low <= REGULAR * middle)
 
 
 def last_measured(measured: Bool[np.ndarray, "samples *columns"]) -> Int[np.ndarray, "samples *columns"]:

@@ -17,8 +17,8 @@ from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES
 from ..rotations import HALF_TURN, euler_angles
 from .columns import column_map
 from .messages import Fields, Messages, MessageSource, Names, Rotors, motor_order
-from .sampling import Series, logged_rate, runs
-from .table import LogFormat, LogPath, Table, fast_enough, items, read_bytes, refuse
+from .sampling import Series, runs
+from .table import LogFormat, LogPath, Table, items, read_bytes, refuse
 from .values import RPM
 
 _MAGIC = b"ULog"
@@ -149,15 +149,10 @@ def _landed(log: Messages) -> list[tuple[float, float]]:
 
 
 def _rotors(log: Messages) -> Rotors | None:
-    """Measured speeds, the motors' commands or the outputs: the first that is fast enough, or else the fastest."""
-    every = [found for find in (_speeds, _motors, _outputs) if (found := find(log)) is not None]
-    rates = [logged_rate(each.series.t) for each in every]
-    if not every:
-        return None
-    chosen = every[next((i for i, rate in enumerate(rates) if fast_enough(rate)), rates.index(max(rates)))]
-    if every[0].is_measured and not chosen.is_measured:
-        log.notes.append(f"measured speeds (esc_status) were logged at {rates[0]:.2g} Hz only: commands are used")
-    elif not chosen.is_measured and log.series("esc_status", _ESC_SPEEDS) is not None:
+    """Measured speeds, the motors' commands, or the outputs."""
+    speeds = _speeds(log)
+    chosen = log.fast_rotors(speeds, _motors(log), _outputs(log))
+    if speeds is None and chosen is not None and log.series("esc_status", _ESC_SPEEDS) is not None:
         log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
     return chosen
 
@@ -253,13 +248,12 @@ def _decoded(path: LogPath) -> Messages:
     """The topics that are needed. Raises `InputError`, one line, for a file that cannot be decoded."""
     try:
         from pyulog.core import ULog
-        from pyulog.exceptions import ULogException
     except ImportError:
         refuse(path, "reading a ULog file needs pyulog; install jaxos4[ulog]")
     content = read_bytes(path, 1 << 31)
     if content.endswith(bytes(64)):  # a loss of power leaves zeros at the end
         content = content.rstrip(b"\0")
-    damage = reading(path, "cannot be decoded", "copy the log again from the vehicle", ULogException)
+    damage = reading(path, "cannot be decoded", "copy the log again from the vehicle")
     with damage, contextlib.redirect_stdout(io.StringIO()):
         _check_formats(ULog(_Content(content), parse_header_only=True).message_formats)
         topics = {topic for columns in _COLUMNS for topic, *_ in _sources(columns)}
@@ -290,18 +284,21 @@ class _Content(io.BytesIO):
         return super().seek(offset, whence)
 
 
-def _check_formats(formats: Mapping[str, Any], *, most: int = 1024, deepest: int = 3) -> None:
-    """Refuse formats with too many fields or levels, as pyulog makes an object of each; PX4 has about 200 fields."""
+MAX_FIELDS, MAX_DEPTH = 1024, 3  # of a message, with those of messages in it; PX4 has about 200
+
+
+def _check_formats(formats: Mapping[str, Any]) -> None:
+    """Refuse formats with too many fields or levels, because pyulog makes an object of each."""
 
     @functools.cache
     def count(name: str, depth: int) -> int:
-        if depth > deepest:
+        if depth > MAX_DEPTH:
             raise ValueError("messages are nested too deeply")
         total = sum(
             max(size, 1) * (count(kind, depth + 1) if kind in formats else 1) for kind, size, _ in formats[name].fields
         )
-        if total > most:
-            raise ValueError(f"a message has more than {most} fields")
+        if total > MAX_FIELDS:
+            raise ValueError(f"a message has more than {MAX_FIELDS} fields")
         return max(total, 1)
 
     for name in formats:

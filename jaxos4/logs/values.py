@@ -74,7 +74,7 @@ _RESTART = 0.1  # s; a rotor that has stopped needs longer to turn again
 
 
 def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Whether each speed is a 0 of the telemetry: the rotor turns so shortly before and after that it did not stop."""
+    """Whether each speed is a dropout: 0, though the rotor turns too shortly before and after to have stopped."""
     out, turning, zeros = np.zeros(speeds.size, dtype=bool), np.flatnonzero(speeds > 0), np.flatnonzero(speeds == 0)
     after = np.searchsorted(turning, zeros)
     between = (after > 0) & (after < turning.size)
@@ -83,19 +83,20 @@ def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " sample
     return out
 
 
-def without_impossible(
-    table: Table, limits: Mapping[str, ColumnLimits] = COLUMNS, *, most: float = 0.01, farthest: float = 10.0
-) -> Table:
+MAX_IMPOSSIBLE = 0.01  # the share of the values of a column that can be impossible; more are a wrong unit
+MAX_SPEED_RATIO = 10.0  # of a rotor, to the speed that it exceeds for the share `MAX_IMPOSSIBLE` of its flight
+
+
+def without_impossible(table: Table, limits: Mapping[str, ColumnLimits] = COLUMNS) -> Table:
     """The table without the values outside of `limits`, or `dropped`: they count as not measured.
 
-    - `most`: the share of the values of a column that can be impossible. More are a wrong unit: `InputError`.
-    - `farthest`: a rotor turns at most this many times as fast as in all but this share of its flight.
+    Raises `InputError` if a column has more than the share `MAX_IMPOSSIBLE` of such values.
     """
     columns, impossible = dict(table.columns), dict(table.impossible)
     for name, limit in limits.items():
         values, largest = columns.get(name, np.empty(0)), limit.largest
         if name in SPEED_NAMES and (values > 0).any():
-            largest = min(largest, farthest * float(np.quantile(values[values > 0], 1 - most)))
+            largest = min(largest, MAX_SPEED_RATIO * float(np.quantile(values[values > 0], 1 - MAX_IMPOSSIBLE)))
         beyond = (values < limit.least) | (values > largest)
         if not limit.zero and values.size:
             columns[name] = np.where(values > 0, values, np.nan)
@@ -104,9 +105,9 @@ def without_impossible(
             continue
         count, index = int(np.count_nonzero(beyond)), int(np.argmax(beyond if beyond.any() else wrong))
         first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
-        if count > most * every:
+        if count > MAX_IMPOSSIBLE * every:
             low = values[index] < limit.least
-            share = f"{count} of {every} values, more than {100 * most:g} %"
+            share = f"{count} of {every} values, more than {100 * MAX_IMPOSSIBLE:g} %"
             what = f"is {first}, beyond {limit.least if low else limit.largest:.4g} {limit.unit} ({share}); "
             advice = (low and limit.below) or table.remedy or limit.advice
             table.refuse(what + advice, index=index, column=name)
@@ -171,7 +172,7 @@ MIN_VALUES = 20  # fewer have no range
 
 
 def _among_measured(values: Samples, check: Callable[[Samples], Places]) -> Bool[np.ndarray, " samples"]:
-    """Whether each value is among those that a check finds, which takes the measured ones."""
+    """Whether a check finds each value. The check takes the measured values only."""
     out, known = np.zeros(values.size, dtype=bool), np.flatnonzero(np.isfinite(values))
     if known.size >= MIN_VALUES:
         out[known[check(values[known])]] = True

@@ -206,6 +206,6 @@ class ErrorTable(NamedTuple):
         return rms, correlation, factors, simultaneous
 
 
-def calibrated_scales(noise: tuple[float, float], count: int = 9) -> Float[Array, " scales"]:
-    """The `count` noise scales of a calibration, evenly spaced in the logarithm; one if the lowest is the highest."""
-    return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else count))
+def calibrated_scales(noise: tuple[float, float]) -> Float[Array, " scales"]:
+    """The nine noise scales of a calibration, evenly spaced in the logarithm; one if the lowest is the highest."""
+    return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else 9))

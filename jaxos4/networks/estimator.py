@@ -174,9 +174,9 @@ class TrainedNetwork(AbstractEstimator):
         return Bracket.around(self.features.coordinates.center[:count], self.features.coordinates.width[:count])
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight in the network's own bracket; that of the problem must only be valid.
+        """Identifies one flight in the network's own bracket; the problem's bracket only has to be valid.
 
-        If the problem fixes parameters, the answer is that for their values.
+        Parameters that the problem fixes count as known.
 
         **Returns:** an estimate, `at_bound` if the answer lies outside of the bracket of training by more than its
         interval, `unidentifiable` if an interval is hardly narrower than the bracket, and `network_mismatch` for more

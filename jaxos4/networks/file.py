@@ -74,7 +74,7 @@ def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
         with open(path, "rb", opener=at_once) as file:
             content = io.BytesIO(file.read())
     place = "the network" if isinstance(path, io.BytesIO) else path
-    with reading(place, "not a whole network file", _REMEDY, OSError):
+    with reading(place, "not a whole network file", _REMEDY):
         with zipfile.ZipFile(content) as archive:
             if sum(each.file_size for each in archive.infolist()) > content.getbuffer().nbytes:
                 raise ValueError("it announces more than it holds")

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 WARM_UP = 200  # steps in which the learning rate rises, at most half of all
 LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
 CHECK = 250  # steps between two evaluations of the validation loss
+PER_FEATURE = 4  # simulated flights, to which the linear map is fitted
 VALIDATION = 2 * CHUNK  # simulated flights
 USES = 4  # of a simulated flight in training, with new noise each time; a flight costs more than its noise
 IMPROVEMENT = 1e-4  # share by which a loss must be lower
@@ -35,12 +36,10 @@ def _rates(steps: int, largest: float) -> Float[np.ndarray, " steps"]:
     return (largest * share).astype(np.float32)
 
 
-def untrained(
-    features: Features, settings: "NetworkEstimator", key: Key, *, per_feature: int = 4
-) -> tuple[Scaling, Regressor]:
-    """Scaling, and a linear map fitted to `per_feature` simulated flights for each feature."""
+def untrained(features: Features, settings: "NetworkEstimator", key: Key) -> tuple[Scaling, Regressor]:
+    """Scaling, and a linear map fitted to simulated flights."""
     scales = np.asarray(settings.noise, float)
-    count, purpose = max(CHUNK, per_feature * features.size), Purpose.LINEAR_MAP
+    count, purpose = max(CHUNK, PER_FEATURE * features.size), Purpose.LINEAR_MAP
     chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)
     return _untrained(features, chunks, scales, key, settings.architecture, settings.shape)
 

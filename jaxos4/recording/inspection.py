@@ -79,7 +79,6 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         inspected.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
     nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)
-    yaw = opposite_yaw(opposite.get("yaw"))
     refusals = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
@@ -90,7 +89,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         channels=_channels(recording),
         refusals=refusals,
-        findings=(*findings(evidence), *filter(None, (yaw,))),
+        findings=tuple(filter(None, (*findings(evidence), opposite_yaw(opposite)))),
         notes=recording.notes,
         stretches=tuple(inspected),
     )

@@ -37,9 +37,9 @@ SHORTEST, SHORTEST_OF_COMMANDS = 0.002, 0.004
 LONGEST = 0.032  # s; the longest sample at which an answer is compared with that of shorter ones
 # A given sample time becomes a multiple of the log's if that changes it by less than this share.
 WHOLE = 0.05
-NOISY = 0.1  # share of the changes of rotor speeds from which on their noise is noted
+NOISY = 0.1  # a larger share of noise in the changes of rotor speeds is noted
 FULL = 0.999  # share of full speed at which a rotor is at its limit
-OFTEN = 0.01  # share of the time at this limit that is noted
+OFTEN = 0.01  # a larger share of the time at this limit is noted
 
 
 class Prepared(NamedTuple):
@@ -93,7 +93,7 @@ def prepare(
     holdout: float = HOLDOUT,
     predicted: bool = False,
 ) -> tuple[Prepared, ...]:
-    """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
+    """Make one flight of the usable stretches of one vehicle's recordings. Arguments as in `jaxos4.identify`.
 
     `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors, and
     messages do not name options of the fit.
@@ -162,8 +162,8 @@ def _cleaned(
 ) -> tuple[list[Recording], list[str], list[Finding]]:
     """The plausible stretches of one recording to fit, notes, and findings.
 
-    The findings are those that concern a moment of inertia, or contradict another quantity. All others become notes,
-    and so do those about the attitude alone. Raises `InputError` if it cannot be used.
+    Findings concern a moment of inertia, or contradict another quantity. All others, and those about the attitude
+    alone, become notes. Raises `InputError` if the recording cannot be used.
     """
     recording = evidence.logged
     name, facts = recording.name, recording.facts
@@ -177,7 +177,7 @@ def _cleaned(
     if refused := refused_note(opposite):
         raise InputError(f"{name}: {refused}.")
     notes, judged = [], []
-    for found in filter(None, (*findings(evidence), opposite_yaw(opposite.get("yaw")))):
+    for found in filter(None, (*findings(evidence), opposite_yaw(opposite))):
         found = msgspec.structs.replace(found, cause=f"{name}: {found.cause}")
         if {*found.quantities} & {*INERTIAS} or (found.contradicted and found.quantities != ("attitude",)):
             judged.append(found)
@@ -279,10 +279,11 @@ def _sampled(
     rests: Sequence[Float[np.ndarray, "3"]],
     noise: Float[np.ndarray, "3"],
 ) -> Prepared:
-    """One flight of stretches that are averaged to samples of `step` [s].
+    """Joins stretches, averaged to samples of `step` [s], to one flight.
 
-    `numbers`: of their recordings. `rests`: the specific force before take-off, where it is known. `noise`: the least
-    of the accelerometer, see `force_noise`.
+    - `numbers`: for each stretch, the number of its recording.
+    - `rests`: the specific forces before take-off that are known [m/s^2].
+    - `noise`: the lower limit of the accelerometer's noise, see `force_noise`.
     """
     length = round(WINDOW / step)
     if length < MIN_SAMPLES:
@@ -313,7 +314,7 @@ def _sampled(
 
 
 def _available_inputs(whole: Recording, flown: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
-    """The inputs for `Term.needs` that the whole recording offers. A force counts if every stretch measured it."""
+    """The inputs for `Term.needs` that the whole recording offers; a force only if every stretch measured it."""
     force = np.all([~np.isnan(each.channels[:, len(STATE_NAMES) :]).all(axis=0) for each in flown], axis=0)
     offers = {
         COMMANDS: whole.commanded,

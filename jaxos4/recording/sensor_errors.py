@@ -78,17 +78,17 @@ def without_noise(stretches: Sequence[Recording], airframe: Airframe) -> tuple[l
     **Returns:** the stretches, the noise's standard deviation [rad/s], and its share of the power of changes between
     samples.
     """
-    if any(each.commanded for each in stretches):
-        return list(stretches), 0.0, 0.0
+    unchanged = list(stretches), 0.0, 0.0
     axes = np.linalg.qr(np.asarray(airframe.mixer, dtype=float).T)[0]
-    power = _power([each.omega @ axes for each in stretches], stretches[0].dt)
+    commanded = any(each.commanded for each in stretches)
+    power = None if commanded else _power([each.omega @ axes for each in stretches], stretches[0].dt)
     if power is None:
-        return list(stretches), 0.0, 0.0
+        return unchanged
     noise = _noise(power)
     kept = 1 - noise[:, None] / np.maximum(power, noise[:, None] + np.finfo(float).tiny)
     share = float(noise.sum() / max(power.mean(axis=1).sum(), np.finfo(float).tiny))
     if share < NEGLIGIBLE:
-        return list(stretches), 0.0, 0.0
+        return unchanged
     speeds = [np.maximum(_filtered(each.omega @ axes, kept) @ axes.T, 0.0) for each in stretches]
     smooth = [each._replace(omega=speed) for each, speed in zip(stretches, speeds, strict=True)]
     return smooth, float(np.sqrt(noise.mean() / 2)), share

@@ -146,16 +146,16 @@ def concatenate(stretches: Sequence[Recording]) -> Recording:
     )
 
 
-def hold_out(
-    recording: Recording, length: int, share: float, *, seconds: float = 5.0
-) -> tuple[Recording, Recording | None]:
+BATCH = 5.0  # s; measurements are held out in batches, so short that all phases of a flight have both kinds
+
+
+def hold_out(recording: Recording, length: int, share: float) -> tuple[Recording, Recording | None]:
     """Split a recording into measurements to fit and measurements to predict, in alternating batches of whole windows.
 
     **Arguments:**
 
     - `recording`: whole windows, see `whole_windows`, of `length` samples.
     - `share`: the share of the windows to hold out, 0 to 0.5.
-    - `seconds`: about how long a batch is [s]: short enough for all phases of a flight to have batches of both kinds.
 
     **Returns:** two recordings of the same samples: in each, the measurements of the other are NaN. The second keeps
     all signals besides the states, because a model may use them as inputs. `None`: nothing is held out.
@@ -163,7 +163,7 @@ def hold_out(
     if not share:
         return recording, None
     windows, rounding = recording.time.size // length, 1e-9
-    batch = max(min(round(seconds / (length * recording.dt)), int(windows * share / 2)), 1)
+    batch = max(min(round(BATCH / (length * recording.dt)), int(windows * share / 2)), 1)
     number = np.arange(windows) // batch
     held_out = np.floor((number + 1) * share + rounding) > np.floor(number * share + rounding)
     held_out = np.repeat(held_out, length)

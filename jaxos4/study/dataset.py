@@ -23,7 +23,7 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
-from .._files import BROKEN, check_plain, read_json, reading, write_file
+from .._files import check_plain, read_json, reading, write_file
 from .._version import __version__
 from ..errors import InputError, shortened
 from ..models import MODELS
@@ -102,9 +102,9 @@ class Store:
         path = self.cell_file(index)
         if not path.exists():
             return None
-        with reading(path, "not a whole cell", _RUN_AGAIN):
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
+        content = io.BytesIO(path.read_bytes())
+        with reading(path, "not a whole cell", _RUN_AGAIN), np.load(content, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
 
     def read_network(self, number: int) -> TrainedNetwork | None:
         """A network, or `None` if it is not trained. Raises `InputError` if its file is damaged."""
@@ -149,8 +149,8 @@ def read_store(directory: Path) -> Store:
     path = directory / _SPECIFICATION
     if not path.exists():
         raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.")
+    header = read_json(path, "give another folder")
     with reading(path, "not the specification of a study", "give another folder"):
-        header = read_json(path, "give another folder")
         if (version := header["version"]) == __version__:
             return Store(directory, msgspec.convert(header["study"], Study), header["device"])
     raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {__version__}; give another folder.")
@@ -185,7 +185,7 @@ def assemble(store: Store) -> xr.Dataset:
     study, coordinates, failures = store.study, _coordinates(store.study), []
     blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {
-        name: np.full([len(coordinates[dim][1]) for dim in dims], blank.get(name, np.nan), kind)
+        name: np.full([len(coordinates[dim]) for dim in dims], blank.get(name, np.nan), kind)
         for name, (dims, kind, *_) in OF_CELLS.items()
     }
     for cell in map(study.cell, range(study.count)):
@@ -208,25 +208,26 @@ def assemble(store: Store) -> xr.Dataset:
                 arrays[name][shared if name == "truth" else own] = found
             if not np.isin(results["result"], np.arange(len(OUTCOMES))).all():
                 raise ValueError("unknown result")
-    variables = {name: _described(name, values) for name, values in (arrays | _brackets(study)).items()}
     command = {"command": "jaxos4 study specification.toml --out .", "failures": json.dumps(failures)}
-    dataset = xr.Dataset(variables, coordinates, provenance(study, store.device) | command)
-    flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
-    dataset["result"].attrs |= flags
-    return dataset
+    attributes = provenance(study, store.device) | command
+    return xr.Dataset(described(arrays | _brackets(study)), described(coordinates), attributes)
 
 
-def _coordinates(study: Study) -> dict[str, tuple]:
+def _coordinates(study: Study) -> dict[str, Any]:
     model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
     values = [list(getattr(study, axis)) for axis in AXES]
     values += [np.arange(study.flights), list(model.parameter_names), list(LEVELS)]
-    known = dict(zip(COORDINATES, values, strict=True)) | {"unit": list(model.parameter_units)}
-    return {name: _described(name, some) for name, some in known.items()}
+    return dict(zip(COORDINATES, values, strict=True)) | {"unit": list(model.parameter_units)}
 
 
-def _described(name: str, values: Any) -> tuple[tuple[str, ...], Any, dict[str, str]]:
-    dims, _, units, about = SCHEMA[name]
-    return dims, values, {"long_name": about, "units": units}
+def described(arrays: dict[str, Any]) -> dict[str, tuple[tuple[str, ...], Any, dict[str, Any]]]:
+    """Arrays of a study's Dataset as xarray takes them, with their dimensions and attributes by `SCHEMA`."""
+    flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
+    found = {}
+    for name, values in arrays.items():
+        dims, _, units, about = SCHEMA[name]
+        found[name] = dims, values, {"long_name": about, "units": units} | (flags if name == "result" else {})
+    return found
 
 
 def provenance(study: Study, device: str) -> dict[str, str | int]:
@@ -282,13 +283,13 @@ _REMEDY = "give a folder that `jaxos4 study` wrote"
 
 
 def read_results(directory: Path) -> xr.Dataset:
-    """Reads the Dataset in a study's folder. Raises `InputError` if there is none, or it is not a study's."""
+    """Reads the Dataset in a study's folder. Raises `InputError` if it is missing, or no study wrote it."""
     path = directory / RESULTS_FILE
     if not directory.is_dir():
         raise InputError(f"{directory}: no such folder; {_REMEDY}.")
     if not path.is_file():
         raise InputError(f"{directory}: holds no {RESULTS_FILE}; {_REMEDY}.")
-    with reading(path, "not a netCDF file that can be read", "run the study again", OSError):
+    with reading(path, "not a netCDF file that can be read", "run the study again"):
         _probe(path)
         with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
             dataset = opened.load()
@@ -337,11 +338,8 @@ def _check_texts(path: Path, dataset: xr.Dataset) -> None:
     """Refuse texts of many lines, and cells that failed without saying which."""
     texts: dict[str, Any] = {name: dataset[name].values.ravel().tolist() for name in (*COORDINATES, "seen", "unit")}
     check_plain(path, texts | {name: str(each).splitlines() for name, each in dataset.attrs.items()}, _REMEDY)
-    try:
+    with reading(path, "`failures` is not a list of cells that failed", _REMEDY):
         failures = json.loads(dataset.attrs.get("failures", "[]"))
-        wrong = [each for each in failures if not {"cell", "message", *SCENARIO} <= each.keys()]
-    except BROKEN:
-        failures, wrong = [], [None]
-    if wrong:
-        raise InputError(f"{path}: `failures` is not a list of cells that failed; {_REMEDY}.")
+        if not all({"cell", "message", *SCENARIO} <= each.keys() for each in failures):
+            raise ValueError("a cell has no name or message")
     check_plain(path, failures, _REMEDY)

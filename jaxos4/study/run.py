@@ -62,11 +62,14 @@ def run_here(store: Store) -> Iterator[tuple[str, int]]:
     yield from _run(store, submit, results)
 
 
-def run_on_cluster(store: Store, client: "Client", *, retries: int = 2) -> Iterator[tuple[str, int]]:
+RETRIES = 2  # of a task that raises an unexpected exception
+
+
+def run_on_cluster(store: Store, client: "Client") -> Iterator[tuple[str, int]]:
     """Computes the remaining cells on a cluster, in the order in which they finish. Yields as `run_here`.
 
-    `client`: made with `set_as_default=False`, or xarray would write under a lock of the cluster. `retries`: of a task
-    that raises an unexpected exception. Raises `InputError` without workers, or if a task is lost too often.
+    `client`: made with `set_as_default=False`, or xarray would write under a lock of the cluster. Raises `InputError`
+    without workers, or if a task is lost too often.
     """
     from distributed import as_completed
 
@@ -84,7 +87,7 @@ def run_on_cluster(store: Store, client: "Client", *, retries: int = 2) -> Itera
                 raise InputError(f"lost by the cluster ({what}); run the study again to resume.") from None
             yield future, result
 
-    yield from _run(store, functools.partial(client.submit, retries=retries, pure=False), results)
+    yield from _run(store, functools.partial(client.submit, retries=RETRIES, pure=False), results)
 
 
 def _run(

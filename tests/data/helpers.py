@@ -8,13 +8,17 @@ import pathlib
 import re
 import subprocess
 import sys
+import tracemalloc
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tomlkit
 
 import jaxos4
+from jaxos4.airframe import airframe_table
 from jaxos4.models.state import CASCADE_ORDER
 from jaxos4.recording import stretches
 
@@ -33,15 +37,7 @@ CRAZYFLIE = jaxos4.Airframe(
     rotor_inertia=2e-8,
     max_rotor_speed=FULL_SPEED,
 )
-CRAZYFLIE_TOML = """
-mass = 0.027
-inertia = [1.66e-5, 1.7e-5, 2.9e-5]
-rotor_positions = [[0.028, -0.028], [-0.028, -0.028], [-0.028, 0.028], [0.028, 0.028]]
-thrust_coefficient = 2.4e-8
-drag_coefficient = 1.2e-10
-rotor_inertia = 2e-8
-max_rotor_speed = 2500.0
-"""
+CRAZYFLIE_TOML = tomlkit.dumps(airframe_table(CRAZYFLIE))
 
 
 @contextlib.contextmanager
@@ -254,6 +250,24 @@ def same(one, other):
         x.dtype == y.dtype and np.array_equal(x, y, equal_nan=x.dtype.kind == "f")
         for x, y in zip(leaves, others, strict=True)
     )
+
+
+@contextlib.contextmanager
+def memory_below(most: float) -> Iterator[None]:
+    """The block allocates less than this many bytes at a time."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
+def output_of(result: tuple[int, str, str]) -> str:
+    """The output of a command that succeeded, and wrote nothing to stderr."""
+    code, out, err = result
+    assert (code, err) == (0, "")
+    return out
 
 
 def refused(result: tuple[int, str, str], *fragments: str) -> None:

@@ -8,6 +8,7 @@ import xarray as xr
 import jaxos4
 from jaxos4.study import OUTCOMES as RESULTS
 from jaxos4.study.cell import LEVELS
+from jaxos4.study.dataset import described
 from jaxos4.study.metrics import SCENARIO
 
 MODEL = jaxos4.PublishedOS4()
@@ -66,34 +67,10 @@ def synthetic_study(
         message = "FloatingPointError: <b>the filter's covariance</b> is not positive definite"
         failures.append({"cell": 7, **{name: some[-1] for name, some in coordinates.items()}, "message": message})
     center = np.broadcast_to(TRUTH + 0.2 * HALF_WIDTH * (not drawn), (len(models), 1, 1, 8))
-    per_flight, wide = (*SCENARIO, "flight"), ("model", "airframe", "width", "parameter")
-    of_parameters = {name: (*per_flight, "parameter") for name in ("estimate", "std", "bound")}
-    of_flights = {name: per_flight for name in ("result", "rollouts", "cost", "hit")}
-    dimensions = {"truth": (*SCENARIO[:-1], "flight", "parameter"), "half_width": (*per_flight, "parameter", "level")}
-    dimensions |= of_parameters | of_flights
-    dataset = xr.Dataset(
-        {
-            **{name: (dimensions[name], array) for name, array in found.items()},
-            "center": (wide, center),
-            "bracket_half_width": (wide, np.broadcast_to(HALF_WIDTH, center.shape)),
-            "seen": (("channels", "estimator"), seen),
-        },
-        coords={
-            **coordinates,
-            "flight": np.arange(flights),
-            "parameter": list(MODEL.parameter_names),
-            "unit": ("parameter", list(UNITS)),
-            "level": list(LEVELS),
-        },
-        attrs=PROVENANCE | {"failures": json.dumps(failures)},
-    )
-    for name in dataset.variables:
-        dataset[name].attrs = {"long_name": str(name).replace("_", " "), "units": "1"}
-    for name in ("truth", "center", "bracket_half_width", "estimate", "std", "half_width", "bound"):
-        dataset[name].attrs["units"] = "unit"
-    flags = {"flag_values": np.arange(len(RESULTS), dtype=np.int8), "flag_meanings": " ".join(RESULTS)}
-    dataset["result"].attrs |= flags
-    return dataset
+    found |= {"center": center, "bracket_half_width": np.broadcast_to(HALF_WIDTH, center.shape), "seen": seen}
+    names = {"parameter": list(MODEL.parameter_names), "unit": list(UNITS)}
+    coordinates |= {"flight": np.arange(flights), "level": list(LEVELS)} | names
+    return xr.Dataset(described(found), described(coordinates), PROVENANCE | {"failures": json.dumps(failures)})
 
 
 def answers(flights, coordinates, seen, drawn):

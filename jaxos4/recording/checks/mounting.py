@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -58,14 +58,14 @@ def _rotation_for(evidence: Evidence, turn: Float[Numeric, "3 3"]) -> str:
     return f"give `sensor_rotation = [{degrees}]` [deg] in the airframe's file"
 
 
-def opposite_yaw(correlation: float | None) -> Finding | None:
-    """A vehicle that yaws against the torque, see `jaxos4.recording.motion.opposite_axes`; `None` if it does not."""
-    if correlation is None:
+def opposite_yaw(axes: Mapping[str, float]) -> Finding | None:
+    """A vehicle that yaws against the torque. `axes`: of `jaxos4.recording.motion.opposite_axes`."""
+    if "yaw" not in axes:
         return None
     return Finding(
         "yaw_sign",
         "yaw answers the rotors with the opposite sign",
-        f"torque and angular acceleration correlate by {-correlation:.2f}",
+        f"torque and angular acceleration correlate by {-axes['yaw']:.2f}",
         "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
         "all four signs",
         (YAW.inertia,),

@@ -181,7 +181,7 @@ def _forced(flown: Recording, airframe: Airframe, lag: float) -> Float[np.ndarra
 
 
 def _forgetting(values: Signals, share: float) -> Signals:
-    """The running sum of the values, of which exp(-`share`) is kept from one sample to the next."""
+    """The running sum of the values, which is multiplied by exp(-`share`) from each sample to the next."""
     kept = np.exp(-share * np.arange(min(math.ceil(20 / share), len(values))))[:, None]
     size = 1 << (len(values) + len(kept)).bit_length()
     spectrum = np.fft.rfft(values, size, axis=0) * np.fft.rfft(kept, size, axis=0)
