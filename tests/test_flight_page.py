@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from pages import printed, says, stands_alone, words
+from pages import page_of, printed, says
 from synthetic_identification import (
     CONSTANTS,
     SAMPLE_TIMES,
@@ -35,10 +35,8 @@ EVIL = "</script><script>alert(1)</script>"
 
 def written(path, title="A flight", **changes):
     """The page of a vehicle, and its words."""
-    write_flight_page(path, identified_vehicle(**changes), title=title)
-    text = path.read_text(encoding="utf-8")
-    stands_alone(text)
-    return text, words(text)
+    shown = page_of(identified_vehicle(**changes), path, title=title)
+    return path.read_text(encoding="utf-8"), shown
 
 
 def test_the_page_says_what_was_found(tmp_path):
@@ -148,13 +146,10 @@ def test_what_stands_behind_an_estimate_is_drawn(tmp_path):
     correlations = behind["correlations"]
     assert (np.abs(correlations.own) < correlations.bound[:, None]).mean() == pytest.approx(0.95, abs=0.03)
     assert correlations.with_torque[1, 2].argmax() == 25 + 5
-    found = identified_flight(**behind)
-    write_flight_page(tmp_path / "flight.html", found)
-    text = (tmp_path / "flight.html").read_text(encoding="utf-8")
-    stands_alone(text)
-    assert len(text) < 600_000
+    shown = page_of(identified_flight(**behind), tmp_path / "flight.html")
+    assert (tmp_path / "flight.html").stat().st_size < 600_000
     says(
-        words(text),
+        shown,
         "alpha3 and alpha6 (-0.95)",
         "Measured, predicted, residual",
         "p rad/s 97.5",

@@ -10,9 +10,9 @@ import pytest
 import tomlkit
 from blackbox_logs import T as BLACKBOX_TIME, recorded
 from crazyflie_logs import one_event
-from helpers import CRAZYFLIE, refused
+from helpers import CRAZYFLIE, done, refused
 from hypothesis import given, settings, strategies as st
-from pages import stands_alone, words
+from pages import read_page, words
 from px4_logs import everything
 from recorded_logs import VEHICLE, blackbox_csv
 from rich.console import Console
@@ -41,8 +41,7 @@ LOGS = {
 def test_each_format_is_inspected(kind, run, tmp_path):
     (tmp_path / "log").write_bytes(LOGS[kind])
     (tmp_path / "vehicle.toml").write_text(VEHICLE)
-    code, out, err = run("inspect", "log", "--airframe", "vehicle.toml", "--out", "log.json")
-    assert (code, err) == (0, "")
+    out = done(run("inspect", "log", "--airframe", "vehicle.toml", "--out", "log.json"))
     assert len(out.splitlines()) < 40  # a screen
     for said in ("p q r: ", "rad/s", "usable", "good ("):
         assert said in out
@@ -62,23 +61,20 @@ def test_any_console_shows_the_units_in_brackets():
 
 def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):
     assert run("simulate", "--duration", "3", "--noise", "1", "--out", "flight.csv")[0] == 0
-    code, out, err = run("inspect", "flight.csv", "--airframe", "os4", "--report", "log.html")
-    assert (code, err) == (0, "")
+    out = done(run("inspect", "flight.csv", "--airframe", "os4", "--report", "log.html"))
     assert "report: log.html" in out
     assert "jaxos4 inspect flight.csv --airframe os4" in (tmp_path / "log.html").read_text()
     assert "flight CSV, 0.00 to 3.00 s, 301 samples, one every 10 ms" in out
     rows = [f"{0.01 * k:.2f},226,226,226,226,0,0,0" for k in range(200)]
     (tmp_path / "hover.csv").write_text("\n".join(["t,omega1,omega2,omega3,omega4,p,q,r", *rows]))
-    code, out, err = run("inspect", "hover.csv", "--airframe", "os4")
-    assert (code, err) == (0, "")
+    out = done(run("inspect", "hover.csv", "--airframe", "os4"))
     assert "none (0)" in out
 
 
 def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
     rows = [f"{0.01 * k:.2f},0.5,0.5,0.5,{0.5 + 0.1 * np.sin(k):.3f},0.1" for k in range(200)]
     (tmp_path / "c.csv").write_text("\n".join(["t,command1,command2,command3,command4,p", *rows]))
-    code, out, err = run("inspect", "c.csv")
-    assert (code, err) == (0, "")
+    out = done(run("inspect", "c.csv"))
     assert "up to 0.6 of full scale (commands)" in out
     assert "usable" in out
 
@@ -126,8 +122,7 @@ def test_props_in_and_props_out_and_flights_that_do_not_show_their_rotors():
 def test_real_logs_give_airframes(name, shared_flights, run, tmp_path):
     """The draft of a log has its signs, is no airframe before it is filled in, and then is that of the vehicle."""
     log = str(shared_flights / f"arpl_crazyflie_{name}.csv")
-    code, out, err = run("inspect", log, "--airframe-out", "mine.toml")
-    assert (code, err) == (0, "")
+    out = done(run("inspect", log, "--airframe-out", "mine.toml"))
     assert "airframe: mine.toml; weigh or measure, and fill in: mass, rotor_positions" in out
     text = (tmp_path / "mine.toml").read_text()
     x, y = ([{1: name, -1: f"-{name}"}[sign] for sign in each] for name, each in zip("xy", SIGNS, strict=False))
@@ -174,8 +169,7 @@ def test_settings_of_the_autopilot_are_taken():
 def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
     rows = [f"{0.01 * k:.2f},0,0,0,0,0" for k in range(200)]
     (tmp_path / "log").write_text("\n".join(["t,command1,command2,command3,command4,p", *rows]))
-    code, out, err = run("inspect", "log", "--airframe-out", "mine.toml")
-    assert (code, err) == (0, "")
+    out = done(run("inspect", "log", "--airframe-out", "mine.toml"))
     assert "fill in: mass, rotor_positions, rotor_spins, hover_speed" in out
     text = (tmp_path / "mine.toml").read_text()
     keys = "`mass`, `rotor_positions`, `thrust_coefficient` are missing"
@@ -193,8 +187,7 @@ def test_the_page_of_a_log_shows_what_would_be_fitted(tmp_path):
     idle = np.arange(flight.time.size) < flight.time.size // 4
     flight = flight._replace(omega=np.where(idle[:, None], 0.0, flight.omega), name=f"{EVIL}.csv")
     write_log_page(tmp_path / "log.html", flight, CRAZYFLIE, command="jaxos4 inspect")
-    text = (tmp_path / "log.html").read_text(encoding="utf-8")
-    stands_alone(text)
+    text = read_page(tmp_path / "log.html")
     shown, found = words(text), inspect_log(flight, CRAZYFLIE)
     assert len(text) < 600_000
     for said in (

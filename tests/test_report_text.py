@@ -6,13 +6,12 @@ import math
 import msgspec
 import pytest
 from hypothesis import given, strategies as st
-from pages import printed, says, words
+from pages import page_of, printed, says
 from rich.console import Console
 from synthetic_identification import COLOURED, CONSTANTS, WHITE, WRONG, identified_flight, identified_vehicle
 
 from jaxos4.identification.intervals import PRIOR_NOTE
 from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
-from jaxos4.report import write_flight_page
 from jaxos4.report.text import DASH, Listing, plain
 
 
@@ -75,8 +74,7 @@ def test_the_text_of_a_vehicle(tmp_path):
     assert "Predictions" not in doubtful
     late = {"rotor_delay": ParameterEstimate(-0.02, 0.001, 0.001, (-0.022, -0.018), "s", "")}
     says(printed(identified_vehicle(parameters=late)), "note: motors are recorded 20 ms late (rotor_delay)")
-    write_flight_page(tmp_path / "flight.html", identified_vehicle(parameters=late))
-    says(words((tmp_path / "flight.html").read_text(encoding="utf-8")), "motors are recorded 20 ms late")
+    says(page_of(identified_vehicle(parameters=late), tmp_path / "flight.html"), "motors are recorded 20 ms late")
     unseen = {"alpha1": FixedParameter(-0.56, "1", PRIOR_NOTE)}
     says(
         printed(identified_vehicle(held=unseen)),

@@ -265,6 +265,13 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
         assert fragment in err
 
 
+def done(result: tuple[int, str, str]) -> str:
+    """A command ended with exit code 0 and nothing on stderr. Returns what it printed."""
+    code, out, err = result
+    assert (code, err) == (0, "")
+    return out
+
+
 def blocks(page: pathlib.Path, language: str = "") -> list[str]:
     """The blocks of a page in this language."""
     every = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
