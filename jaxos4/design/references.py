@@ -22,15 +22,13 @@ from .envelope import Envelope, Uses
 from .fleet import LANES, Fleet, batch_of, fly_batch, inertias_first, model_of
 from .task import Coefficients, Designed, Flown
 
-# Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
+# Tones of these amplitudes are flown: angles [rad] and vertical acceleration [m/s^2]. The vehicle is linear for them.
 _SMALL = np.array([0.02, 0.02, 0.02, 0.2])
-# Times in periods at which the search looks, about eight for each cycle of the fastest tone.
+# The search checks the limits at these times, in periods: about eight for each cycle of the fastest tone.
 _POINTS = np.arange(200) / 200
-# References that need too much are reduced to about this share of a limit, with at most this many reductions, each by
-# a factor that is at least the last.
-_TARGET, _REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
-# A parameter counts as excited if its bound is below this share of the bracket's standard deviation.
-_LITTLE = 0.9
+_TARGET = 0.995  # references that exceed a limit are reduced to about this share of it
+_REDUCTIONS, _LEAST_STEP = 8, 0.7  # the most reductions, and the smallest factor of one of them
+_LITTLE = 0.9  # a parameter is excited if its bound is below this share of the bracket's standard deviation
 
 
 class Tones(NamedTuple):
