@@ -18,6 +18,7 @@ from .result_file import read_result
 from .results import NINETY_FIVE
 
 Source = Identification | str | os.PathLike[str]
+_EQUAL = 1e-3  # relative; constants of airframes that differ by less are equal
 
 
 class ComparedQuantity(NamedTuple):
@@ -130,12 +131,12 @@ def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Compar
     return found._replace(statuses=statuses, next_flight=advice)
 
 
-def _reference(name: str, every: Sequence[Identification], *, same: float = 1e-3) -> float:
-    """The moment of inertia in the airframe's file; NaN if the results have several. `same`: see `_notes`."""
+def _reference(name: str, every: Sequence[Identification]) -> float:
+    """The moment of inertia in the airframe's file; NaN if the results have several."""
     if name not in INERTIAS:
         return np.nan
     values = [float(np.asarray(each.airframe.inertia)[INERTIAS.index(name)]) for each in every]
-    return values[0] if np.allclose(values, values[0], rtol=same, atol=0) else np.nan
+    return values[0] if np.allclose(values, values[0], rtol=_EQUAL, atol=0) else np.nan
 
 
 def _spreads(quantities: Sequence[ComparedQuantity]) -> dict[str, float]:
@@ -194,21 +195,19 @@ def _compared(
     return found._replace(chi2=chi2, p=float(chdtrc(free, chi2))) if free else found
 
 
-def _notes(names: Sequence[str], every: Sequence[Identification], *, same: float = 1e-3) -> list[str]:
-    """Reasons why results are hard to compare. `same`: constants of airframes that differ by less are equal."""
+def _notes(names: Sequence[str], every: Sequence[Identification]) -> list[str]:
+    """Reasons why results are hard to compare."""
     notes, first = [], every[0].airframe
     for constant, why in (("mass", "are proportional to it"), ("rotor_positions", "depend on them")):
         values = [np.asarray(getattr(each.airframe, constant), dtype=float) for each in every]
-        far = [x for x in values if not np.allclose(x, np.asarray(getattr(first, constant)), rtol=same, atol=0)]
-        if far:
+        if not all(np.allclose(x, np.asarray(getattr(first, constant)), rtol=_EQUAL, atol=0) for x in values):
             notes.append(
                 f"the airframes differ in `{constant}`: moments of inertia {why}; estimate again with one airframe"
             )
     logs = [name for each in every for name in each.logs]
     if twice := sorted({name for name in logs if logs.count(name) > 1}):
         notes.append(f"{twice[0]} was fitted in several results, which are not independent")
-    refused = [name for name, each in zip(names, every, strict=True) if not each.successful]
-    if refused:
+    if refused := [name for name, each in zip(names, every, strict=True) if not each.successful]:
         notes.append(
             f"not to be trusted as a whole, so that only quantities with a good verdict count: {', '.join(refused)}"
         )
