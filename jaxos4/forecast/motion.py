@@ -36,17 +36,9 @@ class Motion(NamedTuple):
     rates: Rates
 
 
-class Known(NamedTuple):
-    """What is known of the vehicle at each sample, or at one.
-
-    - `state`: measured, in the order of `PARTS`.
-    - `filters`: rates [rad/s] and unexplained specific forces [m/s^2], with their disturbances [rad/s^2; m/s^2].
-    - `offset_std`: the standard deviation of each offset, see `Futures`.
-    """
-
-    state: Float[Numeric, "... 13"]
-    filters: Filtered
-    offset_std: Float[Numeric, "... 6"]
+Known = tuple[Float[Numeric, "... 13"], Filtered, Float[Numeric, "... 6"]]
+"""At each sample, or at one: the measured state; rates [rad/s] and unexplained specific forces [m/s^2], with their
+disturbances [rad/s^2; m/s^2], as filters know them; and the standard deviation of each offset, see `Futures`."""
 
 
 class Futures(NamedTuple):
@@ -79,14 +71,14 @@ def _fly_future(
     model: FlightModel, future: Futures, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
 ) -> Float[Array, "steps 13"]:
     """The states of one future after each step from its start. A motion that diverges keeps its last state."""
-    scalars, axes = tuple(future.parameters), model.force_axes
-    p, v, q, w = (start.state[places] for places in PARTS.values())
+    scalars, axes, (state, filters, offset_std) = tuple(future.parameters), model.force_axes, start
+    p, v, q, w = (state[places] for places in PARTS.values())
     steps = future.gusts.driven.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    error, absorbed = start.offset_std * future.off
+    error, absorbed = offset_std * future.off
     measured = Filtered(jnp.zeros(noise.strength.size).at[:3].set(w), jnp.zeros(noise.strength.size))
-    known = jax.tree.map(lambda x, y, e: jnp.where(future.filtered, x, y) + e, start.filters, measured, future.errors)
+    known = jax.tree.map(lambda x, y, e: jnp.where(future.filtered, x, y) + e, filters, measured, future.errors)
     known = known._replace(disturbance=known.disturbance.at[:3].add(absorbed[:3]))
     w = known.driven[:3] - gyro_bias(model, w, still, scalars)
     offset = future.offset[first] + error
@@ -186,7 +178,7 @@ def known_at_samples(
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     seen = jnp.concatenate([rates, force], axis=1)
     filters, _ = filtered(noise, seen, modelled, flight.stretch_numbers, flight.dt)
-    return Known(state, filters, offset_std), forcing, offset
+    return (state, filters, offset_std), forcing, offset
 
 
 def _offset_weights(
