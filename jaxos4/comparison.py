@@ -14,10 +14,9 @@ from .identification.next_flight import next_flight, pooled_statuses
 from .identification.results import Identification
 from .identification.tables import PhysicalQuantity, physical_quantities
 from .identification.verdict import IDENTIFIED, RESERVED, STATUSES, pooled_status
-from .result_file import read_result
+from .result_file import ResultSource, read_result
 from .results import NINETY_FIVE
 
-Source = Identification | str | os.PathLike[str]
 _EQUAL = 1e-3  # relative; constants of airframes that differ by less are equal
 
 
@@ -82,7 +81,7 @@ class Comparison(NamedTuple):
         return tuple(each for each in self.tested if each.p * len(self.tested) < self.level)
 
 
-def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Comparison:
+def compare_results(results: Sequence[ResultSource], *, level: float = 0.05) -> Comparison:
     """Compare results of repeated flights quantity by quantity.
 
         jaxos4.compare_results(["monday.json", "tuesday.json"]).different

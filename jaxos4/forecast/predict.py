@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ from ..logs import Recording, Source, as_recording
 from ..models.flight_model import FlightModel, without_recording
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording.prepared import Prepared, prepare
-from ..result_file import vehicle_result
+from ..result_file import ResultSource, vehicle_result
 from ..rotations import rotated
 from ..shooting import capacity_of, pad_flight
 from ..shooting.gains import Covariance, LogNoise
@@ -62,7 +61,7 @@ class Vehicle(NamedTuple):
     notes: tuple[str, ...]
 
 
-def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
+def vehicle_of(found: ResultSource) -> Vehicle:
     """The vehicle of an identification or a file of `jaxos4 estimate --out`. Raises `InputError` or `OSError`."""
     file = vehicle_result(found)
     given = isinstance(found, Identification)
@@ -116,7 +115,7 @@ _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
 
 def predict(
-    found: Identification | Vehicle | str | os.PathLike[str],
+    found: ResultSource | Vehicle,
     flight: Source,
     *,
     horizon: float = 0.5,
