@@ -38,11 +38,9 @@ def closed_loop(report: Row) -> Figure:
         for inertia in INERTIAS:
             marks: list[Mark] = [level(wanted)]
             for name, look in looks.items():
-                rows = {
-                    gust: found[inertia] for (gust, one), found in cases.items() if one == name and inertia in found
-                }
-                value, error = (percent([*rows.values()], each) for each in (key, f"{key}_error"))
-                marks += points([*rows], value, look, name, 2 * error)
+                own = {gust: found[inertia] for (gust, k), found in cases.items() if k == name and inertia in found}
+                value, error = (percent([*own.values()], each) for each in (key, f"{key}_error"))
+                marks += points([*own], value, look, name, 2 * error)
             panels.append(Panel(f"{inertia}: {title}", marks, gusts, y, 340, 220))
     return Figure("closed_loop", panels)
 
@@ -97,13 +95,13 @@ def horizons(report: Row) -> Figure:
     flights |= {f"true vehicle, gusts of {gust} rad/s^2": found for gust, found in report["simulated"].items()}
     looks, panels = styles(list(AHEAD)), []
     for name, quantities in flights.items():
-        marks: list[Mark] = [Line((), ())]
-        for kind, label in AHEAD.items():
-            if kind in quantities["p"]:
-                error = np.mean([quantities[rate][kind] for rate in "pq"], axis=0)
-                marks += points(0.01 * np.arange(1, len(error) + 1), error, looks[kind], label, marker="")
-        top = max(float(np.nanmax(mark.y)) for mark in marks if isinstance(mark, Line) and len(mark.y))
-        y = Scale(ends=(0.0, 1.05 * top))
+        known = [kind for kind in AHEAD if kind in quantities["p"]]
+        errors = [np.mean([quantities[rate][kind] for rate in "pq"], axis=0) for kind in known]
+        marks = [
+            Line(0.01 * np.arange(1, len(error) + 1), error, looks[kind].color, dash=looks[kind].dash, name=AHEAD[kind])
+            for kind, error in zip(known, errors, strict=True)
+        ]
+        y = Scale(ends=(0.0, 1.05 * float(np.nanmax(errors))))
         panels.append(Panel(name, marks, Scale(label="ahead [s]"), y, subtitle="error of p and q [rad/s]"))
     return Figure("public_flights", panels, columns=4)
 
