@@ -14,10 +14,10 @@ from .identification.next_flight import next_flight, pooled_statuses
 from .identification.results import Identification
 from .identification.tables import PhysicalQuantity, physical_quantities
 from .identification.verdict import IDENTIFIED, RESERVED, STATUSES, pooled_status
-from .result_file import read_result
+from .result_file import ResultSource, read_result
 from .results import NINETY_FIVE
 
-Source = Identification | str | os.PathLike[str]
+_EQUAL = 1e-3  # relative; constants of airframes that differ by less are equal
 
 
 class ComparedQuantity(NamedTuple):
@@ -81,7 +81,7 @@ class Comparison(NamedTuple):
         return tuple(each for each in self.tested if each.p * len(self.tested) < self.level)
 
 
-def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Comparison:
+def compare_results(results: Sequence[ResultSource], *, level: float = 0.05) -> Comparison:
     """Compare results of repeated flights quantity by quantity.
 
         jaxos4.compare_results(["monday.json", "tuesday.json"]).different
@@ -130,15 +130,12 @@ def compare_results(results: Sequence[Source], *, level: float = 0.05) -> Compar
     return found._replace(statuses=statuses, next_flight=advice)
 
 
-SAME = 1e-3  # constants of airframes that differ by a smaller share are equal
-
-
 def _reference(name: str, every: Sequence[Identification]) -> float:
     """The moment of inertia in the airframe's file; NaN if the results have several."""
     if name not in INERTIAS:
         return np.nan
     values = [float(np.asarray(each.airframe.inertia)[INERTIAS.index(name)]) for each in every]
-    return values[0] if np.allclose(values, values[0], rtol=SAME, atol=0) else np.nan
+    return values[0] if np.allclose(values, values[0], rtol=_EQUAL, atol=0) else np.nan
 
 
 def _spreads(quantities: Sequence[ComparedQuantity]) -> dict[str, float]:
@@ -202,16 +199,14 @@ def _notes(names: Sequence[str], every: Sequence[Identification]) -> list[str]:
     notes, first = [], every[0].airframe
     for constant, why in (("mass", "are proportional to it"), ("rotor_positions", "depend on them")):
         values = [np.asarray(getattr(each.airframe, constant), dtype=float) for each in every]
-        far = [x for x in values if not np.allclose(x, np.asarray(getattr(first, constant)), rtol=SAME, atol=0)]
-        if far:
+        if not all(np.allclose(x, np.asarray(getattr(first, constant)), rtol=_EQUAL, atol=0) for x in values):
             notes.append(
                 f"the airframes differ in `{constant}`: moments of inertia {why}; estimate again with one airframe"
             )
     logs = [name for each in every for name in each.logs]
     if twice := sorted({name for name in logs if logs.count(name) > 1}):
         notes.append(f"{twice[0]} was fitted in several results, which are not independent")
-    refused = [name for name, each in zip(names, every, strict=True) if not each.successful]
-    if refused:
+    if refused := [name for name, each in zip(names, every, strict=True) if not each.successful]:
         notes.append(
             f"not to be trusted as a whole, so that only quantities with a good verdict count: {', '.join(refused)}"
         )

@@ -28,6 +28,8 @@ from .identification.results import (
 from .models.state import CHANNELS
 from .results import NAMES
 
+ResultSource = Identification | str | os.PathLike[str]
+"""A result, or its file."""
 _NAME = re.compile(r"[\w.() -]{1,80}")
 _REMEDY, _AGAIN = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
 _LARGEST = 1e30  # far beyond every quantity in SI units, and its square is a number
@@ -106,7 +108,7 @@ def _with_arrays(kind: type[msgspec.Struct], table: Any, place: str) -> Any:
         return kind(**fields)
 
 
-def vehicle_result(found: Identification | str | os.PathLike[str]) -> VehicleIdentification:
+def vehicle_result(found: ResultSource) -> VehicleIdentification:
     """The result of a vehicle, given or read, with an estimate. Raises `InputError`, one line; as `read_result`."""
     given = isinstance(found, Identification)
     own = found if given else read_result(found)

@@ -1,6 +1,7 @@
 """Settings and fixtures of all tests: precision, platform, runtime shape checks, property tests, real flights."""
 
 import gc
+import json
 import os
 import pathlib
 import sys
@@ -153,3 +154,9 @@ def save(tmp_path):
         return path
 
     return write
+
+
+@pytest.fixture
+def write(save):
+    """Writes a result as the file `found.json`."""
+    return lambda result: save(result if isinstance(result, str) else json.dumps(result), "found.json")

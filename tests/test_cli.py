@@ -10,7 +10,7 @@ import sys
 
 import pytest
 import typer
-from helpers import CRAZYFLIE_TOML, refused
+from helpers import CRAZYFLIE_TOML, output_of, refused
 from pages import without_matplotlib, words
 from synthetic_results import vehicle_result
 
@@ -24,8 +24,7 @@ TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alph
 
 
 def simulate(run, path="flight.csv", *options: str) -> None:
-    code, _, err = run("simulate", "--duration", "2", "--out", str(path), *options)
-    assert (code, err) == (0, "")
+    output_of(run("simulate", "--duration", "2", "--out", str(path), *options))
 
 
 def estimate(run, *options):
@@ -35,8 +34,7 @@ def estimate(run, *options):
 
 
 def test_simulate_writes_the_standard_flight(run, tmp_path):
-    code, out, err = run("simulate", "--out", "flight.csv")
-    assert (code, err) == (0, "")
+    out = output_of(run("simulate", "--out", "flight.csv"))
     assert "501 samples" in out
     rows = list(csv.DictReader((tmp_path / "flight.csv").read_text().splitlines()))
     assert len(rows) == 501
@@ -154,6 +152,7 @@ INPUTS = {
 CLOSED, EXPORT = "simulate --out new.csv --closed-loop", "export found.json --to mujoco"
 DESIGN = "design --out new.csv --initial-state known"
 REFERENCES = "design --out new.csv --closed-loop --airframe mine.toml"
+OUT_OF_RANGE = ("gust -1", "lag nan", "delay 5", "load-sag 2", "gyro-cutoff 0", "log-every 0")
 # A command line, and what its message names. `test_flight_csv.py` has all kinds of bad flights.
 REFUSED = {
     "estimate none.csv": ["none.csv"],
@@ -207,12 +206,7 @@ REFUSED = {
     "inspect log --airframe-out none/mine.toml": ["none/mine.toml"],
     "inspect log --airframe-out log2 --airframe os4": ["leave out --airframe"],
     "inspect log --airframe-out mine.toml": ["mine.toml: exists"],
-    f"{CLOSED} --gust -1": ["--gust"],
-    f"{CLOSED} --lag nan": ["--lag"],
-    f"{CLOSED} --delay 5": ["--delay"],
-    f"{CLOSED} --load-sag 2": ["--load-sag"],
-    f"{CLOSED} --gyro-cutoff 0": ["--gyro-cutoff"],
-    f"{CLOSED} --log-every 0": ["--log-every"],
+    **{f"{CLOSED} --{option}": [f"--{option.split()[0]}"] for option in OUT_OF_RANGE},
     f"{CLOSED} --duration -1": ["duration"],
     f"{CLOSED} --dt 0": ["dt"],
     f"{CLOSED} --duration 0.001": ["at least two samples"],

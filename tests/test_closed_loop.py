@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop_flights import ANGLES, DT, LEVEL, QUIET, RATES, SUCCESS, VELOCITY, references
-from helpers import CRAZYFLIE, CRAZYFLIE_TOML, FULL_SPEED
+from helpers import CRAZYFLIE, CRAZYFLIE_TOML, FULL_SPEED, output_of
 from scipy.spatial.transform import Rotation
 
 import jaxos4
@@ -254,8 +254,7 @@ def test_a_batch_is_a_loop_and_a_failure_stays_in_its_lane():
 
 def test_simulate_writes_what_estimate_reads(run, tmp_path):
     (tmp_path / "crazyflie.toml").write_text(CRAZYFLIE_TOML)
-    code, out, err = run("simulate", "--closed-loop", "--airframe", "crazyflie.toml", "--out", "a.csv")
-    assert (code, err) == (0, "")
+    out = output_of(run("simulate", "--closed-loop", "--airframe", "crazyflie.toml", "--out", "a.csv"))
     assert "5001 samples of 0.004 s, closed loop, commands, gusts of 5 rad/s^2" in " ".join(out.split())
     airframe = jaxos4.load_airframe(tmp_path / "crazyflie.toml")
     flight = jaxos4.read_flight(tmp_path / "a.csv", airframe)

@@ -7,7 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, CRAZYFLIE_TOML, DT, euler_trajectory, published_derivative, refused, standard_flight
+from helpers import (
+    CRAZYFLIE,
+    CRAZYFLIE_TOML,
+    DT,
+    euler_trajectory,
+    output_of,
+    published_derivative,
+    refused,
+    standard_flight,
+)
 
 import jaxos4
 from jaxos4 import design
@@ -54,8 +63,7 @@ def command(run, tmp_path, monkeypatch):
         asked = []
         monkeypatch.setattr(jaxos4, function, lambda subject, **given: asked.append((subject, given)) or found)
         (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
-        code, out, err = run("design", *options, "--out", "new.csv", "--figure", "new.svg")
-        assert (code, err) == (0, "")
+        out = output_of(run("design", *options, "--out", "new.csv", "--figure", "new.svg"))
         assert (tmp_path / "new.svg").read_text().count("<svg") == 1
         ((subject, given),) = asked
         given.pop("progress")
@@ -281,8 +289,7 @@ def test_the_command_writes_references_that_simulate_flies(references, command, 
     written, dt = design.read_references(tmp_path / "new.csv")
     assert dt == pytest.approx(LOOP_DT)
     np.testing.assert_allclose(written, references.designed.inputs, atol=1e-6)
-    code, out, err = run("simulate", *CLOSED, "--references", "new.csv", "--out", "flight.csv")
-    assert (code, err) == (0, "")
+    out = output_of(run("simulate", *CLOSED, "--references", "new.csv", "--out", "flight.csv"))
     assert "1001 samples of 0.004 s" in out
 
 

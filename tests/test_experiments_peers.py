@@ -1,21 +1,17 @@
 """`experiments/peers`: each tool is exact on flights of its own kind, and all tools get the same flights."""
 
-import equinox as eqx
 import numpy as np
 import pytest
 from small_experiments import load, plot, result_of
 
 import jaxos4
+from experiments.fits import given_airframe
 from jaxos4.recording import Recording
 
 flights, logs = load("peers", "flights"), load("peers", "log")
 QUIET = {"gyro_noise": 1e-6, "force_noise": 1e-5, "attitude_noise": 0.0}
 TRUE = np.asarray(flights.CRAZYFLIE.inertia)
-WRONG = eqx.tree_at(
-    lambda a: (a.inertia, a.thrust_coefficient, a.drag_coefficient),
-    flights.CRAZYFLIE,
-    (1.25 * TRUE, 1.2 * flights.CRAZYFLIE.thrust_coefficient, 1.2 * flights.CRAZYFLIE.drag_coefficient),
-)
+WRONG = given_airframe(flights.CRAZYFLIE, 0)
 pytestmark = pytest.mark.slow
 
 

@@ -15,12 +15,6 @@ from jaxos4.export import TARGETS, export_vehicle, read_result
 from jaxos4.export.vehicle import CARRIED, rigid_vehicle
 
 
-@pytest.fixture
-def write(save):
-    """Writes a result file."""
-    return lambda result, name="found.json": save(result if isinstance(result, str) else json.dumps(result), name)
-
-
 def test_the_table_of_an_airframe_can_be_read_again():
     for airframe in (jaxos4.OS4, airframe_from_table(AIRFRAME)):
         table = airframe_table(airframe)

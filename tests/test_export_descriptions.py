@@ -1,6 +1,5 @@
 """Exported descriptions: mass, inertia and rotors in XML (SDF, URDF, MuJoCo), and names that are no code or markup."""
 
-import json
 import xml.etree.ElementTree as ElementTree
 
 import msgspec
@@ -17,19 +16,19 @@ from jaxos4.recording import read_recording
 from jaxos4.recording.inspection import airframe_draft
 
 
-def described(save, target):
+def described(write, target):
     """A vehicle, and the root element of its description."""
-    found = read_result(save(json.dumps(vehicle_result()), "found.json"))
+    found = read_result(write(vehicle_result()))
     return found, ElementTree.fromstring(export_vehicle(found, target).text)
 
 
-def test_a_model_of_mujoco_has_four_controls(save):
-    actuators = described(save, "mujoco")[1].findall("actuator/general")
+def test_a_model_of_mujoco_has_four_controls(write):
+    actuators = described(write, "mujoco")[1].findall("actuator/general")
     assert [each.get("name") for each in actuators] == ["thrust1", "thrust2", "thrust3", "thrust4"]
 
 
-def test_an_urdf_has_the_mass_the_inertia_and_the_rotors(save):
-    found, robot = described(save, "urdf")
+def test_an_urdf_has_the_mass_the_inertia_and_the_rotors(write):
+    found, robot = described(write, "urdf")
     inertia = robot.find("link/inertial/inertia")
     np.testing.assert_allclose([float(inertia.get(name)) for name in ("ixx", "iyy", "izz")], found.vehicle.inertia)
     assert float(robot.find("link/inertial/mass").get("value")) == found.vehicle.mass
@@ -39,9 +38,9 @@ def test_an_urdf_has_the_mass_the_inertia_and_the_rotors(save):
     assert {joint.find("child").get("link") for joint in robot.findall("joint")} == links - {"base_link"}
 
 
-def test_an_sdf_is_valid_and_has_the_inertia(save):
+def test_an_sdf_is_valid_and_has_the_inertia(write):
     """The rules of the SDF 1.9 schema for the elements that are written."""
-    found, root = described(save, "sdf")
+    found, root = described(write, "sdf")
     (model,) = root
     links, joints, plugins = (model.findall(tag) for tag in ("link", "joint", "plugin"))
     assert (root.tag, len(links) + len(joints) + len(plugins)) == ("sdf", len(model))
@@ -97,10 +96,8 @@ NAMES = st.lists(st.sampled_from(HOSTILE), min_size=1, max_size=4).map("".join)
 
 
 @pytest.mark.slow
-def test_hostile_names_are_in_comments_alone(tmp_path):
-    path = tmp_path / "found.json"
-    path.write_text(json.dumps(vehicle_result()), encoding="utf-8")
-    found = read_result(path)
+def test_hostile_names_are_in_comments_alone(tmp_path, write):
+    found = read_result(write(vehicle_result()))
     usual = {target: parsed(export_vehicle(found, target).text, target) for target in TARGETS}
 
     @given(name=NAMES)

@@ -19,12 +19,6 @@ ALPHAS = ("alpha3", "alpha6", "alpha8")
 COUNT = 10_000
 
 
-@pytest.fixture
-def write(save):
-    """Writes a result file."""
-    return lambda result, name="found.json": save(json.dumps(result), name)
-
-
 def vehicle_result(values=VALUES, **changes):
     return any_vehicle_result(values, **changes)
 

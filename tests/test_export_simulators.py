@@ -43,12 +43,6 @@ def mujoco_model(found):
     return model
 
 
-def read(tmp_path, result):
-    path = tmp_path / "found.json"
-    path.write_text(json.dumps(result), encoding="utf-8")
-    return read_result(path)
-
-
 def random_states(slowest, fastest):
     """States in the paper's order, and rotor speeds."""
     generator = np.random.default_rng(1)
@@ -125,7 +119,7 @@ def agree(found, expected):
 
 
 @every_simulator
-def test_a_vehicle_accelerates_as_the_model(target, mujoco, tmp_path):
+def test_a_vehicle_accelerates_as_the_model(target, mujoco, write):
     """With all effects that the simulator has. MuJoCo has no gyroscopic torque of the rotors."""
     states, omega = random_states(500, 2500)
     u = omega / AIRFRAME["max_rotor_speed"]
@@ -137,17 +131,17 @@ def test_a_vehicle_accelerates_as_the_model(target, mujoco, tmp_path):
         effective, values, inertia = omega, VALUES | {"thrust_curve": 1.0}, 2e-8
     values = values | {"rotor_reaction": inertia * values["alpha8"] / values["thrust_gain"]}
     expected = vehicle_acceleration(values, states, omega, rotor_inertia=inertia)
-    assert agree(SIMULATORS[target](read(tmp_path, vehicle_result(values)), states, effective), expected)
+    assert agree(SIMULATORS[target](read_result(write(vehicle_result(values))), states, effective), expected)
     # The comparison can fail: rotors that turn the other way, or a heavier vehicle.
     for change in ({"rotor_spins": [-1, 1, -1, 1]}, {"mass": 0.0271}):
-        other = read(tmp_path, vehicle_result(values, airframe=AIRFRAME | change))
+        other = read_result(write(vehicle_result(values, airframe=AIRFRAME | change)))
         assert not agree(SIMULATORS[target](other, states, effective), expected)
 
 
-def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
+def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(write):
     """`Multirotor(quad_params)` has no class of the file."""
     values = VALUES | {"x_drag": 0.3, "y_drag": 0.3, "thrust_curve": 1.0}
-    found = read(tmp_path, vehicle_result(values))
+    found = read_result(write(vehicle_result(values)))
     states, _ = random_states(0, 1)
     states[:, [7, 9, 11]] = 0.0
     hover = np.full((STATES, 4), found.vehicle.hover_speed)
@@ -158,13 +152,13 @@ def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
 @pytest.fixture(scope="module")
 def predicted_flight(tmp_path_factory):
     """The exported vehicle, its rotor speeds, and the flight from the first sample as `jaxos4.predict` predicts it."""
-    tmp_path = tmp_path_factory.mktemp("flight")
     model, values = rigid_model({name: VALUES[name] for name in VALUES if not name.startswith(("rotor", "thrust_cu"))})
     level = {"strength": 0.0, "unit": "", "time_constant": 0.25, "sensor": 0.01, "correlation": 0.0}
     about = provenance(terms=list(TERMS), sample_time=SAMPLE)
     known = {"disturbances": dict.fromkeys(("p", "q", "r", "ax", "ay", "az"), level), "provenance": about, "held": {}}
-    result = vehicle_result(values, airframe=airframe_table(model.airframe), **known)
-    found = read(tmp_path, result)
+    path = tmp_path_factory.mktemp("flight") / "found.json"
+    path.write_text(json.dumps(vehicle_result(values, airframe=airframe_table(model.airframe), **known)))
+    found = read_result(path)
     time = SAMPLE * np.arange(round(SECONDS / SAMPLE) + 250)
     steer = np.sin(2 * np.pi * time[:, None] * [1.1, 1.7, 2.3, 0.9] + [0, 1, 2, 3])
     hover = np.sqrt(found.vehicle.hover_thrust / float(model.airframe.thrust_coefficient) / VALUES["thrust_gain"])
@@ -173,7 +167,7 @@ def predicted_flight(tmp_path_factory):
     states[:, [6, 8, 10]], states[:, 1:6:2] = [0.5, 0.3, -2.0], [1.0, -2.0, 0.5]
     states[1:, 1:6:2] = np.nan  # no changes that the model would have to learn
     flight = jaxos4.Flight(time=time, omega=omega, states=states, specific_force=np.full((time.size, 3), 9.81))
-    prediction = jaxos4.predict(tmp_path / "found.json", flight, horizon=SECONDS, spacing=1.0)
+    prediction = jaxos4.predict(path, flight, horizon=SECONDS, spacing=1.0)
     assert prediction.time[0] == 0
     return found, omega, np.vstack([prediction.begin[0], prediction.unaware[0]])
 
@@ -221,9 +215,9 @@ def test_a_vehicle_flies_the_predicted_flight(mujoco, predicted_flight, fly):
     # Whole time steps are exact. Between them, the command rises during one time step.
     [(0.002, 0.01, 1e-12), (0.0002, 0.01, 1e-12), (0.002, 0.0102, 1e-5)],
 )
-def test_the_rotors_lag_and_those_of_mujoco_are_late(mujoco, tmp_path, step, delay, error):
+def test_the_rotors_lag_and_those_of_mujoco_are_late(mujoco, write, step, delay, error):
     """Also in a scene with another time step, and with a delay of 5.1 time steps."""
-    found = read(tmp_path, vehicle_result(VALUES | {"rotor_delay": delay}))
+    found = read_result(write(vehicle_result(VALUES | {"rotor_delay": delay})))
     model = mujoco.MjModel.from_xml_string(export_vehicle(found, "mujoco").text)
     data = mujoco.MjData(model)
     # The thrusts of the keyframe balance the weight and the constant torques.
@@ -245,10 +239,10 @@ def test_the_rotors_lag_and_those_of_mujoco_are_late(mujoco, tmp_path, step, del
 
 
 @pytest.mark.parametrize(("target", "suffix"), [("mujoco", "xml"), ("rotorpy", "py")])
-def test_the_programs_of_the_page_run(run, mujoco, monkeypatch, tmp_path, target, suffix):
+def test_the_programs_of_the_page_run(run, mujoco, monkeypatch, tmp_path, write, target, suffix):
     """The vehicle hovers in each simulator, and every sample of it too, by the programs that the page prints."""
     pytest.importorskip(target)
-    read(tmp_path, vehicle_result())
+    write(vehicle_result())
     for options in (("--out", f"vehicle.{suffix}"), ("--out", "vehicles", "--samples", "3")):
         code, _, err = run("export", "found.json", "--to", target, *options)
         assert code == 0, err

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from pages import printed, says, stands_alone, words
+from pages import page_of, printed, says
 from synthetic_identification import (
     CONSTANTS,
     SAMPLE_TIMES,
@@ -30,15 +30,14 @@ from jaxos4.report.identification_page import verdict
 from jaxos4.report.identification_signals import identified_signals, prediction_band
 from jaxos4.report.panels import Band, Line, Words, styles
 
+LOOK = styles(["ibss"])["ibss"]
 EVIL = "</script><script>alert(1)</script>"
 
 
 def written(path, title="A flight", **changes):
     """The page of a vehicle, and its words."""
-    write_flight_page(path, identified_vehicle(**changes), title=title)
-    text = path.read_text(encoding="utf-8")
-    stands_alone(text)
-    return text, words(text)
+    shown = page_of(identified_vehicle(**changes), path, title=title)
+    return path.read_text(encoding="utf-8"), shown
 
 
 def test_the_page_says_what_was_found(tmp_path):
@@ -74,15 +73,15 @@ def unpacked(line):
 def test_the_signals_are_the_predictions_with_a_band_of_95_percent():
     unfitted = msgspec.structs.replace(vehicle_traces(), measured=np.full((400, 3), np.nan))
     found = identified_vehicle(traces=unfitted)
-    predicted, look = found.predictions, styles(["ibss"])["ibss"]
-    drawn = json.loads(identified_signals(found, look))
+    predicted = found.predictions
+    drawn = json.loads(identified_signals(found, LOOK))
     named = ["0.1 s ahead", "0.248 s ahead", "0.5 s ahead", "from one start"]
     assert [view["name"] for view in drawn["views"]] == named
     assert drawn["shown"] == 1
     # Nothing was measured so far ahead.
     measured = np.where(np.arange(3)[:, None] > 0, np.nan, predicted.measured)
     short = msgspec.structs.replace(found, predictions=msgspec.structs.replace(predicted, measured=measured))
-    assert json.loads(identified_signals(short, look))["shown"] == 0
+    assert json.loads(identified_signals(short, LOOK))["shown"] == 0
     # The line breaks between two stretches.
     view, half = drawn["views"][1], prediction_band(predicted)
     time = np.frombuffer(base64.b64decode(view["time"]), "<f4")
@@ -106,7 +105,7 @@ def test_fitted_and_held_out_parts_are_on_one_axis_of_all_logs():
     traces = synthetic_traces(time, log, measured)
     traces = msgspec.structs.replace(traces, start_time=time[start], start_log=log[start])
     changes = {"traces": traces, "predictions": ahead, "provenance": {"flights": ["a.csv", "b.csv"]}}
-    drawn = json.loads(identified_signals(identified_vehicle(**changes), styles(["ibss"])["ibss"]))
+    drawn = json.loads(identified_signals(identified_vehicle(**changes), LOOK))
     (at, begin, end, name), (later, *_, other) = drawn["pieces"]
     assert (at, begin, name, other) == (0.0, 5.0, "a.csv", "b.csv")
     assert end - begin < later < 1.1 * (end - begin)
@@ -123,7 +122,7 @@ def test_the_trajectory_from_each_start_is_on_the_page():
     """The measured line breaks only where no trajectory is near; each sample knows its start."""
     found = identified_vehicle()
     paths, traces = found.trajectories, found.traces
-    drawn = json.loads(identified_signals(found, styles(["ibss"])["ibss"]))["views"][-1]
+    drawn = json.loads(identified_signals(found, LOOK))["views"][-1]
     start = np.frombuffer(base64.b64decode(drawn["start"]), "<i2")
     time = np.frombuffer(base64.b64decode(drawn["time"]), "<f4")
     assert (np.diff(time) >= 0).all()
@@ -143,18 +142,28 @@ def test_the_trajectory_from_each_start_is_on_the_page():
             np.testing.assert_allclose(measured[own][1:], paths.measured[k, :, i], atol=1e-3)
 
 
+def test_a_few_wild_samples_do_not_set_the_scale_of_the_gusts():
+    traces = vehicle_traces()
+    wild = traces.disturbance.copy()
+    wild[:2] = 1e4
+    drawn = json.loads(
+        identified_signals(identified_vehicle(traces=msgspec.structs.replace(traces, disturbance=wild)), LOOK)
+    )
+    panels = {panel["title"]: panel["reach"] for view in drawn["common"] for panel in view["panels"]}
+    largest = np.abs(traces.disturbance).max()
+    assert 0.9 * largest < panels["gusts [rad/s²]"] < 2 * largest
+    assert panels["inputs [rad/s]"] == 0
+
+
 def test_what_stands_behind_an_estimate_is_drawn(tmp_path):
     behind = behind_an_estimate()
     correlations = behind["correlations"]
     assert (np.abs(correlations.own) < correlations.bound[:, None]).mean() == pytest.approx(0.95, abs=0.03)
     assert correlations.with_torque[1, 2].argmax() == 25 + 5
-    found = identified_flight(**behind)
-    write_flight_page(tmp_path / "flight.html", found)
-    text = (tmp_path / "flight.html").read_text(encoding="utf-8")
-    stands_alone(text)
-    assert len(text) < 600_000
+    shown = page_of(identified_flight(**behind), tmp_path / "flight.html")
+    assert (tmp_path / "flight.html").stat().st_size < 600_000
     says(
-        words(text),
+        shown,
         "alpha3 and alpha6 (-0.95)",
         "Measured, predicted, residual",
         "p rad/s 97.5",
@@ -167,7 +176,7 @@ def test_what_stands_behind_an_estimate_is_drawn(tmp_path):
 
 def test_the_figure_says_how_strongly_each_axis_answers(tmp_path):
     found = synthetic_response()
-    figure = frequency_responses(found, styles(["ibss"])["ibss"])
+    figure = frequency_responses(found, LOOK)
     low, high = found.roll.agreement().interval
     _, shown = written(tmp_path / "flight.html")
     says(shown, f"roll: 1.25 ({low:.2f} to {high:.2f}) times the model; pitch: 0.50 (", "yaw: no clear response.")
@@ -186,7 +195,7 @@ def test_the_vehicle_is_drawn_as_it_was_identified(tmp_path):
     _, shown = written(tmp_path / "flight.html", parameters=rows, covariance=covariance)
     says(shown, "centre of mass, x 2.00 ± 0.39 mm, y 1.00 ± 0.20 mm (95 %)")
     place = (CenterOfMass("x", 2e-3, 2e-4), CenterOfMass("y", 1e-3, 1e-4))
-    above, bars = vehicle(CRAZYFLIE, CONSTANTS, place, styles(["ibss"])["ibss"]).panels
+    above, bars = vehicle(CRAZYFLIE, CONSTANTS, place, LOOK).panels
     # Rotor 1 is at the front on the right. The centre of mass is at the front on the left.
     assert [(each.x, each.y) for each in above.marks if isinstance(each, Words) and each.text == "1"] == [(28.0, 28.0)]
     cross = next(mark for mark in above.marks if isinstance(mark, Line) and mark.marker == "P")
@@ -233,7 +242,7 @@ def test_the_inertias_of_all_sample_times_are_shown(tmp_path):
     )
     _, shown = written(tmp_path / "flight.html", **changes)
     says(shown, "Moment of inertia against sample time")
-    first, *_, last = inertias_by_sample_time(SAMPLE_TIMES, 0.008, styles(["ibss"])["ibss"]).panels
+    first, *_, last = inertias_by_sample_time(SAMPLE_TIMES, 0.008, LOOK).panels
     chosen, line, bars, _ = first.marks
     np.testing.assert_allclose(chosen.y, 1.78e-5)
     np.testing.assert_allclose(line.y, [1.64e-5, 1.78e-5, 1.8e-5])

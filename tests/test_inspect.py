@@ -12,7 +12,7 @@ from blackbox_logs import T as BLACKBOX_TIME, recorded
 from crazyflie_logs import one_event
 from helpers import CRAZYFLIE, output_of, refused
 from hypothesis import given, settings, strategies as st
-from pages import stands_alone, words
+from pages import read_page, words
 from px4_logs import everything
 from recorded_logs import VEHICLE, blackbox_csv
 from rich.console import Console
@@ -187,8 +187,7 @@ def test_the_page_of_a_log_shows_what_would_be_fitted(tmp_path):
     idle = np.arange(flight.time.size) < flight.time.size // 4
     flight = flight._replace(omega=np.where(idle[:, None], 0.0, flight.omega), name=f"{EVIL}.csv")
     write_log_page(tmp_path / "log.html", flight, CRAZYFLIE, command="jaxos4 inspect")
-    text = (tmp_path / "log.html").read_text(encoding="utf-8")
-    stands_alone(text)
+    text = read_page(tmp_path / "log.html")
     shown, found = words(text), inspect_log(flight, CRAZYFLIE)
     assert len(text) < 600_000
     for said in (

@@ -2,13 +2,12 @@
 
 import msgspec
 import pytest
-from pages import printed, says, words
+from pages import page_of, printed, says, words
 from synthetic_identification import identified_flight, identified_vehicle
 
 from jaxos4.identification.next_flight import next_flight, spreads_of
 from jaxos4.identification.results import Constant, RigidBody
 from jaxos4.identification.verdict import RESERVATION, RESERVED, Issue, Quantity, Verdict, verdicts_of
-from jaxos4.report import write_flight_page
 
 HALF = {"Ix": 0.16, "Iy": 0.05, "Iz": 0.64}
 
@@ -59,8 +58,7 @@ def test_terminal_and_page_end_with_it(tmp_path):
     found = vehicle()
     line = said(found)
     assert " ".join(printed(found).split()).endswith(line)
-    write_flight_page(tmp_path / "flight.html", found)
-    says(words((tmp_path / "flight.html").read_text(encoding="utf-8")).replace("Next:", "next:"), line)
+    says(page_of(found, tmp_path / "flight.html").replace("Next:", "next:"), line)
     says(words(found._repr_html_()), line)
 
 

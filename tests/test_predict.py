@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CRAZYFLIE, refused
-from pages import says, stands_alone, words
+from helpers import CRAZYFLIE, output_of, refused
+from pages import read_page, says, words
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from synthetic_results import provenance, row, vehicle_result
@@ -83,12 +83,6 @@ def uncertain(seed):
     values = {name: value + std[name] * generator.standard_normal() for name, value in truth().items()}
     rows = {name: row(value, std[name]) for name, value in values.items()}
     return result(parameters=rows, covariance=np.diag(np.square(list(std.values()))).tolist())
-
-
-@pytest.fixture
-def write(save):
-    """Writes a result file."""
-    return lambda content, name="found.json": save(json.dumps(content), name)
 
 
 def reference(begin, squares, steps):
@@ -247,8 +241,7 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     write(result())
     jaxos4.write_flight(flown(2), tmp_path / "log.csv", CRAZYFLIE)
     files = ("--out", "out.nc", "--json", "out.json", "--figure", "out.svg", "--report", "out.html")
-    code, out, err = run("predict", "found.json", "log.csv", "--horizon", "0.25", "--seed", "3", *files)
-    assert (code, err) == (0, "")
+    out = output_of(run("predict", "found.json", "log.csv", "--horizon", "0.25", "--seed", "3", *files))
     assert all(
         line in out for line in ("attitude  rad    0.25 s", "rates     rad/s  sum", "written: out.nc", "25 steps")
     )
@@ -258,10 +251,9 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     error = np.abs(dataset.rates - dataset.rates_measured).sel(rate="p").mean("start")
     np.testing.assert_allclose(error, written["quantities"]["p"]["error"])
     assert "<svg" in (tmp_path / "out.svg").read_text(encoding="utf-8")
-    page = (tmp_path / "out.html").read_text(encoding="utf-8")
-    stands_alone(page)
-    says(words(page), "Better than constant rates and than a regression up to", "jaxos4 predict found.json log.csv")
-    assert plain(written["quantities"]["attitude"]["error"][-1]) in words(page)
+    page, errors = words(read_page(tmp_path / "out.html")), written["quantities"]["attitude"]["error"]
+    says(page, "Better than constant rates and than a regression up to", "jaxos4 predict found.json log.csv")
+    says(page, plain(errors[-1]))
     assert run("predict", "found.json", "log.csv", "--horizon", "0.25", "--out", "out.csv", "--seed", "3")[0] == 0
     table = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
     np.testing.assert_allclose(table["qw"], dataset.attitude.sel(component="w").values.ravel(), rtol=1e-8)

@@ -11,8 +11,8 @@ import matplotlib.colors
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import refused
-from pages import stands_alone, words
+from helpers import output_of, refused
+from pages import read_page, words
 from rich.console import Console
 from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
@@ -63,9 +63,7 @@ def report(study, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(report):
-    text = report[0].read_text(encoding="utf-8")
-    stands_alone(text)
-    return tables(text)
+    return tables(read_page(report[0]))
 
 
 def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_path, run):
@@ -78,8 +76,7 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
     assert (folder / "specification.toml").read_text() == study.attrs["specification"]
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     xr.testing.assert_equal(read_results(tmp_path), study)
-    code, out, err = run("report", str(tmp_path), "--csv", str(tmp_path / "errors.csv"))
-    assert (code, err) == (0, "")
+    out = output_of(run("report", str(tmp_path), "--csv", str(tmp_path / "errors.csv")))
     assert "4 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
@@ -87,8 +84,7 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
 
 def test_figures_as_pdf_are_beside_those_as_svg_if_wanted_and_do_not_outlive_them(study, tmp_path, run):
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
-    code, out, err = run("report", str(tmp_path), "--pdf")
-    assert (code, err) == (0, "")
+    out = output_of(run("report", str(tmp_path), "--pdf"))
     assert "4 figures, as SVG and PDF" in out
     files = {path.name: path.read_bytes()[:5] for path in (tmp_path / "figures").iterdir()}
     assert files.keys() == {f"{name}.{kind}" for name in OF_SCENARIO for kind in ("svg", "pdf")}
@@ -209,8 +205,7 @@ def test_a_study_of_one_flight_shows_the_answer_and_no_statistics(tmp_path):
     for name, none in {"result": code, "estimate": np.nan, "half_width": np.nan}.items():
         study[name].loc[{"scale": 0.0, "estimator": "svsf"}] = none
     page, *figures = write_report(study, tmp_path)
-    text = page.read_text(encoding="utf-8")
-    stands_alone(text)
+    text = read_page(page)
     assert [path.name for path in figures] == ["intervals.svg"]
     assert set(tables(text)) == {"estimates-1", "results-1"}
     shown, cells = words(text), tables(text)["estimates-1"]
@@ -265,7 +260,7 @@ def test_a_study_without_noise_has_a_page_without_figures_of_noise(tmp_path):
     study = synthetic_study(flights=4, scales=(1.0,), spoiled=False).assign_coords(scale=[0.0])
     files = write_report(study, tmp_path)
     assert not {"error.svg", "efficiency.svg"} & {file.name for file in files}
-    stands_alone((tmp_path / "report.html").read_text(encoding="utf-8"))
+    read_page(tmp_path / "report.html")
 
 
 def test_names_cannot_break_out_of_the_page(tmp_path):
@@ -275,8 +270,7 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
     study = study.assign_coords(estimator=["ibss", evil], model=[f"{evil} {{{{ 1 }}}}"], parameter=parameters)
     failures = json.dumps([{"cell": 0, "scale": 1.0, "estimator": evil, "message": evil}])
     study.attrs |= {"title": evil, "specification": f"</pre>{evil}", "command": evil, "failures": failures}
-    text = write_report(study, tmp_path)[0].read_text(encoding="utf-8")
-    stands_alone(text)
+    text = read_page(write_report(study, tmp_path)[0])
     assert words(text).count("alert(1)") >= 6
     assert all(name in words(text) for name in ("{{ 1 }}", "$\\frac{<b>}$"))
 

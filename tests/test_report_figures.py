@@ -4,12 +4,20 @@ import itertools
 import re
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
 from pages import assert_inside
 from sign_flights import flown
-from synthetic_identification import SAMPLE_TIMES, behind_an_estimate, identified_flight, identified_vehicle
+from synthetic_identification import (
+    KNOWN,
+    SAMPLE_TIMES,
+    behind_an_estimate,
+    identified_flight,
+    identified_vehicle,
+    synthetic_response,
+)
 from synthetic_study import synthetic_study
 
 from jaxos4 import compare_results
@@ -158,3 +166,49 @@ def test_no_mark_of_a_page_is_outside_of_its_axes_and_each_series_has_a_name():
         assert figure.legend() or len(colors) <= 4, figure.stem
         ElementTree.fromstring(as_file(figure))
         assert as_file(figure) == as_file(figure)
+
+
+@pytest.mark.parametrize("far", [3.0, 60.0])
+def test_every_parameter_is_inside_the_axis_of_the_brackets(far):
+    low, high = 0.0, 2.0  # the centre is 1, and half of the width is 1
+    at = 1.0 + far
+    row = msgspec.structs.replace(KNOWN, bracket=(low, high), estimate=at, ci95=(at - 0.5, at + 0.5))
+    near = msgspec.structs.replace(row, estimate=1.0, ci95=(0.9, 1.1))
+    (panel,) = identification_figures.priors(
+        identified_vehicle(parameters={"alpha8": row, "alpha3": near}), LOOK
+    ).panels
+    interval, points = (mark for mark in panel.marks if isinstance(mark, Line) and len(mark.x))
+    np.testing.assert_allclose(interval.x[[0, 1, 3, 4]], [far - 0.5, far + 0.5, -0.1, 0.1], atol=1e-12)
+    np.testing.assert_allclose(points.x, [far, 0], atol=1e-12)
+    assert panel.x.ends[1] > far + 0.5
+    assert panel.x.kind == ("symlog" if far > 5 else "linear")
+    assert {"-1", "0", "1"} <= {*panel.x.labelled()[0].values()}
+    assert_inside(panel)
+
+
+def test_the_gain_has_the_mean_that_the_verdict_is_about_and_an_axis_that_shows_it():
+    found = synthetic_response()
+    figure = identification_figures.frequency_responses(found, LOOK)
+    for place, axis in ((0, found.roll), (3, found.pitch)):
+        panel, mean = figure.panels[place], axis.agreement()
+        bar = next(mark for mark in panel.marks if mark.name == "mean gain with its 95 % interval")
+        assert (list(bar.x), list(bar.y)) == ([mean.low, mean.high], [mean.ratio] * 2)
+        low, high = panel.y.ends
+        assert low < mean.interval[0] < mean.interval[1] < high
+        assert high / low < 10
+    assert figure.panels[6].y.ends == (0.5, 2.0)
+    assert {*figure.legend()} >= {"measured / modelled", "model", "not clear"}
+
+
+def test_residuals_have_a_legend_and_both_signs_on_their_axes():
+    figure = identification_figures.residual_figure(behind_an_estimate()["correlations"])
+    assert [*figure.legend()] == ["95 % by chance", "roll torque", "pitch torque", "yaw torque"]
+    for panel in figure.panels:
+        assert len(panel.y.labelled(2)[0]) >= 2
+
+
+def test_each_row_and_column_of_the_correlations_has_its_name():
+    (panel,) = identification_figures.correlation_matrix(identified_flight(**behind_an_estimate()), LOOK).panels
+    assert [(each.text, each.y) for each in panel.marks if isinstance(each, Words)] == [("alpha3", 0), ("alpha6", 1)]
+    (pair,) = (mark for mark in panel.marks if isinstance(mark, Line) and mark.hollow)
+    assert (pair.tip, [*pair.x], [*pair.y]) == ("alpha6, alpha3: -0.95", [0], [1])

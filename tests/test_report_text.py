@@ -6,13 +6,19 @@ import math
 import msgspec
 import pytest
 from hypothesis import given, strategies as st
-from pages import printed, says, words
+from pages import page_of, printed, says
 from rich.console import Console
 from synthetic_identification import COLOURED, CONSTANTS, WHITE, WRONG, identified_flight, identified_vehicle
 
 from jaxos4.identification.intervals import PRIOR_NOTE
-from jaxos4.identification.results import Disturbance, FixedParameter, ParameterEstimate, RigidBody, Validation
-from jaxos4.report import write_flight_page
+from jaxos4.identification.results import (
+    Constant,
+    Disturbance,
+    FixedParameter,
+    ParameterEstimate,
+    RigidBody,
+    Validation,
+)
 from jaxos4.report.text import DASH, Listing, plain
 
 
@@ -75,8 +81,7 @@ def test_the_text_of_a_vehicle(tmp_path):
     assert "Predictions" not in doubtful
     late = {"rotor_delay": ParameterEstimate(-0.02, 0.001, 0.001, (-0.022, -0.018), "s", "")}
     says(printed(identified_vehicle(parameters=late)), "note: motors are recorded 20 ms late (rotor_delay)")
-    write_flight_page(tmp_path / "flight.html", identified_vehicle(parameters=late))
-    says(words((tmp_path / "flight.html").read_text(encoding="utf-8")), "motors are recorded 20 ms late")
+    says(page_of(identified_vehicle(parameters=late), tmp_path / "flight.html"), "motors are recorded 20 ms late")
     unseen = {"alpha1": FixedParameter(-0.56, "1", PRIOR_NOTE)}
     says(
         printed(identified_vehicle(held=unseen)),
@@ -84,6 +89,23 @@ def test_the_text_of_a_vehicle(tmp_path):
     )
     small = {"rotor_delay": msgspec.structs.replace(late["rotor_delay"], estimate=-0.004)}
     assert "late" not in printed(identified_vehicle(parameters=small))
+
+
+def test_much_widened_intervals_are_a_warning(tmp_path):
+    found = identified_vehicle(widened={"alpha3": 1.7, "alpha6": 2.4, "rotor_lag": 4.9})
+    said = "warning: parts of the flight disagree, so that intervals were widened 2.4 to 4.9 times: alpha6, rotor_lag."
+    for text in (found.summary(width=400), page_of(found, tmp_path / "flight.html")):
+        says(text, said, "The model lacks an effect.")
+    several = identified_vehicle(widened=found.widened, provenance={"flights": ["a.csv", "b.csv"]})
+    says(several.summary(width=400), "The model lacks an effect, or the flights are not of one vehicle.")
+    assert "warning" not in printed(identified_vehicle(widened={"alpha3": 1.9}))
+
+
+def test_a_moment_of_inertia_below_noise_has_no_value(tmp_path):
+    body = RigidBody(CONSTANTS | {"J_R": Constant(-2.83, 9.0, "kg m^2")}, 0.2, True)
+    text = page_of(identified_flight(rigid_body=body), tmp_path / "flight.html")
+    says(text, "J_R kg m^2 – -20.47 to 14.81 below noise")
+    assert "-2.83" not in text
 
 
 def test_small_numbers_keep_their_digits():

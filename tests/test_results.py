@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, refused
+from helpers import CRAZYFLIE, output_of, refused
 from jaxtyping import Float, jaxtyped
 from matplotlib.figure import Figure
-from pages import printed, says, stands_alone, words
+from pages import printed, read_page, says, words
 from rich.console import Console
 from strange import survives_strange_values
 from synthetic_identification import (
@@ -76,8 +76,7 @@ def test_the_command_makes_the_page_of_the_estimate_byte_for_byte(run, tmp_path)
     found = identified_vehicle(**FULL)
     write_flight_page(tmp_path / "fresh.html", found)
     written(found, tmp_path / "found.json")
-    code, out, err = run("report", "found.json")
-    assert (code, err) == (0, "")
+    out = output_of(run("report", "found.json"))
     assert out.startswith("found.html: ")
     assert (tmp_path / "found.html").read_bytes() == (tmp_path / "fresh.html").read_bytes()
     refused(run("report", "found.json", "--out", "found.json"), "would overwrite an input")
@@ -299,8 +298,7 @@ def files(tmp_path):
 
 
 def test_three_results_that_agree_are_pooled_and_one_that_does_not_is_named(run, tmp_path, files):
-    code, out, err = run("compare", *files[:3])
-    assert (code, err) == (0, "")
+    out = output_of(run("compare", *files[:3]))
     assert out.startswith("The results agree within their intervals in all 2 quantities")
     agree = jaxos4.compare_results([tmp_path / name for name in files[:3]])
     ix, iy = agree.quantities
@@ -317,9 +315,7 @@ def test_three_results_that_agree_are_pooled_and_one_that_does_not_is_named(run,
     assert err == "jaxos4: the results differ by more than chance: see the quantities that differ\n"
     assert "differ by more than chance in 1 of 2 quantities: Ix (p = " in " ".join(out.split())
     assert "3.json" in out
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    stands_alone(page)
-    assert all(said in words(page) for said in ("Ix (p = ", "1.90e-5", "differ", "3.json"))
+    says(words(read_page(tmp_path / "page.html")), "Ix (p = ", "1.90e-5", "differ", "3.json")
     (different,) = jaxos4.compare_results([tmp_path / name for name in files]).different
     assert different.name == "Ix"
 

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 import jaxos4
-from experiments.closed_loop.effects import DELAY, DT, LAG, LARGEST, VEHICLE, flights_of, stacked
+from experiments.closed_loop.effects import CHUNK, DELAY, DT, LAG, LARGEST, VEHICLE, flights_of, stacked
 from experiments.fits import INERTIAS, given_airframe, identified, shares_of_truth, summary, whole
 from experiments.monte_carlo import LOST, Row, check_names, groups, plus_minus, print_table, product, results_of, study
 from experiments.shared import Count, Estimators, Out, Seed
@@ -34,7 +34,6 @@ WINDOW = 62  # samples
 SIGMA = 0.02
 # Without a disturbance in their model. The regression's memory is the best on real flights.
 WITHOUT_DISTURBANCE = {"equation-error": jaxos4.EquationError(memory=0.9), "output-error": jaxos4.OutputError()}
-CHUNK = 25  # flights of one call
 
 
 def references_of(kind: str, gust: float, duration: float, seed: int) -> np.ndarray | None:

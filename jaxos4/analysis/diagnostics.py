@@ -9,6 +9,8 @@ from ..results import NINETY_FIVE
 from ..shooting import ROUNDING
 from .evaluation import Evaluation
 
+LAGS = 25  # samples; correlations are those of residuals up to so many apart
+
 
 class Correlations(Arrays, frozen=True, eq=False):
     """Correlations of the residuals of some channels: with themselves, and with the roll, pitch and yaw torque.
@@ -62,11 +64,11 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
     """Diagnostics of the residuals of one flight, evaluated at the answer of a fit.
 
     `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom. Correlations are those
-    of residuals up to 25 samples apart, in a short flight up to half of it.
+    of residuals up to `LAGS` samples apart, in a short flight up to half of it.
     """
     from scipy.special import gammainc, gammaincc, ndtr  # slow to import, and few need it
 
-    lags = min(25, evaluation.measured.shape[0] // 2)
+    lags = min(LAGS, evaluation.measured.shape[0] // 2)
     problem, feasible = evaluation.problem, evaluation.feasible
     # A diverged trajectory counts as nothing measured.
     measured = ~np.isnan(evaluation.measured) & feasible
@@ -113,15 +115,15 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
 
 
 def residual_correlations(
-    errors: Float[np.ndarray, "samples channels"], torques: Float[np.ndarray, "samples 3"], lags: int = 25
+    errors: Float[np.ndarray, "samples channels"], torques: Float[np.ndarray, "samples 3"]
 ) -> Correlations:
-    """The correlations of residuals up to this many samples apart. NaN: not measured."""
+    """The correlations of residuals up to `LAGS` samples apart. NaN: not measured."""
     measured = np.isfinite(errors)
     errors = np.where(measured, errors, 0.0)
-    own, pairs = (x[:, lags + 1 :] for x in _correlations(errors, errors, measured, measured, lags))
-    crossed, deviations = _with_torques(errors, measured, own, _moves(torques), lags)
+    own = _correlations(errors, errors, measured, measured, LAGS)[0][:, LAGS + 1 :]
+    crossed, deviations = _with_torques(errors, measured, own, _moves(torques), LAGS)
     bound = NINETY_FIVE / np.sqrt(np.maximum(measured.sum(axis=0), 1))
-    return Correlations(own, crossed, bound, NINETY_FIVE * deviations[:, :, lags])
+    return Correlations(own, crossed, bound, NINETY_FIVE * deviations[:, :, LAGS])
 
 
 def _moves(torques: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:

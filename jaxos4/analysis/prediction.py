@@ -81,10 +81,10 @@ def predictions(
     disturbance: Float[np.ndarray, "samples 3"] | None = None,
     noise: LogNoise | None = None,
 ) -> Predictions:
-    """Predict the body rates from many `starts`, with the recorded rotor speeds. The velocity keeps its value there.
+    """Predict the body rates from many `starts`, with the recorded rotor speeds and the velocity at the start.
 
-    `problem` gives model, flight and method; `horizons` [s] are positive. `disturbance` [rad/s^2]: fades from its value
-    at the start by the time constants of `noise`; by default there is none.
+    `problem` gives model, flight and method; `horizons` [s] are positive. The `disturbance` [rad/s^2] at a start fades
+    with the time constants of `noise`; by default there is none.
 
     **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """
@@ -100,25 +100,25 @@ def predictions(
     return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead - 1], measured)
 
 
-def trajectory_horizons(dt: float, longest: float = max(HORIZONS), *, every: float = 0.02) -> tuple[float, ...]:
-    """Horizons each `every` seconds, in whole samples, which draw a trajectory up to the `longest`."""
-    step = max(round(every / dt), 1)
-    return tuple(dt * np.arange(step, max(round(longest / dt), 1) + 1, step))
+def trajectory_horizons(dt: float) -> tuple[float, ...]:
+    """Horizons every 20 ms, in whole samples, which draw a trajectory up to the longest of `HORIZONS`."""
+    step = max(round(0.02 / dt), 1)
+    return tuple(dt * np.arange(step, max(round(max(HORIZONS) / dt), 1) + 1, step))
 
 
 def starts(
-    flight: Flight, horizons: tuple[float, ...] = HORIZONS, *, every: float = 0.05, near: float = 0.01
+    flight: Flight, horizons: tuple[float, ...] = HORIZONS
 ) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 3"]]:
     """The samples at which `predictions` starts, and the rates there [rad/s]. Raises the same errors.
 
-    There is a start each `every` seconds. The rates are the mean of those measured up to `near` [s] around the start:
-    less noise than one sample. A start is omitted if one of these rates is missing, or if the longest horizon reaches
-    beyond the stretch.
+    There is a start every 50 ms. The rates are the mean of those measured up to 10 ms before or after the start: less
+    noise than one sample. A start is omitted if one of these rates is missing, or if the longest horizon reaches beyond
+    the stretch.
     """
     dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
-    around = int(near / dt)
+    around = int(0.01 / dt)
     stretch, rates = np.asarray(flight.stretch_numbers), np.asarray(flight.states)[:, RATES]
-    start = np.arange(around, samples - ahead.max() - around, max(int(round(every / dt)), 1))
+    start = np.arange(around, samples - ahead.max() - around, max(int(round(0.05 / dt)), 1))
     start = start[stretch[start - around] == stretch[np.minimum(start + ahead.max(), samples - 1)]]
     initial = rates[start[:, None] + np.arange(-around, around + 1)].mean(axis=1)
     known = np.isfinite(initial).all(axis=1)
@@ -214,7 +214,7 @@ def filtered(
     stretch: Int[Numeric, " samples"],
     dt: Scalar,
 ) -> tuple[Filtered, Float[Array, "samples channels"]]:
-    """The knowledge from all measurements until each sample, and the innovations. Filters begin anew in each stretch.
+    """Filter all measurements up to each sample, and return the innovations too. Each stretch starts new filters.
 
     The likelihood's filters (`jaxos4.shooting.filters`), with the model's accelerations as data instead of derivatives.
 
@@ -247,12 +247,12 @@ def open_loop(
     gusts: Filtered,
     over: Transition,
 ) -> Motion:
-    """The motion after each step. Nothing is measured any more, and the disturbance fades.
+    """Simulate the motion without measurements, step by step, while the disturbance fades.
 
     - `advance(motion, row, added)`: the motion after one step. `added`: what disturbances add to each rate over the
       step, and the mean of each specific force that they add.
-    - `known`: at the start. Its rates do not count, as they are part of the motion.
-    - `rows`: the forcing of each step. `gusts`: what each channel gains in it besides.
+    - `known`: the filters at the start. Their rates are not used, because the motion has rates of its own.
+    - `rows`: the forcing of each step. `gusts`: random increments of each channel in each step.
     - `over`: the transition of the disturbance over a step.
     """
     rate = is_rate(over.reach)

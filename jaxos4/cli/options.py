@@ -43,8 +43,9 @@ def as_typed(message: str) -> str:
     return re.sub(r"`(\w+)`", typed, message)
 
 
-def check_sizes(*, most: float = 1e9) -> None:
+def check_sizes() -> None:
     """Refuses numbers of options that are far larger than any time, speed, size or count."""
+    most = 1e9
     for name, given in ASKED.items():
         for value in given if isinstance(given, tuple) else (given,):
             if name != "seed" and isinstance(value, int | float) and not math.isnan(value) and abs(value) > most:

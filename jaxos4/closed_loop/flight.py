@@ -88,10 +88,10 @@ class Signals(NamedTuple):
 
 
 def _physics(loop: ClosedLoop) -> tuple[Callable[..., BodyMotion], Callable[..., Vector]]:
-    """The derivative of the motion in the body's axes, and the specific force along them [m/s^2], as functions.
+    """The functions `derivative(motion, forcing, wind, gusts)` and `specific_force(velocity, forcing, wind)`.
 
-    They take the motion or its velocity, the forcing by rotors and vertical gust, the wind along the body's axes, and
-    the derivative the gusts of p', q', r'. Constants are scalars, because a batch of scalars vectorises.
+    Motion, specific force [m/s^2] and wind are along the body's axes. The forcing is that of rotors and vertical gust;
+    `gusts` are added to p', q', r'. Constants are scalars, because a batch of scalars vectorises.
     """
     airframe, air = loop.airframe, loop.air
     ix, iy, iz = jnp.asarray(airframe.inertia)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,33 +22,28 @@ from .envelope import Envelope, Uses
 from .fleet import LANES, Fleet, batch_of, fly_batch, inertias_first, model_of
 from .task import Coefficients, Designed, Flown
 
-# Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
+# Tones of these amplitudes are flown: angles [rad] and vertical acceleration [m/s^2]. The vehicle is linear for them.
 _SMALL = np.array([0.02, 0.02, 0.02, 0.2])
-# Times in periods at which the search looks, about eight for each cycle of the fastest tone.
+# The search checks the limits at these times, in periods: about eight for each cycle of the fastest tone.
 _POINTS = np.arange(200) / 200
-# References that need too much are reduced to about this share of a limit, with at most this many reductions, each by
-# a factor that is at least the last.
-_TARGET, _REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
-# A parameter counts as excited if its bound is below this share of the bracket's standard deviation.
-_LITTLE = 0.9
+_TARGET = 0.995  # references that exceed a limit are reduced to about this share of it
+_REDUCTIONS, _LEAST_STEP = 8, 0.7  # the most reductions, and the smallest factor of one of them
+_LITTLE = 0.9  # a parameter is excited if its bound is below this share of the bracket's standard deviation
 
 
-class Tones(NamedTuple):
-    """The tones of references, each a whole number of cycles in a period of the references."""
+def _tones(bandwidth: float, samples: int, dt: float) -> tuple[int, int]:
+    """The period of the references in samples, and the number of tones: the multiples of 1 / period up to a bandwidth.
 
-    period: int  # in samples
-    number: int  # of the tones, which are the multiples of 1 / period
+    There are as many tones as fit into a batch beside eight hovering flights.
+    """
+    most = (LANES - 1 - 8) // 2
+    period = (samples - 1) // max(math.ceil(samples * dt * bandwidth / most), 1)
+    return period, max(min(math.floor(bandwidth * period * dt + 1e-9), most), 1)
 
-    @classmethod
-    def up_to(cls, bandwidth: float, samples: int, dt: float) -> "Tones":
-        """As many as fit into a batch beside eight hovering flights, up to a bandwidth [Hz]; the references repeat."""
-        most = (LANES - 1 - 8) // 2
-        period = (samples - 1) // max(math.ceil(samples * dt * bandwidth / most), 1)
-        return cls(period, max(min(math.floor(bandwidth * period * dt + 1e-9), most), 1))
 
-    def turns(self, periods: Float[np.ndarray, " points"]) -> np.ndarray:
-        """exp(i angle) of each tone, at times in periods."""
-        return np.exp(2j * math.pi * np.outer(periods, np.arange(1, self.number + 1)))
+def _turns(tones: int, periods: Float[np.ndarray, " points"]) -> np.ndarray:
+    """exp(i angle) of each of so many tones, at times in periods."""
+    return np.exp(2j * math.pi * np.outer(periods, np.arange(1, tones + 1)))
 
 
 def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
@@ -57,15 +52,15 @@ def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
 
 
 def _response(
-    fleet: Fleet, envelope: Envelope, largest: Float[np.ndarray, "4"], tones: Tones, samples: int, key: Key
+    fleet: Fleet, envelope: Envelope, largest: Float[np.ndarray, "4"], period: int, number: int, samples: int, key: Key
 ) -> dict[str, Any]:
-    """The fields `base`, `added` and `signals` of `ReferenceTask`: each tone is flown once in still air.
+    """The fields `base`, `added` and `signals` of `ReferenceTask`: each of a `number` of tones flies in still air.
 
     For small tones the vehicle is linear. So the information of a sum of tones is the sum of their informations.
 
     **Raises:** `InputError` if gusts alone use a limit.
     """
-    number, turns = tones.number, tones.turns(np.arange(samples) / tones.period)
+    turns = _turns(number, np.arange(samples) / period)
     references = np.zeros((LANES, samples, 4))
     references[:number, :, :3] = _SMALL[:3] * np.real(turns).T[:, :, None]
     references[number : 2 * number, :, 3] = _SMALL[3] * np.real(turns).T
@@ -82,14 +77,14 @@ def _response(
     scale[: len(INERTIAS)] = 1  # their bounds are relative already
     unit = np.outer(scale, scale)
     # The responses in the last period, in which the beginning is forgotten.
-    last = np.conj(turns[-tones.period :]) * 2 / tones.period
+    last = np.conj(turns[-period:]) * 2 / period
     signals = {}
     for name, columns in (("angle", ANGLES), ("rate", RATES)):
         left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
         if (left <= 0).any():
             raise _too_gusty(name)
-        responses = np.einsum("kta,tk->ak", states[:number, -tones.period :, columns], last) / _SMALL[:3, None]
-        moving = _parts(responses[:, None] * tones.turns(_POINTS))
+        responses = np.einsum("kta,tk->ak", states[:number, -period:, columns], last) / _SMALL[:3, None]
+        moving = _parts(responses[:, None] * _turns(number, _POINTS))
         signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
     relative = np.square(largest / _SMALL)[:, None, None, None]
     return {"base": jnp.asarray(base / unit), "added": jnp.asarray(relative * each / unit), "signals": signals}
@@ -104,6 +99,7 @@ class ReferenceTask(task.AbstractTask):
     - `signals`: the angles and rates of an axis by a unit of the coefficients of its reference, cosines first, as a
       share of the part of the limit that gusts leave; by the name of the limit.
     - `largest`: the largest value of each reference.
+    - `period`: in samples, after which the references repeat. `tones`: their number.
     """
 
     kind: ClassVar[str] = "references"
@@ -122,7 +118,8 @@ class ReferenceTask(task.AbstractTask):
     added: Float[Numeric, "references tones unknowns unknowns"]
     signals: dict[str, Float[Numeric, "axes points coefficients"]]
     largest: Float[Numeric, "4"]
-    tones: Tones = eqx.field(static=True)
+    period: int = eqx.field(static=True)
+    tones: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
@@ -131,7 +128,7 @@ class ReferenceTask(task.AbstractTask):
     @property
     def size(self) -> int:
         """A cosine and a sine for each tone of each reference."""
-        return 8 * self.tones.number
+        return 8 * self.tones
 
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
@@ -143,11 +140,11 @@ class ReferenceTask(task.AbstractTask):
         """See `AbstractTask`."""
         each = coefficients.reshape(4, -1)
         moved = {name: jnp.einsum("apk,ak->pa", some, each[:3]) for name, some in self.signals.items()}
-        return moved | {"reference": as_float(_parts(self.tones.turns(_POINTS))) @ each.T}
+        return moved | {"reference": as_float(_parts(_turns(self.tones, _POINTS))) @ each.T}
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`. The references have their largest values, or are reduced to a share of them."""
-        basis = _parts(self.tones.turns(np.arange(self.samples) / self.tones.period))
+        basis = _parts(_turns(self.tones, np.arange(self.samples) / self.period))
         inputs = with_largest(basis @ coefficients.reshape(4, -1).T, np.asarray(self.largest))
         uses, factor, still = self.fleet.uses(inputs, self.envelope), 1.0, None
         for _ in range(_REDUCTIONS):
@@ -174,7 +171,7 @@ class ReferenceTask(task.AbstractTask):
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
         """See `AbstractTask`. The bounds are those of filter error, after a flight through gusts."""
         bounds, dt = self.fleet.bounds({name: references for name, (references, _) in flown.items()}), self.fleet.dt
-        period = dt * self.tones.period
+        period = dt * self.period
         return {name: Designed(inputs, dt, bounds[name], uses, period) for name, (inputs, uses) in flown.items()}
 
 
@@ -221,7 +218,7 @@ def design_references(
     samples, largest = round(duration / dt) + 1, np.array([angle, angle, angle, acceleration])
     fleet = Fleet.of(loop, bracket, dt, key)
     envelope = fleet.envelope(standard_references(samples, dt, largest)["3211"], limits or {})
-    tones = Tones.up_to(bandwidth, samples, dt)
+    period, tones = _tones(bandwidth, samples, dt)
     progress("flying tones")
     references = ReferenceTask(
         names=inertias_first(INERTIAS, fleet.model.parameter_names),
@@ -231,10 +228,11 @@ def design_references(
         unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
         largest=largest,
+        period=period,
         tones=tones,
         samples=samples,
         criterion=criterion,
-        **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
+        **_response(fleet, envelope, largest, period, tones, samples, jax.random.fold_in(key, 3)),
     )
     return task.design(references, compare=compare, key=key, progress=progress)
 

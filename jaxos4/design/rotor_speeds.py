@@ -28,25 +28,19 @@ from . import task
 from .envelope import Envelope, Uses, hover_squares
 from .task import Coefficients, Designed, Flown, Series
 
-# The vehicles that keep the limits: the last are corners of the bracket. The criterion is the mean of the first.
-_VEHICLES, _CORNERS, _AVERAGED = 200, 100, 4
-# The vehicles that keep the limits in a stage of the search: at first random ones. Each stage adds those that use the
-# most, in place of the first ones.
+_VEHICLES, _CORNERS = 200, 100  # that keep the limits; the last of them are corners of the bracket
+_AVERAGED = 4  # the criterion is the mean over this many of them
+# Each stage of the search watches this many. It replaces the first of them by those that now use the most of a limit.
 _WATCHED = 40
-# The share of a limit that an input uses at most, because other vehicles from the bracket may need a little more.
-_TARGET = 0.95
+_TARGET = 0.95  # the largest share of a limit: other vehicles from the bracket may need a little more
 _FINER = 10  # steps in a sample of the flights that must keep the limits
-# Tones of a lower frequency [Hz] have the amplitude of this one: angles would allow almost none.
-_SLOWEST_TONE = 0.3
-# Squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
-_LEAST = 1e-6
-# A standard input is multiplied by at most about this; one that needs a larger share of a limit than the last counts
-# as if it needed this; the factor is found to this share of it.
-_AMPLIFIED, _FAR, _PRECISION = 100.0, 10.0, 1e-3
-# An amplitude is reduced in steps of this factor until the limits are kept, at most to this.
-_REDUCED, _SMALLEST = 0.9, 1e-3
-# A margin is widened at most this many times, until the limits are kept between samples too.
-_CORRECTIONS = 5
+_SLOWEST_TONE = 0.3  # Hz; a slower tone has the amplitude of this one, because angles would allow almost none
+_LEAST = 1e-6  # rad^2/s^2; squared rotor speeds stay above this, which is outside of the envelope
+_AMPLIFIED = 100.0  # a standard input is multiplied by at most about this factor
+_PRECISION = 1e-3  # of this factor, as a share of it
+_FAR = 10.0  # an input that uses a larger share of a limit counts as if it used this share
+_REDUCED, _SMALLEST = 0.9, 1e-3  # the factor of one reduction of an amplitude, and of all reductions together
+_CORRECTIONS = 5  # times that the margin is widened, at most, until the limits are kept between samples too
 
 
 class RotorSpeedTask(task.AbstractTask):

@@ -174,7 +174,8 @@ def design(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -
     progress("compiling the search")
     searches = _started(jax.random.fold_in(key, 2), task)
     for stage, penalty in enumerate(_PENALTIES, start=1):
-        searches = [_minimise(search.watching(), as_float(penalty)) for search in searches]
+        watching = (search._replace(task=search.task.watching(search.coefficients)) for search in searches)
+        searches = [_minimise(search, as_float(penalty)) for search in watching]
         best = min(searches, key=lambda search: search.cost)
         if not np.isfinite(best.cost):
             remedy = "narrow the bracket, or give stronger gusts for a vehicle under a controller"
@@ -193,7 +194,7 @@ def design(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -
 class _Search(NamedTuple):
     """The state of a search.
 
-    - `task`: with the vehicles whose limits it watches.
+    - `task`: with the vehicles whose limits the search watches.
     - `basis`: moves along which the cost is about equally curved, as BFGS found.
     - `cost`: the criterion, and the penalty of the vehicles that this search watches.
     """
@@ -202,10 +203,6 @@ class _Search(NamedTuple):
     coefficients: Coefficients
     basis: Float[Array, "coefficients coefficients"]
     cost: Scalar
-
-    def watching(self) -> "_Search":
-        """The search that watches the vehicles which now use the most of the limits."""
-        return self._replace(task=self.task.watching(self.coefficients))
 
 
 @quick_jit
@@ -235,12 +232,12 @@ def _minimise(search: _Search, penalty: Scalar) -> _Search:
 
 
 def criterion_of(
-    information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str, norm: int = 16
+    information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str
 ) -> Scalar:
     """The logarithm of a mean bound of the first unknowns, see `design_input`. Smaller is better.
 
     A bound is a standard deviation as a share of the `half_width` of its parameter's bracket. The volume of `"D"` is
-    given as the edge of a cube. In `"worst"`, the largest bound is replaced by the `norm` of the bounds, which has
+    given as the edge of a cube. In `"worst"`, the largest bound is replaced by the 16-norm of the bounds, which has
     derivatives.
     """
     count = half_width.shape[0]
@@ -251,7 +248,7 @@ def criterion_of(
     squares = jnp.diagonal(gram(basis[0, :count, -count:])) / jnp.square(half_width)
     if criterion == "A":
         return jnp.log(squares.mean()) / 2
-    largest = squares.max()
+    largest, norm = squares.max(), 16
     return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (norm / 2)).sum()) / norm
 
 

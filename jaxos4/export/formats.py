@@ -2,7 +2,6 @@
 
 import functools
 import math
-import os
 import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .._files import in_xml, templates
 from .._version import __version__
 from ..errors import InputError, printable
-from ..identification.results import Identification
+from ..result_file import ResultSource
 from ..results import meaning
 from .result import Identified, read_result
 from .vehicle import RigidVehicle
@@ -107,9 +106,7 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
     )
 
 
-def sample_vehicles(
-    found: Identification | str | os.PathLike[str], samples: int, *, key: PRNGKeyArray
-) -> dict[str, Float[Array, "samples ..."]]:
+def sample_vehicles(found: ResultSource, samples: int, *, key: PRNGKeyArray) -> dict[str, Float[Array, "samples ..."]]:
     """Vehicles drawn from the uncertainty of an estimate, the reservations of its verdicts, and the width of guesses.
 
         vehicles = found.sample(64, key=jax.random.key(0))

@@ -17,7 +17,7 @@ from ..errors import InputError, named, printable
 from ..flight import RATES, STATE_NAMES
 from ..identification.results import Identification, VehicleIdentification
 from ..models.flight_model import without_recording
-from ..result_file import vehicle_result
+from ..result_file import ResultSource, vehicle_result
 from .spread import DRAG, ESTIMATE, spread_of
 from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
@@ -118,7 +118,7 @@ class Identified(NamedTuple):
 _MAY_BE_POSITIVE = 2.0  # standard deviations below 0: one draw in 44 is positive
 
 
-def read_result(found: Identification | str | os.PathLike[str], *, inertia_z: float | None = None) -> Identified:
+def read_result(found: ResultSource, *, inertia_z: float | None = None) -> Identified:
     """The vehicle of an identification, or of a file that `jaxos4 estimate --out` wrote.
 
     `inertia_z`: Iz [kg m^2] instead of the estimate, as far as a rigid body with these Ix and Iy can have it.

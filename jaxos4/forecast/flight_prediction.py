@@ -126,19 +126,17 @@ class FlightPrediction(NamedTuple):
         """The predictions as an xarray Dataset. A quantity that was not measured is left out."""
         import xarray as xr
 
-        coordinates: dict[str, Any]
         variables, both = {}, ("start", "horizon")
-        coordinates = {"start": ("start", self.time, {"units": "s"}), "axis": ["x", "y", "z"]}
+        coordinates: dict[str, Any] = {"start": ("start", self.time, {"units": "s"}), "axis": ["x", "y", "z"]}
         coordinates |= {"horizon": ("horizon", self.horizons, {"units": "s"})}
         for name, places in PARTS.items():
             if name in self.missing:
                 continue
             unit, errors = QUANTITIES[name]
             axis, labels = _AXES.get(name, ("axis", ["x", "y", "z"]))
-            rows = {"": self.predicted, "_unaware": self.unaware, "_measured": self.measured}
-            for suffix, states in rows.items():
-                unit_of = "1" if name == "attitude" else unit
-                variables[name + suffix] = ((*both, axis), states[..., places], {"units": unit_of})
+            units = {"units": "1" if name == "attitude" else unit}
+            for suffix, states in (("", self.predicted), ("_unaware", self.unaware), ("_measured", self.measured)):
+                variables[name + suffix] = ((*both, axis), states[..., places], units)
             across = axis if name != "attitude" else "axis"
             variables[f"{name}_half_width"] = ((*both, across), self.half_width[..., errors], {"units": unit})
             coordinates[axis] = labels

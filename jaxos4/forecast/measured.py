@@ -59,7 +59,7 @@ class Measured(NamedTuple):
         return self._replace(**parts)
 
     def contradictions(
-        self, start: Int[np.ndarray, " starts"], steps: int, gravity: float, *, fewest: int = 10
+        self, start: Int[np.ndarray, " starts"], steps: int, gravity: float
     ) -> Float[np.ndarray, "steps 9"]:
         """How far position, velocity and attitude are from dead reckoning with gyro and accelerometer, without a model.
 
@@ -67,8 +67,8 @@ class Measured(NamedTuple):
         not count.
 
         **Returns:** the standard deviation after each step, less the part that the white noise of gyro and
-        accelerometer causes. It is at least the noise of start and end together, and equal to it for fewer than
-        `fewest` starts.
+        accelerometer causes. It is at least the noise of start and end together, and equal to it for fewer than ten
+        starts.
         """
         rows, dt, down = start[:, None] + np.arange(steps + 1), self.dt, np.array([0.0, 0.0, gravity])
         begin, rates = self.states[start], self.states[rows[:, 1:], 10:]
@@ -80,7 +80,7 @@ class Measured(NamedTuple):
         reckoned = _moved(begin, rates, velocity, dt)
         departed = np.abs(departures(reckoned, self.states[rows[:, 1:]]))[..., :9]
         one_sigma = 0.6827  # the share of a Gaussian within one standard deviation
-        enough = np.isfinite(departed).sum(axis=0) >= fewest
+        enough = np.isfinite(departed).sum(axis=0) >= 10
         size = np.nanquantile(np.where(enough, departed, 0.0), one_sigma, axis=0)
         seconds, white = dt * np.arange(1, steps + 1)[:, None], np.nan_to_num([white_noise(x, 4) for x in self.force.T])
         jerky, gyro = white**2 * dt * seconds, self.noise[9:] ** 2 * dt * seconds

@@ -23,9 +23,8 @@ PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10]
 
 
 MEMORY = 5.0  # s; offsets of a recording are forgotten with this time constant: batteries and propellers change slowly
-# Standard deviation [m/s^2] of an offset of the specific force, and of the force that a model lacks; its correlation
-# time.
-PUSH, PUSH_TIME = 1.0, 0.25
+PUSH = 1.0  # m/s^2; standard deviation of an offset of the specific force, and of the force that a model lacks
+PUSH_TIME = 0.25  # s; the correlation time of that force
 
 
 class Motion(NamedTuple):
@@ -37,17 +36,9 @@ class Motion(NamedTuple):
     rates: Rates
 
 
-class Known(NamedTuple):
-    """The knowledge at each sample, or at one.
-
-    - `state`: as measured, as in `PARTS`.
-    - `filters`: rates and unexplained specific forces [rad/s; m/s^2], and what drives these [rad/s^2; m/s^2].
-    - `offset_std`: the standard deviation of each offset, see `Futures`.
-    """
-
-    state: Float[Numeric, "... 13"]
-    filters: Filtered
-    offset_std: Float[Numeric, "... 6"]
+Known = tuple[Float[Numeric, "... 13"], Filtered, Float[Numeric, "... 6"]]
+"""At each sample, or at one: the measured state; rates [rad/s] and unexplained specific forces [m/s^2], with their
+disturbances [rad/s^2; m/s^2], as filters know them; and the standard deviation of each offset, see `Futures`."""
 
 
 class Futures(NamedTuple):
@@ -55,10 +46,11 @@ class Futures(NamedTuple):
 
     - `parameters`: of the model. `forcing`: with these parameters, one row for each sample.
     - `offset`: p', q', r' [rad/s^2] and specific force [m/s^2] that the model lacks in this recording, estimated from
-      the past of each sample.
-    - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
+      all samples before.
+    - `filtered`: whether the future begins with the rates and the disturbance of the filters, or with measured rates
+      and no disturbance.
     - `errors`: errors of the filters at the start.
-    - `off`: errors of the offsets, and what they make of the disturbances at the start, in standard deviations.
+    - `off`: errors of the offsets in standard deviations, and the changes of the disturbances that these errors cause.
     - `gusts`: random increments of each channel in each step.
     """
 
@@ -78,15 +70,15 @@ def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
 def _fly_future(
     model: FlightModel, future: Futures, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
 ) -> Float[Array, "steps 13"]:
-    """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
-    scalars, axes = tuple(future.parameters), model.force_axes
-    p, v, q, w = (start.state[places] for places in PARTS.values())
+    """The states of one future after each step from its start. A motion that diverges keeps its last state."""
+    scalars, axes, (state, filters, offset_std) = tuple(future.parameters), model.force_axes, start
+    p, v, q, w = (state[places] for places in PARTS.values())
     steps = future.gusts.driven.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), future.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
-    error, absorbed = start.offset_std * future.off
+    error, absorbed = offset_std * future.off
     measured = Filtered(jnp.zeros(noise.strength.size).at[:3].set(w), jnp.zeros(noise.strength.size))
-    known = jax.tree.map(lambda x, y, e: jnp.where(future.filtered, x, y) + e, start.filters, measured, future.errors)
+    known = jax.tree.map(lambda x, y, e: jnp.where(future.filtered, x, y) + e, filters, measured, future.errors)
     known = known._replace(disturbance=known.disturbance.at[:3].add(absorbed[:3]))
     w = known.driven[:3] - gyro_bias(model, w, still, scalars)
     offset = future.offset[first] + error
@@ -123,7 +115,7 @@ def _unit(a: Quaternion) -> Quaternion:
 
 
 def departures(states: Any, others: Any) -> Any:
-    """How far other states are off, (..., 13) to (..., 12): attitude by `deviation`. NumPy and JAX."""
+    """`others` minus `states`, (..., 13) to (..., 12): attitudes differ by `deviation`. NumPy and JAX."""
     difference, xp = others - states, np if isinstance(states, np.ndarray) else jnp
     turn = deviation(xp.moveaxis(states[..., 6:10], -1, 0), xp.moveaxis(others[..., 6:10], -1, 0))
     return xp.concatenate([difference[..., :6], xp.stack(turn, axis=-1), difference[..., 10:]], axis=-1)
@@ -154,9 +146,9 @@ def known_at_samples(
     noise: LogNoise,
     prior: Float[Array, "6"],
 ) -> tuple[Known, Forcing, Float[Array, "futures samples 6"]]:
-    """The knowledge at each sample, by the first row of `parameters`; forcing and offsets of each row: see `Futures`.
+    """What is known at each sample by the first row of `parameters`; forcing and offsets by each row, see `Futures`.
 
-    The forcing has no velocity: a prediction has its own.
+    The forcing has no velocity, because a prediction simulates it.
 
     - `length`: the samples of the flight that are no padding.
     - `measured`: states, accelerations and the white noise of velocity: see `jaxos4.forecast.measured.Measured`.
@@ -186,7 +178,7 @@ def known_at_samples(
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     seen = jnp.concatenate([rates, force], axis=1)
     filters, _ = filtered(noise, seen, modelled, flight.stretch_numbers, flight.dt)
-    return Known(state, filters, offset_std), forcing, offset
+    return (state, filters, offset_std), forcing, offset
 
 
 def _offset_weights(
@@ -198,9 +190,9 @@ def _offset_weights(
     kept: Scalar,
     dt: Scalar,
 ) -> tuple[Float[Array, "samples 6"], Float[Array, "samples 6"]]:
-    """The factor of the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
+    """The factor that makes an offset of a sum of earlier residuals, and the standard deviation of the offsets.
 
-    The mean of a recording's residuals is drawn to 0 as far as offsets are known not to differ.
+    An offset is the mean of a recording's residuals, drawn towards 0 by its `prior`.
     """
     channels = np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
     strength, time_constant = (jnp.full(6, x) for x in (PUSH, PUSH_TIME))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ from ..logs import Recording, Source, as_recording
 from ..models.flight_model import FlightModel, without_recording
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording.prepared import Prepared, prepare
-from ..result_file import vehicle_result
+from ..result_file import ResultSource, vehicle_result
 from ..rotations import rotated
 from ..shooting import capacity_of, pad_flight
 from ..shooting.gains import Covariance, LogNoise
@@ -62,7 +61,7 @@ class Vehicle(NamedTuple):
     notes: tuple[str, ...]
 
 
-def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
+def vehicle_of(found: ResultSource) -> Vehicle:
     """The vehicle of an identification or a file of `jaxos4 estimate --out`. Raises `InputError` or `OSError`."""
     file = vehicle_result(found)
     given = isinstance(found, Identification)
@@ -116,7 +115,7 @@ _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
 
 def predict(
-    found: Identification | Vehicle | str | os.PathLike[str],
+    found: ResultSource | Vehicle,
     flight: Source,
     *,
     horizon: float = 0.5,
@@ -155,11 +154,7 @@ def predict(
     vehicle = found if isinstance(found, Vehicle) else vehicle_of(found)
     recording = as_recording(flight, airframe=vehicle.model.airframe)
     name, prepared = recording.name, _prepare(vehicle, recording, sample_time)
-    measured, padded = Measured.of(prepared.fitted), prepared.fitted
-    if padded.body_velocity is None:  # the model's forcing has one
-        padded = dataclasses.replace(padded, body_velocity=np.zeros((padded.time.size, 3)))
-    if (capacity := capacity_of(padded.time.size)) != padded.time.size:
-        padded = pad_flight(padded, capacity)
+    measured = Measured.of(prepared.fitted)
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
     for option, value in (("horizon", horizon), ("spacing", spacing)):
         if 0 < value < dt / 2:
@@ -168,7 +163,7 @@ def predict(
     start = _starts(measured, name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    begin, states, spread = _predict_states(vehicle, padded, measured, start, missing, noise, steps, seed)
+    begin, states, spread = _predict_states(vehicle, prepared.fitted, measured, start, missing, noise, steps, seed)
     fitted = found.problem if isinstance(found, Identification) else None
     trained = measured.first_half if fitted is None else Measured.of(fitted.flight)
     ahead, gravity = start[:, None] + np.arange(1, steps + 1), float(vehicle.model.airframe.gravity)
@@ -239,6 +234,10 @@ def _predict_states(
 
     Without measurements, the position is 0, and the velocity comes from dead reckoning and has no offset of the force.
     """
+    if flight.body_velocity is None:  # the model's forcing has one
+        flight = dataclasses.replace(flight, body_velocity=np.zeros((flight.time.size, 3)))
+    if (capacity := capacity_of(flight.time.size)) != flight.time.size:
+        flight = pad_flight(flight, capacity)
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, flight.dt
     root = covariance_root(vehicle.covariance)
     drawn = vehicle.parameters + generator.standard_normal((DRAWS, len(root))) @ root.T

@@ -108,17 +108,17 @@ def correlations(found: Identification) -> Float[np.ndarray, "parameters paramet
     return matrix
 
 
-def correlation_matrix(found: Identification, look: Style, *, least: float = 0.05) -> Figure:
+def correlation_matrix(found: Identification, look: Style) -> Figure:
     """The correlations of the parameters: a square for each pair, hollow if negative.
 
-    A name stands at the right end of its row, where its column begins. Correlations below `least` are left out.
+    A name stands at the right end of its row, where its column begins. Correlations below 0.05 are left out.
     """
     names, matrix = [name.replace("_", " ") for name in found.parameters], correlations(found)
     count, cell = len(names), 16
     marks: list[Mark] = [Words(k + 0.4, k, name) for k, name in enumerate(names)]
     for k in range(count):
         marks += [Line((-0.6, k), (k, k), GRID, 1.0), Line((k, k), (k, count - 0.4), GRID, 1.0)]
-    for row, column in zip(*(each.tolist() for each in np.nonzero(np.tril(np.abs(matrix) >= least))), strict=True):
+    for row, column in zip(*(each.tolist() for each in np.nonzero(np.tril(np.abs(matrix) >= 0.05))), strict=True):
         value = float(matrix[row, column])
         color, name = (look.color, "positive") if value > 0 else (INK, "negative")
         size, tip = 0.75 * cell * abs(value) ** 0.5, f"{names[row]}, {names[column]}: {value:.2f}"
@@ -129,12 +129,12 @@ def correlation_matrix(found: Identification, look: Style, *, least: float = 0.0
     return Figure("matrix", [Panel("", marks, x, y, *size, bare=True)])
 
 
-def strongest(found: Identification, *, least: float = 0.9, most: int = 5) -> list[tuple[str, str, float]]:
-    """The pairs of parameters that are correlated most."""
+def strongest(found: Identification) -> list[tuple[str, str, float]]:
+    """The five pairs of parameters that are correlated most, and by more than 0.9."""
     matrix, names = correlations(found), list(found.parameters)
     rows, columns = np.tril_indices(len(names), -1)
     pairs = [(names[j], names[i], float(matrix[i, j])) for i, j in zip(rows, columns, strict=True)]
-    return sorted((pair for pair in pairs if abs(pair[2]) > least), key=lambda pair: -abs(pair[2]))[:most]
+    return sorted((pair for pair in pairs if abs(pair[2]) > 0.9), key=lambda pair: -abs(pair[2]))[:5]
 
 
 def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:

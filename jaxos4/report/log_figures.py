@@ -56,15 +56,15 @@ def logged(recording: Recording, found: Inspection) -> tuple[str, int]:
 
 
 def bridged(
-    time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"], *, steps: float = 3.0
+    time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]
 ) -> Float[np.ndarray, " samples"]:
-    """A signal with straight lines between its samples, unless they are apart by more than this many usual steps."""
+    """A signal with straight lines between its samples, unless they are apart by more than three usual steps."""
     at = np.flatnonzero(np.isfinite(values))
     if at.size < 2 or at.size == values.size:
         return values
     apart = np.diff(time[at])
     place = np.clip(np.searchsorted(time[at], time, side="right") - 1, 0, at.size - 2)
-    near = (apart[place] <= steps * np.median(apart)) & (time >= time[at[0]]) & (time <= time[at[-1]])
+    near = (apart[place] <= 3 * np.median(apart)) & (time >= time[at[0]]) & (time <= time[at[-1]])
     return np.where(near | np.isfinite(values), np.interp(time, time[at], values[at]), np.nan)
 
 

@@ -24,7 +24,7 @@ from .page import Section, picture, signals, table, text, write_page
 from .text import Listing, plain, say
 from .timeline import spans
 
-_LONGEST = 60  # parts in the table at most, the longest
+_LONGEST, _PRINTED = 60, 14  # parts in the table of the page, and on the terminal, at most: the longest
 _USUAL = 0.9  # of the time the rotors turn at speeds in the band of the spectra
 _COMMANDS = "of full scale (commands)"
 _TOGETHER = ["p q r", "phi theta psi", "x y z", "vx vy vz"]
@@ -37,8 +37,8 @@ _TOGETHER += [
 _UNITS = {names: UNITS[names.split()[0]] for names in _TOGETHER} | {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 
 
-def print_inspection(console: Console, found: Inspection, label: str, *, most: int = 14) -> None:
-    """Prints the channels of a log, the findings of its checks, and the `most` longest parts. `label`: its format."""
+def print_inspection(console: Console, found: Inspection, label: str) -> None:
+    """Prints the channels of a log, the findings of its checks, and its longest parts. `label`: its format."""
     say(
         console,
         f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
@@ -63,7 +63,7 @@ def print_inspection(console: Console, found: Inspection, label: str, *, most: i
         say(console, f"  {' '.join(measured)}: {rate:.4g} Hz{gaps}, {size}")
     for note in found.notes:
         say(console, f"note: {note}")
-    rows = _part_rows(found, most)
+    rows = _part_rows(found, _PRINTED)
     headings, numbers = ("from [s]", "to [s]", "use", *MOTIONS), ("from [s]", "to [s]")
     Listing(headings, rows, numbers).print_on(console)
     if len(found.stretches) > len(rows):

@@ -72,26 +72,21 @@ def draw(panel: Panel, axes: Axes) -> None:
     axes.set_title(f"{panel.title}\n{panel.subtitle}" if panel.subtitle else panel.title)
 
 
-def as_matplotlib(figure: Figure) -> Drawn:
-    """The figure with its legend as Matplotlib draws it. For use in `drawing`."""
+def as_pdf(figure: Figure) -> bytes:
+    """The figure with its legend as PDF."""
     columns = min(figure.columns, len(figure.panels))
     rows, (width, height) = -(-len(figure.panels) // columns), (figure.panels[0].width, figure.panels[0].height)
-    drawn = Drawn(figsize=(columns * width / 108, rows * height / 108 + 0.4), layout="constrained")
-    for place, panel in enumerate(figure.panels):
-        draw(panel, drawn.add_subplot(rows, columns, place + 1))
-    if named := figure.legend():
-        handles = [
-            Patch(color=mark.color, alpha=mark.opacity) if isinstance(mark, Band) else Line2D([], [], **_look(mark))
-            for mark in named.values()
-        ]
-        drawn.legend(handles, list(named), loc="outside lower center", ncols=2 * columns, handlelength=3)
-    return drawn
-
-
-def as_pdf(figure: Figure) -> bytes:
-    """The figure as PDF."""
     with drawing():
-        return rendered(as_matplotlib(figure), "pdf")
+        drawn = Drawn(figsize=(columns * width / 108, rows * height / 108 + 0.4), layout="constrained")
+        for place, panel in enumerate(figure.panels):
+            draw(panel, drawn.add_subplot(rows, columns, place + 1))
+        if named := figure.legend():
+            handles = [
+                Patch(color=mark.color, alpha=mark.opacity) if isinstance(mark, Band) else Line2D([], [], **_look(mark))
+                for mark in named.values()
+            ]
+            drawn.legend(handles, list(named), loc="outside lower center", ncols=2 * columns, handlelength=3)
+        return rendered(drawn, "pdf")
 
 
 def rendered(drawn: Drawn, kind: str) -> bytes:

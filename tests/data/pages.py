@@ -8,7 +8,7 @@ import sys
 import numpy as np
 from rich.console import Console
 
-from jaxos4.report import print_identification
+from jaxos4.report import print_identification, write_flight_page
 from jaxos4.report.panels import Band
 
 
@@ -36,6 +36,19 @@ def stands_alone(text):
     ids = re.findall(r'\sid="([^"]*)"', outside)
     assert len(ids) == len(set(ids)) > 4
     assert text.count("<script") == text.count("</script") == 1
+
+
+def read_page(path):
+    """The text of a page, which stands alone."""
+    text = path.read_text(encoding="utf-8")
+    stands_alone(text)
+    return text
+
+
+def page_of(found, path, **how):
+    """The words on the page of an identification, which stands alone."""
+    write_flight_page(path, found, **how)
+    return words(read_page(path))
 
 
 def without_matplotlib(patch):
