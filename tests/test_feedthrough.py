@@ -342,23 +342,3 @@ def test_no_torque_before_an_instant_answers_what_is_measured_at_it():
     assert longer.likelihood.answers_within
     assert slower.likelihood.answers_within
     assert float(slower.problem.flight.averaging_time) == 0.0
-
-
-@pytest.mark.slow
-def test_a_controller_that_answers_a_noisy_gyro_within_the_sample_causes_no_bias():
-    """Commands every 4 ms, samples of 8 ms, a gyro with a noise of 0.05 rad/s.
-
-    Without input innovations the delay was 5.5 standard deviations too large, and the lag 3.7 too small.
-    """
-    first, second = jax.random.split(jax.random.key(0))
-    loop = jaxos4.ClosedLoop(CINERAT, rotor_lag=0.025, rotor_delay=0.0, gust=2.0, gyro_noise=0.05, logged="commands")
-    references = jaxos4.random_references(duration=20.0, dt=0.004, key=first)
-    flight = jaxos4.fly_closed_loop(loop, references, dt=0.004, key=second, substeps=4)
-    settings = jaxos4.VehicleSettings(sample_time=0.008, holdout=0.0)
-    data = prepare_vehicle(as_recordings(flight), CINERAT, settings)[0]
-    answer = jaxos4.FilterError(tolerance=1e-3)(data.likelihood)
-    found = dict(zip(data.likelihood.unknowns.names, zip(answer.parameters, answer.std, strict=True), strict=True))
-    truth = dict(zip(("alpha3", "alpha6"), 1 / np.asarray(CINERAT.inertia)[:2], strict=True))
-    for name, value in (truth | {"rotor_lag": 0.025, "rotor_delay": 0.0}).items():
-        estimate, std = found[name]
-        assert abs(estimate - value) < 2 * std, name
