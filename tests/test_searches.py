@@ -114,6 +114,9 @@ def test_a_gradient_that_is_nan_is_no_minimum():
     assert names(found) != "successful"
 
 
+factor_of, limited_step = eqx.filter_jit(joint_factor), eqx.filter_jit(limited)
+
+
 @pytest.mark.parametrize("windows", [1, 3])
 def test_a_limited_step_is_the_lowest_of_all_that_share_its_limits(windows):
     """Behind the shared unknowns, each window has two of its own, without limits."""
@@ -123,11 +126,11 @@ def test_a_limited_step_is_the_lowest_of_all_that_share_its_limits(windows):
     columns = [np.vstack([shared, np.eye(2, count + 2 * windows, count + 2 * w)]) for w in range(windows)]
     for _ in range(20):
         roots, gradient = random.normal(size=(windows, width, width)), random.normal(size=(windows, width))
-        basis = joint_factor(jnp.asarray(roots @ roots.swapaxes(1, 2)), count).basis
+        basis = factor_of(jnp.asarray(roots @ roots.swapaxes(1, 2)), count).basis
         free = -(basis * slopes_along(basis, jnp.asarray(gradient), count)[:, None, :]).sum(axis=-1)
         low, high = -random.uniform(0, 0.5, width), random.uniform(0, 0.5, width)
         room = (jnp.tile(jnp.asarray(limit), (windows, 1)) for limit in (low, high))
-        found = np.asarray(limited(free, basis, tuple(room), count))
+        found = np.asarray(limited_step(free, basis, tuple(room), count))
         whole = sum(c.T @ r @ r.T @ c for c, r in zip(columns, roots, strict=True))
         slope = sum(c.T @ g for c, g in zip(columns, gradient, strict=True))
         joint = np.concatenate([found[0, :count], found[:, count:].ravel()])
@@ -145,10 +148,10 @@ def test_a_limited_step_is_the_lowest_of_all_that_share_its_limits(windows):
 def test_two_unknowns_at_their_limits_do_not_stop_the_others():
     """The minimum without limits lies far outside, so that a step shortened as a whole would hardly move the third."""
     information = np.array([[2.0, 0.9, 0.3], [0.9, 1.0, 0.1], [0.3, 0.1, 1.0]])
-    basis = joint_factor(jnp.asarray(information)[None], 3).basis
+    basis = factor_of(jnp.asarray(information)[None], 3).basis
     minimum = np.array([80.0, -70.0, 0.5])
     room = jnp.array([[-0.1, -0.2, -90.0]]), jnp.array([[0.1, 0.0, 90.0]])
-    (found,) = np.asarray(limited(jnp.asarray(minimum)[None], basis, room, 3))
+    (found,) = np.asarray(limited_step(jnp.asarray(minimum)[None], basis, room, 3))
     assert found[0] == 0.1
     assert found[1] in (-0.2, 0.0)
     slope = information @ (found - minimum)
@@ -172,15 +175,18 @@ def test_where_a_start_is_nan_the_search_begins_at_the_center(name):
 
 
 @every_solver
-def test_a_start_beyond_the_reach_is_moved_to_its_limit(name):
+def test_a_start_beyond_the_reach_is_moved_to_its_limit_and_rollouts_are_the_shots_and_their_derivatives(name):
+    """IBSS counts derivatives only; a colony simulates without them, but at the answer."""
     shots = []
-    problem, solver = squares(quadratic, half_width=0.1, hear=lambda x: shots.append(x)), solver_of(name)
+    problem, solver = squares(valley, half_width=0.5, hear=lambda x: shots.append(x)), solver_of(name)
     lower, upper = (np.asarray(limit) for limit in problem.unknowns.limits(solver.reach))
     found = solver(problem, start=jnp.array([9.0, 0.0]))
     jax.effects_barrier()
     assert [upper[0], 0.0] in [shot.tolist() for shot in shots]
     assert ((np.array(shots) >= lower - 1e-12) & (np.array(shots) <= upper + 1e-12)).all()
     assert names(found) != "nonfinite_trajectory"
+    count = len(shots)
+    assert int(found.rollouts) == {"IBSS": 2 * count, "AntColony": count + 2}.get(name, 3 * count)
 
 
 @every_solver
@@ -242,17 +248,6 @@ def test_a_slope_of_the_wrong_sign_ends_no_search_as_a_success():
 
 
 # How much was simulated.
-
-
-@every_solver
-def test_rollouts_are_the_shots_and_their_derivatives(name):
-    """IBSS counts derivatives only; a colony simulates without them, but at the answer."""
-    shots = []
-    found = solver_of(name)(squares(valley, hear=lambda x: shots.append(x)))
-    jax.effects_barrier()
-    count = len(shots)
-    expected = {"IBSS": 2 * count, "AntColony": count + 2}.get(name, 3 * count)
-    assert int(found.rollouts) == expected
 
 
 @pytest.mark.parametrize("halvings", [2, 3])
