@@ -32,7 +32,7 @@ NAMES = [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
 LIKELIHOODS = ("ibss", "output-error", "filter-error", "kalman", "ant-colony")
 
 
-@pytest.fixture(params=NAMES)
+@pytest.fixture(params=[pytest.param(each, marks=pytest.mark.slow) if each == "ant-colony" else each for each in NAMES])
 def name(request):
     """Every estimator in turn."""
     if request.param in ("filter-error", "ant-colony"):  # they compute for long
