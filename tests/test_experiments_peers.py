@@ -106,7 +106,9 @@ def test_all_tools_get_the_same_flights_and_who_is_missing_is_skipped(capsys, mo
     assert [(row["flight"], row["tool"]) for row in report["rows"]] == [(0, "jaxos4"), (0, "regression")]
     assert all(abs(row["Ix"]["error"]) < 0.1 for row in report["rows"])
     assert {row["flight"] for row in report["chosen"]} == {1000}
-    assert all(1e-5 < row["Ix"]["estimate"] < 2.6e-5 for row in report["real"])
+    ours, regression = (row["Ix"]["estimate"] for row in report["real"])
+    assert 1.1e-5 < ours < 1.7e-5
+    assert ours < regression < 2.5e-5  # which the controller biases
     printed = capsys.readouterr().out
     assert "CasADi: skipped: No module named" in printed
     assert "settings of the peers" in printed

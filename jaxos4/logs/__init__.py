@@ -181,7 +181,7 @@ def as_recordings(flights: Source | Sequence[Source], airframe: Airframe | None 
     """One or several flights as recordings, see `as_recording`. The names of several are numbered from 1."""
     single = isinstance(flights, Recording | str) or not isinstance(flights, Sequence)
     every = [flights] if single else cast(Sequence[Any], flights)
-    names = [f"flight {i}" for i in range(1, len(every) + 1)] if len(every) > 1 else ["flight"]
+    names = [f"flight {i + 1}" if len(every) > 1 else "flight" for i in range(len(every))]
     return tuple(as_recording(each, name, airframe) for each, name in zip(every, names, strict=True))
 
 

@@ -4,6 +4,7 @@ import functools
 import importlib
 import json
 import pathlib
+from xml.etree import ElementTree
 
 import pytest
 
@@ -37,3 +38,5 @@ def plot(folder: pathlib.Path, name, script="plot", results="out.json", *, suffi
         figures = list((folder / f"{name} {script}").glob(f"*{suffix}"))
         assert figures
         assert all(path.name.startswith(name) and path.stat().st_size > 2000 for path in figures)
+        if suffix == ".svg":  # axes, labels and at least a line
+            assert all(len([*ElementTree.parse(path).iter()]) > 20 for path in figures)
