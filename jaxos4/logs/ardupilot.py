@@ -11,8 +11,8 @@ import numpy as np
 from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES
 from ..rotations import HALF_TURN
 from .messages import Fields, Messages, Rotors, motor_order, records
-from .sampling import Series
-from .table import LogFormat, LogPath, Table, counted, read_bytes, refuse
+from .sampling import Series, logged_rate
+from .table import LogFormat, LogPath, Table, counted, fast_enough, read_bytes, refuse
 from .values import DEGREE, RPM
 
 _HEAD, _FMT, _FMT_LENGTH = b"\xa3\x95", 0x80, 89
@@ -54,7 +54,7 @@ def read_ardupilot(path: LogPath) -> tuple[Table, tuple[str, ...]]:
     dshot = "log rotor speeds at 100 Hz by ESC telemetry of bidirectional DShot (SERVO_BLH_BDMASK = 15)"
     return log.table(
         {columns: log.fastest(columns, sources) for columns, sources in _SOURCES.items()},
-        log.fast_rotors(_speeds(log, outputs), _commands(log, outputs)),
+        _rotors(log, outputs),
         remedies=(setting, "add 1024 (RC output) to LOG_BITMASK, and use ESC telemetry by bidirectional DShot"),
         is_ordered=True,
         faster=f"{dshot}, because RCOU is always at 10 Hz, {setting}, and fly again",
@@ -69,18 +69,18 @@ def _recognises(begin: bytes) -> bool:
 ARDUPILOT = LogFormat("ArduPilot", "ArduPilot DataFlash log", _recognises, read_ardupilot)
 
 
-def _speeds(log: Messages, outputs: list[int]) -> Rotors | None:
+def _rotors(log: Messages, outputs: list[int]) -> Rotors | None:
+    """Measured speeds; or commands, if speeds were not logged, or too rarely."""
     every = {f"ESC.RPM of output {output + 1}": log.series("ESC", ("RPM",), output) for output in outputs}
     escs = {name: each for name, each in every.items() if each is not None and (each.values > 0).any()}
-    if len(escs) < len(outputs):
-        return None
-    t = next(iter(escs.values())).t
-    values = [log.speeds_at(t, each, name) * RPM for name, each in escs.items()]
-    return Rotors(Series(t, np.abs(np.column_stack(values))), [*escs], is_measured=True)
-
-
-def _commands(log: Messages, outputs: list[int]) -> Rotors | None:
     commands = log.series("RCOU", [f"C{output + 1}" for output in outputs])
+    if len(escs) == len(outputs):
+        t = next(iter(escs.values())).t
+        rate = logged_rate(t)
+        if commands is None or fast_enough(rate) or rate >= logged_rate(commands.t):
+            values = [log.speeds_at(t, each, name) * RPM for name, each in escs.items()]
+            return Rotors(Series(t, np.abs(np.column_stack(values))), [*escs], is_measured=True)
+        log.notes.append(f"measured speeds (ESC) were logged at {rate:.2g} Hz only: commands are used")
     if commands is None:
         return None
     get = log.parameters.get

@@ -20,7 +20,7 @@ from .sampling import (
     root_mean_square,
     unwrap,
 )
-from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, fast_enough, order_note, refuse
+from .table import MAX_ROWS, LogFacts, LogPath, Sampling, Table, order_note, refuse
 from .values import dropped, without_impossible
 
 _FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
@@ -135,18 +135,6 @@ class Messages:
             self.notes.append(f"impossible values count as not measured, in {source}: {count} (0 while it turns)")
         known = np.isfinite(values) & ~zeros
         return np.interp(t, series.t[known], values[known])
-
-    def fast_rotors(self, *found: Rotors | None) -> Rotors | None:
-        """The first that was logged fast enough, or the fastest; `None` without any. `found`: speeds first."""
-        every = [each for each in found if each is not None]
-        rates = [logged_rate(each.series.t) for each in every]
-        if not every:
-            return None
-        chosen = every[next((i for i, rate in enumerate(rates) if fast_enough(rate)), rates.index(max(rates)))]
-        if every[0].is_measured and not chosen.is_measured:
-            source = every[0].names[0].partition(".")[0]
-            self.notes.append(f"measured speeds ({source}) were logged at {rates[0]:.2g} Hz only: commands are used")
-        return chosen
 
     def name(self, columns: Sequence[str], kind: str, fields: Sequence[str]) -> None:
         """Note which fields hold these columns."""

@@ -17,8 +17,8 @@ from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES
 from ..rotations import HALF_TURN, euler_angles
 from .columns import column_map
 from .messages import Fields, Messages, MessageSource, Names, Rotors, motor_order
-from .sampling import Series, runs
-from .table import LogFormat, LogPath, Table, items, read_bytes, refuse
+from .sampling import Series, logged_rate, runs
+from .table import LogFormat, LogPath, Table, fast_enough, items, read_bytes, refuse
 from .values import RPM
 
 _MAGIC = b"ULog"
@@ -149,10 +149,15 @@ def _landed(log: Messages) -> list[tuple[float, float]]:
 
 
 def _rotors(log: Messages) -> Rotors | None:
-    """Measured speeds, the motors' commands, or the outputs."""
-    speeds = _speeds(log)
-    chosen = log.fast_rotors(speeds, _motors(log), _outputs(log))
-    if speeds is None and chosen is not None and log.series("esc_status", _ESC_SPEEDS) is not None:
+    """Measured speeds, the motors' commands or the outputs: the first that is fast enough, or else the fastest."""
+    every = [found for find in (_speeds, _motors, _outputs) if (found := find(log)) is not None]
+    rates = [logged_rate(each.series.t) for each in every]
+    if not every:
+        return None
+    chosen = every[next((i for i, rate in enumerate(rates) if fast_enough(rate)), rates.index(max(rates)))]
+    if every[0].is_measured and not chosen.is_measured:
+        log.notes.append(f"measured speeds (esc_status) were logged at {rates[0]:.2g} Hz only: commands are used")
+    elif not chosen.is_measured and log.series("esc_status", _ESC_SPEEDS) is not None:
         log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
     return chosen
 
