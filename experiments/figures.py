@@ -33,7 +33,7 @@ from jaxos4.study import metrics, read_results
 WORST = 30.0  # RMS error / least bound; the darkest colour
 LARGEST_OF_EIGHT = 2.73  # 95 % quantile of the largest of eight Gaussian magnitudes, in standard deviations
 REJECTED = 0.01  # a p-value below which residuals are rejected
-TESTS = {"white_p": "white", "input_p": "no inputs", "level_p": "size"}
+TESTS = {"white_p": "white", "input_p": "without input", "level_p": "noise size"}
 CHANNELS = {"rates": "body rates", "all": "all channels"}
 SEARCHES = dict(
     zip(("IBSS", "output error", "hybrid"), styles(["ibss", "output-error", "hybrid"]).values(), strict=True)
@@ -58,9 +58,12 @@ def comparison(data: xr.Dataset) -> Figure:
     names, color, panels = data["estimator"].values, THREE[0].color, []
 
     def shade(times: float) -> float:
-        return 0.65 * float(np.clip(np.log(max(times, 1.0)) / np.log(WORST), 0, 1))
+        return 0.06 + 0.6 * float(np.clip(np.log(max(times, 1.0)) / np.log(WORST), 0, 1))
 
-    legend = [Band((), (), (), color, shade(each), f"{each:g} times the least bound") for each in (1, 2, 5, 10, WORST)]
+    legend = [
+        Band((), (), (), color, shade(each), f"{each:g} times the least bound{more}")
+        for each, more in ((1, ""), (2, ""), (5, ""), (10, ""), (WORST, " or more"))
+    ]
     y = named_rows(names)
     for place, scale in enumerate(data["scale"].values):
         marks: list[Mark] = [*legend]

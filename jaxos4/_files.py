@@ -20,10 +20,10 @@ from .errors import InputError, in_words, printable, shortened
 
 @contextlib.contextmanager
 def reading(place: object, fault: str, remedy: str) -> Iterator[None]:
-    """Raises any error of the block as an `InputError`: a library raises anything if a file is damaged."""
+    """Raises an error of the block as an `InputError`, whatever a library raises for a damaged file."""
     try:
         yield
-    except InputError:
+    except (InputError, ImportError, Warning):
         raise
     except Exception as error:  # noqa: BLE001
         raise InputError(f"{place}: {fault} ({in_words(error)}); {remedy}.") from None

@@ -329,7 +329,7 @@ def test_commands_in_short_samples_have_innovations_of_earlier_samples(logged):
         assert bool(data.likelihood.lagged) == is_short == (second[1:] == first[:-1]).all()
     # All sample times share a program.
     trees = (jax.tree.flatten(data.likelihood) for data in every)
-    assert len({(structure, *map(np.shape, leaves)) for leaves, structure in trees}) == 1
+    assert len({(structure, *((leaf.shape, leaf.dtype) for leaf in leaves)) for leaves, structure in trees}) == 1
 
 
 def test_no_torque_before_an_instant_answers_what_is_measured_at_it():

@@ -21,7 +21,13 @@ from jaxos4.identification.fit import chosen_place, moved, sample_time_of, searc
 from jaxos4.identification.intervals import corrected
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
-from jaxos4.identification.search import USUAL_DELAY_OF_COMMANDS, Optimum, _lowest_in_delay, _without_negative
+from jaxos4.identification.search import (
+    USUAL_DELAY_OF_COMMANDS,
+    Optimum,
+    _lowest_in_delay,
+    _without_negative,
+    search_all,
+)
 from jaxos4.logs import as_recordings
 from jaxos4.recording import averaged
 from jaxos4.recording.prepared import finest, prepare
@@ -307,6 +313,15 @@ def test_what_came_out_negative_is_kept_if_a_search_without_it_fails(result):
     else:
         assert after.negative == {}
         assert after.estimate is before.estimate
+
+
+@pytest.mark.slow
+def test_a_search_continues_from_a_known_optimum_of_all_parameters():
+    data = data_of(flown(), DT)
+    (continued,) = search_sample_times([data], SOLVER, longest=search_all(SOLVER, data))
+    (whole,) = search_sample_times([data], SOLVER)
+    np.testing.assert_array_equal(continued.values, whole.values)
+    assert (continued.rollouts, continued.nominal) == (whole.rollouts, whole.nominal)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from ..results import NINETY_FIVE
 from ..shooting import ROUNDING
 from .evaluation import Evaluation
 
-LAGS = 25  # samples; correlations are those of residuals up to so many apart
+LARGEST_LAG = 25  # samples, of the correlations
 
 
 class Correlations(Arrays, frozen=True, eq=False):
@@ -64,11 +64,11 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
     """Diagnostics of the residuals of one flight, evaluated at the answer of a fit.
 
     `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom. Correlations are those
-    of residuals up to `LAGS` samples apart, in a short flight up to half of it.
+    of residuals up to `LARGEST_LAG` samples apart, in a short flight up to half of it.
     """
     from scipy.special import gammainc, gammaincc, ndtr  # slow to import, and few need it
 
-    lags = min(LAGS, evaluation.measured.shape[0] // 2)
+    lags = min(LARGEST_LAG, evaluation.measured.shape[0] // 2)
     problem, feasible = evaluation.problem, evaluation.feasible
     # A diverged trajectory counts as nothing measured.
     measured = ~np.isnan(evaluation.measured) & feasible
@@ -117,13 +117,13 @@ def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diag
 def residual_correlations(
     errors: Float[np.ndarray, "samples channels"], torques: Float[np.ndarray, "samples 3"]
 ) -> Correlations:
-    """The correlations of residuals up to `LAGS` samples apart. NaN: not measured."""
+    """The correlations of residuals up to `LARGEST_LAG` samples apart. NaN: not measured."""
     measured = np.isfinite(errors)
     errors = np.where(measured, errors, 0.0)
-    own = _correlations(errors, errors, measured, measured, LAGS)[0][:, LAGS + 1 :]
-    crossed, deviations = _with_torques(errors, measured, own, _moves(torques), LAGS)
+    own = _correlations(errors, errors, measured, measured, LARGEST_LAG)[0][:, LARGEST_LAG + 1 :]
+    crossed, deviations = _with_torques(errors, measured, own, _moves(torques), LARGEST_LAG)
     bound = NINETY_FIVE / np.sqrt(np.maximum(measured.sum(axis=0), 1))
-    return Correlations(own, crossed, bound, NINETY_FIVE * deviations[:, :, LAGS])
+    return Correlations(own, crossed, bound, NINETY_FIVE * deviations[:, :, LARGEST_LAG])
 
 
 def _moves(torques: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:

@@ -214,7 +214,7 @@ def filtered(
     stretch: Int[Numeric, " samples"],
     dt: Scalar,
 ) -> tuple[Filtered, Float[Array, "samples channels"]]:
-    """Filter all measurements up to each sample, and return the innovations too. Each stretch starts new filters.
+    """The state of the filters after each sample, and the innovations. Each stretch starts new filters.
 
     The likelihood's filters (`jaxos4.shooting.filters`), with the model's accelerations as data instead of derivatives.
 

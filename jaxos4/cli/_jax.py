@@ -1,4 +1,4 @@
-"""How a command prepares JAX: the precision, how loops compile, and where compiled programs are kept."""
+"""How a command prepares JAX: precision, how loops compile, threads of OpenBLAS, where compiled programs are kept."""
 
 import os
 import stat

@@ -52,23 +52,30 @@ def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
 
 
 def _response(
-    fleet: Fleet, envelope: Envelope, largest: Float[np.ndarray, "4"], period: int, number: int, samples: int, key: Key
+    fleet: Fleet,
+    envelope: Envelope,
+    largest: Float[np.ndarray, "4"],
+    *,
+    period: int,
+    tones: int,
+    samples: int,
+    key: Key,
 ) -> dict[str, Any]:
-    """The fields `base`, `added` and `signals` of `ReferenceTask`: each of a `number` of tones flies in still air.
+    """The fields `base`, `added` and `signals` of `ReferenceTask`: each of the `tones` flies in still air.
 
     For small tones the vehicle is linear. So the information of a sum of tones is the sum of their informations.
 
     **Raises:** `InputError` if gusts alone use a limit.
     """
-    turns = _turns(number, np.arange(samples) / period)
+    turns = _turns(tones, np.arange(samples) / period)
     references = np.zeros((LANES, samples, 4))
-    references[:number, :, :3] = _SMALL[:3] * np.real(turns).T[:, :, None]
-    references[number : 2 * number, :, 3] = _SMALL[3] * np.real(turns).T
-    in_gusts = np.arange(LANES) > 2 * number  # the one before is in still air, and has no reference
+    references[:tones, :, :3] = _SMALL[:3] * np.real(turns).T[:, :, None]
+    references[tones : 2 * tones, :, 3] = _SMALL[3] * np.real(turns).T
+    in_gusts = np.arange(LANES) > 2 * tones  # the one before is in still air, and has no reference
     flights = fly_batch(batch_of(fleet.loop, in_gusts), jnp.asarray(references), as_float(fleet.dt), key)
     states, (whole, channels) = np.asarray(flights.states), map(np.asarray, fleet.informations(flights))
-    excess = channels - channels[2 * number]
-    each = np.stack([*np.moveaxis(excess[:number, :3], 1, 0), excess[number : 2 * number].sum(axis=1)])
+    excess = channels - channels[2 * tones]
+    each = np.stack([*np.moveaxis(excess[:tones, :3], 1, 0), excess[tones : 2 * tones].sum(axis=1)])
     # In still air nothing is learned about the noise.
     beyond = whole.shape[-1] - channels.shape[-1]
     each = fleet.about_inertias(np.pad(each, ((0, 0), (0, 0), (0, beyond), (0, beyond))))
@@ -83,8 +90,8 @@ def _response(
         left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
         if (left <= 0).any():
             raise _too_gusty(name)
-        responses = np.einsum("kta,tk->ak", states[:number, -period:, columns], last) / _SMALL[:3, None]
-        moving = _parts(responses[:, None] * _turns(number, _POINTS))
+        responses = np.einsum("kta,tk->ak", states[:tones, -period:, columns], last) / _SMALL[:3, None]
+        moving = _parts(responses[:, None] * _turns(tones, _POINTS))
         signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
     relative = np.square(largest / _SMALL)[:, None, None, None]
     return {"base": jnp.asarray(base / unit), "added": jnp.asarray(relative * each / unit), "signals": signals}
@@ -232,7 +239,15 @@ def design_references(
         tones=tones,
         samples=samples,
         criterion=criterion,
-        **_response(fleet, envelope, largest, period, tones, samples, jax.random.fold_in(key, 3)),
+        **_response(
+            fleet,
+            envelope,
+            largest,
+            period=period,
+            tones=tones,
+            samples=samples,
+            key=jax.random.fold_in(key, 3),
+        ),
     )
     return task.design(references, compare=compare, key=key, progress=progress)
 

@@ -28,16 +28,16 @@ from . import task
 from .envelope import Envelope, Uses, hover_squares
 from .task import Coefficients, Designed, Flown, Series
 
-_VEHICLES, _CORNERS = 200, 100  # that keep the limits; the last of them are corners of the bracket
+_VEHICLES, _CORNERS = 200, 100  # that must keep the limits; the last of them are corners of the bracket
 _AVERAGED = 4  # the criterion is the mean over this many of them
-# Each stage of the search watches this many. It replaces the first of them by those that now use the most of a limit.
+# Vehicles that each stage of the search watches. The first of them become those that use the most of a limit by then.
 _WATCHED = 40
 _TARGET = 0.95  # the largest share of a limit: other vehicles from the bracket may need a little more
 _FINER = 10  # steps in a sample of the flights that must keep the limits
 _SLOWEST_TONE = 0.3  # Hz; a slower tone has the amplitude of this one, because angles would allow almost none
 _LEAST = 1e-6  # rad^2/s^2; squared rotor speeds stay above this, which is outside of the envelope
 _AMPLIFIED = 100.0  # a standard input is multiplied by at most about this factor
-_PRECISION = 1e-3  # of this factor, as a share of it
+_PRECISION = 1e-3  # relative, of that factor
 _FAR = 10.0  # an input that uses a larger share of a limit counts as if it used this share
 _REDUCED, _SMALLEST = 0.9, 1e-3  # the factor of one reduction of an amplitude, and of all reductions together
 _CORRECTIONS = 5  # times that the margin is widened, at most, until the limits are kept between samples too

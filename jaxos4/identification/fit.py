@@ -174,18 +174,18 @@ def fit_sample_times(
     `choose`: whether to choose the sample time; otherwise only the kind of the first is fitted.
     """
     kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
-    kinds = [(some, None) for some in kinds if some and (choose or some[0] is several[0])]
-    if len(kinds) > 1:
-        (some, _), other = kinds
-        progress(_fitting(some[-1]))
-        longest = search_all(solver, some[-1])
-        row = sample_time_of(corrected(longest))
+    order = [(kind, None) for kind in kinds if kind and (choose or kind[0] is several[0])]
+    if len(order) > 1:
+        (kind, _), other = order
+        progress(_fitting(kind[-1]))
+        found = search_all(solver, kind[-1])
+        row = sample_time_of(corrected(found))
         is_far = row.constants and not is_white(row, FAR)
-        kinds = [other, (some, longest)] if is_far else [(some, longest), other]
+        order = [other, (kind, found)] if is_far else [(kind, found), other]
     fitted = []
-    for some, longest in kinds:
+    for kind, longest in order:
         answers = []
-        for optimum in search_sample_times(some, solver, longest=longest, progress=progress):
+        for optimum in search_sample_times(kind, solver, longest=longest, progress=progress):
             progress("computing intervals")
             answer = corrected(optimum)
             answers.insert(0, (answer, sample_time_of(answer)))
@@ -221,8 +221,7 @@ def search_sample_times(
     """
     optimum, first = None, longest
     for data in reversed(several):
-        if first is None:
-            progress(_fitting(data))
+        progress(_fitting(data))
         start, own, compared = None, data.likelihood, None
         if optimum is not None and bool(own.answers_within) == bool(optimum.likelihood.answers_within):
             start, compared = start_of(own, optimum.unrestricted), optimum.compared_delay

@@ -204,7 +204,10 @@ DISORDER = 0.01  # the share of late samples that can be ignored
 
 
 def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:
-    """Whether each sample is later than all before it. `None` if several are not, and more than `DISORDER`."""
+    """Whether each sample is later than all before it.
+
+    `None` if a time is not finite, or if more than one sample, and more than the share `DISORDER`, is late.
+    """
     if not np.isfinite(t).all():
         return None
     later = np.ones(t.size, dtype=bool)

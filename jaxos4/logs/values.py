@@ -84,7 +84,7 @@ def dropped(t: Float[np.ndarray, " samples"], speeds: Float[np.ndarray, " sample
 
 
 MAX_IMPOSSIBLE = 0.01  # the share of the values of a column that can be impossible; more are a wrong unit
-MAX_SPEED_RATIO = 10.0  # of a rotor, to the speed that it exceeds for the share `MAX_IMPOSSIBLE` of its flight
+MAX_SPEED_RATIO = 10.0  # the largest ratio of a rotor's speed to its 99 % quantile
 
 
 def without_impossible(table: Table, limits: Mapping[str, ColumnLimits] = COLUMNS) -> Table:

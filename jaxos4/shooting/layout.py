@@ -156,7 +156,7 @@ def capacity_of(samples: int) -> int:
 def pad_flight(flight: Flight, capacity: int) -> Flight:
     """The flight with more rows, up to `capacity`, in which nothing was measured and the inputs stay as they were.
 
-    `commanded` and `held`, which no model reads, have their defaults: they are static, and would divide programs.
+    `commanded` and `held` are reset: no model reads them, and static fields that differ would compile another program.
     """
     samples = flight.time.shape[0]
 

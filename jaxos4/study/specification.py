@@ -37,7 +37,7 @@ _MOST = 1_000_000  # cells, each of which is a file; and samples of a flight
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Training of a study's networks: the table `network` of the specification. See `NetworkEstimator`.
 
-    `hybrid_channels`: what the hybrid's network looks at, if the scenario measures it. A network alone looks at rates.
+    `hybrid_channels`: what the hybrid's network reads, as far as the scenario measures it. A network alone reads rates.
     """
 
     steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = NetworkEstimator.steps
