@@ -26,7 +26,6 @@ sys.dont_write_bytecode = False
 QUICK = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*os.environ.get("XLA_FLAGS", "").split(), *QUICK]))
 jax.config.update("jax_disable_most_optimizations", True)
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of xdist's workers, which import NumPy later
 # Files of the package whose annotations are not checked. The one that decodes a log number by number has no arrays, and
 # the checks would take four times as long as the decoding.
 UNCHECKED = ("__init__", "blackbox_frames")
