@@ -44,6 +44,7 @@ def plot(folder: pathlib.Path, name, script="plot", results="out.json", *, suffi
     for suffix in suffixes:
         figures = list((folder / f"{name} {script}").glob(f"*{suffix}"))
         assert figures
-        assert all(path.name.startswith(name) and path.stat().st_size > 2000 for path in figures)
+        least = 2000 if suffix == ".svg" else 5000  # bytes
+        assert all(path.name.startswith(name) and path.stat().st_size > least for path in figures)
         if suffix == ".svg":
             assert all(len([*drawn(path)]) > 1 for path in figures)
