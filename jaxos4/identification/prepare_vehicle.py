@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import YAW, Airframe
+from ..airframe import AXES, YAW, Airframe
 from ..analysis.prediction import HORIZONS, starts
 from ..bracket import Bracket
 from ..errors import InputError, shortened
@@ -186,7 +186,8 @@ def _input_innovations(
     if flight.within is None:
         return None
     dt, (samples,), stretch = float(flight.dt), flight.time.shape, np.asarray(flight.stretch_numbers)
-    inputs = np.square(np.asarray(flight.within)) @ np.asarray(shooting.model.airframe.mixer).T
+    within, mixer = np.asarray(flight.within), np.asarray(shooting.model.airframe.mixer)
+    inputs, speeds = np.square(within) @ mixer.T, within @ mixer.T
     counts = LAGGED_COUNTS if is_lagged else COUNTS
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
@@ -194,7 +195,10 @@ def _input_innovations(
         if axis is not None:
             torque, count = inputs[:, :, axis], counts[axis]
             some = 1 if is_lagged else count
-            own = input_innovations(torque, measured, stretch, dt, some, means=means, measured_first=measured_first)
+            spin = speeds[:, :, axis] if axis == AXES.index(YAW) else None
+            own = input_innovations(
+                torque, measured, stretch, dt, some, speeds=spin, means=means, measured_first=measured_first
+            )
             found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
     return found
 

@@ -41,6 +41,7 @@ def input_innovations(
     dt: float,
     count: int,
     *,
+    speeds: Float[np.ndarray, "samples parts"] | None = None,
     memory: float = 0.1,
     means: Sequence[float] = (),
     measured_first: bool = False,
@@ -74,9 +75,9 @@ def input_innovations(
     spare = len(rows) - 1 - lags * (parts + 1)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
-    series = np.ones((samples, parts + 2))
-    series[:, :parts] = _standard(inputs)
-    series[:, parts] = _standard(measured)
+    signals = [_standard(each) for each in (inputs, measured)]
+    others = [] if speeds is None else [_standard(speeds)]
+    series = np.column_stack([*signals, *others, np.ones(samples)])
     rest = _unexplained(series, parts, rows, lags)
     if spare > 2 * len(means) > 0:
         with_means = _unexplained(series, parts, rows, lags, _exponential_means(series, parts, stretch, dt, means))
