@@ -86,16 +86,18 @@ def assert_same_directions(found, expected, *, atol):
     np.testing.assert_allclose(found * np.sign(np.sum(found * expected, axis=0)), expected, atol=atol)
 
 
-@pytest.mark.parametrize(("lags", "times"), [(10, ()), (3, MEANS)])
-def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lags, times):
+@pytest.mark.parametrize(("lags", "times", "parts"), [(10, (), 0), (3, MEANS, 0), (10, (), 1), (3, MEANS, 4)])
+def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lags, times, parts):
     """Against a regression with the whole matrix. One stretch is too short for a row, and the controller integrates."""
     torque, rates = in_loop(rng, pilot=1.0, integral=1.0)
+    speeds = rng.normal(100.0, 0.3, size=(SAMPLES, parts))
+    torque[1:] += speeds[:-1].sum(axis=1)[:, None, None]
     stretch = np.repeat([0, 1, 2], [250, lags - 2, SAMPLES - 248 - lags])
-    found = of_axes(torque, rates, stretch, memory=lags * DT, means=times)
+    found = of_axes(torque, rates, stretch, memory=lags * DT, means=times, speeds=speeds if parts else None)
     rows = np.concatenate([np.arange(lags, 250), np.arange(248 + 2 * lags, SAMPLES)])
     assert not np.delete(found, rows, axis=0).any()
     for axis in range(3):
-        samples = np.column_stack([torque[:, :, axis], rates[:, axis]])
+        samples = np.column_stack([torque[:, :, axis], rates[:, axis], speeds])
         both = np.column_stack([torque[:, :, axis].mean(axis=1), rates[:, axis]])
         means = (means_of(both - both.mean(axis=0), stretch, time)[rows - 1] for time in times)
         past = np.column_stack([np.ones(len(rows)), *(samples[rows - lag] for lag in range(1, lags + 1)), *means])
@@ -330,6 +332,17 @@ def test_commands_in_short_samples_have_innovations_of_earlier_samples(logged):
     # All sample times share a program.
     trees = (jax.tree.flatten(data.likelihood) for data in every)
     assert len({(structure, *((leaf.shape, leaf.dtype) for leaf in leaves)) for leaves, structure in trees}) == 1
+
+
+@pytest.mark.parametrize("logged", ["commands", "speeds"])
+def test_measured_speeds_tell_nothing_of_the_later_innovations_of_yaw(logged):
+    """The reaction of the rotors goes with their speeds, the torque with the squares."""
+    flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0, logged=logged), duration=16.0, seed=0)
+    data = prepare_vehicle(as_recordings(flight), CINERAT, jaxos4.VehicleSettings())[0]
+    speeds = np.asarray(data.problem.flight.within)[:-1].mean(axis=1) @ CINERAT.rotor_spins
+    innovations = np.asarray(data.likelihood.input_innovations)[1 : data.time.size, 0, 2]
+    correlation = np.mean(innovations * (speeds - speeds.mean())) / speeds.std()
+    assert (abs(correlation) < 1e-6) == (logged == "speeds")
 
 
 def test_no_torque_before_an_instant_answers_what_is_measured_at_it():

@@ -187,7 +187,7 @@ def _input_innovations(
         return None
     dt, (samples,), stretch = float(flight.dt), flight.time.shape, np.asarray(flight.stretch_numbers)
     within, mixer = np.asarray(flight.within), np.asarray(shooting.model.airframe.mixer)
-    inputs, speeds = np.square(within) @ mixer.T, within @ mixer.T
+    inputs, speeds = np.square(within) @ mixer.T, within @ mixer[AXES.index(YAW)]
     counts = LAGGED_COUNTS if is_lagged else COUNTS
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
@@ -195,7 +195,7 @@ def _input_innovations(
         if axis is not None:
             torque, count = inputs[:, :, axis], counts[axis]
             some = 1 if is_lagged else count
-            spin = speeds[:, :, axis] if axis == AXES.index(YAW) else None
+            spin = speeds if axis == AXES.index(YAW) and not commanded else None
             own = input_innovations(
                 torque, measured, stretch, dt, some, speeds=spin, means=means, measured_first=measured_first
             )

@@ -41,22 +41,23 @@ def input_innovations(
     dt: float,
     count: int,
     *,
-    speeds: Float[np.ndarray, "samples parts"] | None = None,
+    speeds: Float[np.ndarray, "samples speeds"] | None = None,
     memory: float = 0.1,
     means: Sequence[float] = (),
     measured_first: bool = False,
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
-    The prediction is a linear regression on earlier samples of the input and of the measured motion, and, where they
-    explain more than chance does by Schwarz's criterion, on exponential means of both. The result is the `count`
-    combinations of the parts of a sample with most of the residual, with arbitrary signs. It is 0 in the first `memory`
-    of a stretch, and where measurements in the memory are missing for as long as the memory, as held-out ones are:
-    values in their place would distort the regression.
+    The prediction is a linear regression on earlier samples of the input, of the measured motion and of `speeds`, and,
+    where they explain more than chance does by Schwarz's criterion, on exponential means of the first two. The result
+    is the `count` combinations of the parts of a sample with most of the residual, with arbitrary signs. It is 0 in the
+    first `memory` of a stretch, and where measurements in the memory are missing for as long as the memory, as held-out
+    ones are: values in their place would distort the regression.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN: missing. Shorter gaps than the memory are interpolated.
     - `stretch`: the number of the uninterrupted stretch of each sample.
+    - `speeds`: what else is known of the rotors, such as their speeds where the input is their squares.
     - `dt`: sample time [s]. `memory`: how far back single samples count [s]; at least three samples.
     - `means`: time constants of the means [s]. In longer gaps, the mean of all measurements takes the place of a
       missing one.
@@ -72,12 +73,11 @@ def input_innovations(
     measured, missing = _without_gaps(measured, lags)
     earlier = np.append(0, np.cumsum(missing))  # how many were missing before each sample
     rows = rows[(stretch[rows] == stretch[rows - lags]) & (earlier[rows] == earlier[rows - lags])]
-    spare = len(rows) - 1 - lags * (parts + 1)  # degrees of freedom
+    others = () if speeds is None else (_standard(speeds),)
+    series = np.column_stack([_standard(inputs), _standard(measured), *others, np.ones(samples)])
+    spare = len(rows) - 1 - lags * (series.shape[1] - 1)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
-    signals = [_standard(each) for each in (inputs, measured)]
-    others = [] if speeds is None else [_standard(speeds)]
-    series = np.column_stack([*signals, *others, np.ones(samples)])
     rest = _unexplained(series, parts, rows, lags)
     if spare > 2 * len(means) > 0:
         with_means = _unexplained(series, parts, rows, lags, _exponential_means(series, parts, stretch, dt, means))
