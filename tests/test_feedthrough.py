@@ -86,14 +86,17 @@ def assert_same_directions(found, expected, *, atol):
     np.testing.assert_allclose(found * np.sign(np.sum(found * expected, axis=0)), expected, atol=atol)
 
 
-@pytest.mark.parametrize(("lags", "times", "parts"), [(10, (), 0), (3, MEANS, 0), (10, (), 1), (3, MEANS, 4)])
-def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lags, times, parts):
+@pytest.mark.parametrize(
+    ("lags", "times", "parts", "columns"), [(10, (), 0, 0), (3, MEANS, 0, 0), (10, (), 1, 0), (3, MEANS, 4, 2)]
+)
+def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lags, times, parts, columns):
     """Against a regression with the whole matrix. One stretch is too short for a row, and the controller integrates."""
     torque, rates = in_loop(rng, pilot=1.0, integral=1.0)
-    speeds = rng.normal(100.0, 0.3, size=(SAMPLES, parts))
-    torque[1:] += speeds[:-1].sum(axis=1)[:, None, None]
+    speeds, motion = (rng.normal(100.0, 0.3, size=(SAMPLES, width)) for width in (parts, columns))
+    torque[1:] += (speeds.sum(axis=1) + motion.sum(axis=1))[:-1, None, None]
     stretch = np.repeat([0, 1, 2], [250, lags - 2, SAMPLES - 248 - lags])
-    found = of_axes(torque, rates, stretch, memory=lags * DT, means=times, speeds=speeds if parts else None)
+    others = {"speeds": speeds if parts else None, "motion": motion if columns else None}
+    found = of_axes(torque, rates, stretch, memory=lags * DT, means=times, **others)
     rows = np.concatenate([np.arange(lags, 250), np.arange(248 + 2 * lags, SAMPLES)])
     assert not np.delete(found, rows, axis=0).any()
     for axis in range(3):
@@ -101,6 +104,7 @@ def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lag
         both = np.column_stack([torque[:, :, axis].mean(axis=1), rates[:, axis]])
         means = (means_of(both - both.mean(axis=0), stretch, time)[rows - 1] for time in times)
         past = np.column_stack([np.ones(len(rows)), *(samples[rows - lag] for lag in range(1, lags + 1)), *means])
+        past = np.hstack([past, motion[rows - 1]])
         now = torque[rows, :, axis]
         rest = now - past @ np.linalg.lstsq(past, now)[0]
         directions = np.sqrt(len(rows)) * np.linalg.svd(rest, full_matrices=False)[0][:, :FEEDTHROUGHS]
@@ -140,6 +144,17 @@ def test_the_past_holds_a_measurement_before_the_torque(rng):
         found = of_axes(torque, rates, np.zeros(SAMPLES, int), measured_first=measured_first)[10:, 0]
         correlations = np.abs(np.mean(found * rates[10:], axis=0))
         assert (correlations < 1e-9).all() == measured_first
+
+
+@pytest.mark.parametrize("measured_first", [False, True])
+def test_the_past_holds_the_motion_that_a_controller_answers(rng, measured_first):
+    """An attitude is measured with the rate of its sample."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    angles = np.cumsum(rates, axis=0) * DT + 0.2 * rng.normal(size=rates.shape)
+    answered = angles if measured_first else np.concatenate([angles[:1], angles[:-1]])
+    torque -= 5 * answered[:, None]
+    found = of_axes(torque, rates, np.zeros(SAMPLES, int), motion=angles, measured_first=measured_first)[10:, 0]
+    assert (np.abs(np.mean(found * answered[10:], axis=0)) < 1e-9).all()
 
 
 def test_means_count_where_they_explain_more_than_chance_does(rng):

@@ -12,8 +12,9 @@ from ..airframe import AXES, YAW, Airframe
 from ..analysis.prediction import HORIZONS, starts
 from ..bracket import Bracket
 from ..errors import InputError, shortened
-from ..flight import CHANNEL_NAMES, Flight
+from ..flight import ANGLES, CHANNEL_NAMES, Flight
 from ..logs import Recording
+from ..logs.sampling import filled
 from ..models.flight_model import FlightModel
 from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
 from ..recording.prepared import HOLDOUT, Prepared, prepare
@@ -187,20 +188,37 @@ def _input_innovations(
         return None
     dt, (samples,), stretch = float(flight.dt), flight.time.shape, np.asarray(flight.stretch_numbers)
     within, mixer = np.asarray(flight.within), np.asarray(shooting.model.airframe.mixer)
-    inputs, speeds = np.square(within) @ mixer.T, within @ mixer[AXES.index(YAW)]
+    inputs, yaw = np.square(within) @ mixer.T, AXES.index(YAW)
     counts = LAGGED_COUNTS if is_lagged else COUNTS
+    # With commands, neither makes the moments of inertia more accurate.
+    speeds = None if commanded else within @ mixer[yaw]
+    motion = _motion(flight) if means and not commanded else None
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
         if axis is not None:
             torque, count = inputs[:, :, axis], counts[axis]
             some = 1 if is_lagged else count
-            spin = speeds if axis == AXES.index(YAW) and not commanded else None
             own = input_innovations(
-                torque, measured, stretch, dt, some, speeds=spin, means=means, measured_first=measured_first
+                torque,
+                measured,
+                stretch,
+                dt,
+                some,
+                speeds=speeds if axis == yaw else None,
+                means=means,
+                motion=motion,
+                measured_first=measured_first,
             )
             found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
     return found
+
+
+def _motion(flight: Flight) -> Float[np.ndarray, "samples columns"]:
+    """Roll, pitch and velocity, as far as they are known."""
+    angles = np.asarray(flight.states)[:, ANGLES[:2]]
+    velocity = np.zeros((len(angles), 0)) if flight.body_velocity is None else np.asarray(flight.body_velocity)
+    return np.hstack([filled(angles[:, ~np.isnan(angles).all(axis=0)]), velocity])
 
 
 def _held_out(

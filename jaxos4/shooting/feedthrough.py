@@ -44,15 +44,16 @@ def input_innovations(
     speeds: Float[np.ndarray, "samples speeds"] | None = None,
     memory: float = 0.1,
     means: Sequence[float] = (),
+    motion: Float[np.ndarray, "samples columns"] | None = None,
     measured_first: bool = False,
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
     The prediction is a linear regression on earlier samples of the input, of the measured motion and of `speeds`, and,
-    where they explain more than chance does by Schwarz's criterion, on exponential means of the first two. The result
-    is the `count` combinations of the parts of a sample with most of the residual, with arbitrary signs. It is 0 in the
-    first `memory` of a stretch, and where measurements in the memory are missing for as long as the memory, as held-out
-    ones are: values in their place would distort the regression.
+    where they explain more than chance does by Schwarz's criterion, on exponential means of the first two and on
+    `motion`. The result is the `count` combinations of the parts of a sample with most of the residual, with arbitrary
+    signs. It is 0 in the first `memory` of a stretch, and where measurements in the memory are missing for as long as
+    the memory, as held-out ones are: values in their place would distort the regression.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN: missing. Shorter gaps than the memory are interpolated.
@@ -61,6 +62,7 @@ def input_innovations(
     - `dt`: sample time [s]. `memory`: how far back single samples count [s]; at least three samples.
     - `means`: time constants of the means [s]. In longer gaps, the mean of all measurements takes the place of a
       missing one.
+    - `motion`: what else a controller answers, such as attitude and velocity; no NaN.
     - `measured_first`: whether no torque before a sample's measurement can answer it. The measurement of the sample
       itself then counts as past, although half of the sample's torque is earlier.
 
@@ -70,6 +72,7 @@ def input_innovations(
     rows = np.arange(lags, samples)
     if measured_first:
         measured = np.append(measured[1:], measured[-1])
+        motion = None if motion is None else np.concatenate([motion[1:], motion[-1:]])
     measured, missing = _without_gaps(measured, lags)
     earlier = np.append(0, np.cumsum(missing))  # how many were missing before each sample
     rows = rows[(stretch[rows] == stretch[rows - lags]) & (earlier[rows] == earlier[rows - lags])]
@@ -79,12 +82,14 @@ def input_innovations(
     if spare <= 0:
         return np.zeros((samples, count))
     rest = _unexplained(series, parts, rows, lags)
-    if spare > 2 * len(means) > 0:
-        with_means = _unexplained(series, parts, rows, lags, _exponential_means(series, parts, stretch, dt, means))
-        power, power_with_means = (np.square(each.mean(axis=1)).mean() for each in (rest, with_means))
-        if power_with_means < power * spare ** (-2 * len(means) / spare):
-            rest = with_means
-        del with_means
+    columns = () if motion is None else map(_standard, motion.T)
+    slow = np.column_stack([_exponential_means(series, parts, stretch, dt, means), *columns])
+    if spare > slow.shape[1] > 0:
+        with_slow = _unexplained(series, parts, rows, lags, slow)
+        power, power_with_slow = (np.square(each.mean(axis=1)).mean() for each in (rest, with_slow))
+        if power_with_slow < power * spare ** (-slow.shape[1] / spare):
+            rest = with_slow
+        del with_slow
     _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
     scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
