@@ -2,7 +2,7 @@
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 
 class InputError(ValueError):
@@ -13,6 +13,12 @@ class InputError(ValueError):
     def __init__(self, message: str):
         text, half = printable(message), (self.longest - 3) // 2
         super().__init__(text if len(text) <= self.longest else f"{text[:half]}...{text[-half:]}")
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Raises `InputError` if the value of an argument is not one of its choices."""
+    if value not in choices:
+        raise InputError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}.")
 
 
 class TrainingError(RuntimeError):

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float, setting
 from .batching import in_blocks
+from .errors import check_choice
 from .flight import STATE_NAMES, Flight, Inputs
 from .models.abstract import AbstractModel
 from .models.state import CASCADE_ORDER, Forcing, State, stack, unstack
@@ -102,8 +103,7 @@ def simulate(
 
     **Raises:** `ValueError` that names the argument.
     """
-    if method not in METHODS:
-        raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
+    check_choice("method", method, METHODS)
     start = jnp.zeros(12) if initial_state is None else initial_state
     if jnp.ndim(omega) != 2 or jnp.shape(omega)[1] != 4:
         raise ValueError(f"`omega` must have shape (samples, 4), got {jnp.shape(omega)}; use `vmap` for a batch.")

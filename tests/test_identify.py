@@ -273,13 +273,13 @@ OF_FLIGHT, OF_VEHICLE = jaxos4.OS4Settings, jaxos4.VehicleSettings
 @pytest.mark.parametrize(
     ("subject", "options", "said"),
     [
-        (MODEL, {"estimator": "nobody"}, "`estimator`: must be one of ibss"),
+        (MODEL, {"estimator": "nobody"}, "`estimator` must be one of ibss"),
         (MODEL, {"estimator": "kalman", "settings": OF_FLIGHT(window=1.0)}, "`window`: kalman does not shoot"),
         (MODEL, {"network": "none.net"}, "`network`: ibss uses none"),
         (MODEL, {"bracket": {"alpha9": (0.0, 1.0)}}, "`bracket`: knows no parameter `alpha9`"),
         (MODEL, {"bracket": {"alpha1": (1.0, 0.0)}}, "`bracket`: `alpha1` must be"),
         (MODEL, {"settings": OF_FLIGHT(initial_state="guessed")}, "`initial_state`: must be free or known"),
-        (MODEL, {"settings": OF_FLIGHT(channels="some")}, "`channels`: must be one of rates"),
+        (MODEL, {"settings": OF_FLIGHT(channels="some")}, "`channels` must be one of rates"),
         (MODEL, {"settings": OF_VEHICLE()}, "`settings`: must be OS4Settings for a model"),
         (jaxos4.FlightModel(), {}, "`subject`: must be a model in alpha_1..8 or an airframe, which"),
         (OS4, {"settings": OF_FLIGHT()}, "`settings`: must be VehicleSettings for an airframe"),

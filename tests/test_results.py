@@ -270,7 +270,7 @@ def test_figures_are_on_one_axis_each():
     np.testing.assert_array_equal(gain.lines[0].get_ydata(), found.response.pitch.gain)
     empty = identified_flight()
     for wrong, said in (
-        (lambda: found.plot.rates("x"), "`rate`: must be one of p, q, r"),
+        (lambda: found.plot.rates("x"), "`rate` must be one of p, q, r"),
         (empty.plot.rates, "no predictions"),
         (empty.plot.response, "no frequency response"),
     ):

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Scalar, integer, setting
 from ..airframe import MOTIONS, Airframe
+from ..errors import check_choice
 from ..models.rotors import Motor
 from ..models.terms import STEEPEST
 from ..noise import FORCE_SIGMA
@@ -156,8 +157,7 @@ class ClosedLoop(eqx.Module):
     logged: str = eqx.field(static=True, default="commands")
 
     def __check_init__(self):
-        if self.logged not in LOGGED:
-            raise ValueError(f"`logged` must be one of {', '.join(LOGGED)}, got {self.logged!r}.")
+        check_choice("logged", self.logged, LOGGED)
         loaded = [x for x in (self.thrust_curve, self.motor_braking) if not isinstance(x, Tracer) and float(x) != 1]
         if loaded and not self.airframe.has_full_scale:
             raise ValueError("`airframe.max_rotor_speed` must be known for `thrust_curve` and `motor_braking`: set it.")

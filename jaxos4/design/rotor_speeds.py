@@ -16,7 +16,7 @@ from .._custom_types import Key, Numeric, Parameters, RotorSpeeds, Scalar, as_fl
 from .._xla import quick_jit
 from ..airframe import Airframe
 from ..bracket import Bracket
-from ..errors import InputError, named
+from ..errors import InputError, check_choice, named
 from ..excitation import EXCITATIONS, multisine
 from ..flight import Inputs
 from ..linalg import covariance_of_shared
@@ -298,8 +298,7 @@ def design_input(
     parameter.
     """
     task.check_settings(duration, dt, bandwidth, criterion, samples=(50, 2500), cycles=1, fastest=0.25)
-    if channels not in CHANNELS:
-        raise InputError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
+    check_choice("channels", channels, CHANNELS)
     if model.forcing_parameters or model.force_axes:
         raise InputError("`model` must be an OS4 model: a real vehicle needs its controller, and `design_references`.")
     progress("envelope")

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from .._custom_types import Key, Numeric, Scalar, as_float
 from .._files import write_atomically
 from .._xla import quick_jit
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..flight import SPEED_NAMES, STATE_NAMES, Flight
 from ..linalg import gram, joint_factor
 from ..logs import write_flight
@@ -262,8 +262,7 @@ def check_settings(
     if not (dt > 0 and samples[0] <= duration / dt <= samples[1]):
         allowed = f"{samples[0]} to {samples[1]} samples of a positive `dt`"
         raise InputError(f"`duration` must be {allowed}, got {duration:g} s and {dt:g} s.")
-    if criterion not in CRITERIA:
-        raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
+    check_choice("criterion", criterion, CRITERIA)
     low, high = cycles / duration, fastest / dt
     if not low <= bandwidth <= high:
         limits = f"{cycles} / `duration` and {fastest:g} / `dt`, {low:.3g} to {high:.3g} Hz"

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from .._registry import Registry
+from ..errors import check_choice
 
 if TYPE_CHECKING:  # the command line offers the names before it imports JAX
     from ..estimate import AbstractEstimator
@@ -33,8 +34,7 @@ def make_estimator(name: str, network: "TrainedNetwork | None" = None) -> "Abstr
 
     Raises `ValueError` for an unknown name, or if the estimator needs a network and there is none.
     """
-    if name not in ESTIMATORS:
-        raise ValueError(f"`name` must be one of {', '.join(ESTIMATORS)}, got {name!r}.")
+    check_choice("name", name, ESTIMATORS)
     kind = ESTIMATORS[name]
     if not kind.needs_network:
         return kind()

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._files import in_xml, templates
 from .._version import __version__
-from ..errors import InputError, printable
+from ..errors import InputError, check_choice, printable
 from ..result_file import ResultSource
 from ..results import meaning
 from .result import Identified, read_result
@@ -71,8 +71,7 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
     **Raises:** `InputError` for an unknown simulator, if `samples` or `seed` is not an integer of at least 0, or if
     hardly any draw is a possible vehicle.
     """
-    if to not in TARGETS:
-        raise InputError(f"`to`: must be one of {', '.join(TARGETS)}, got {to!r}.")
+    check_choice("to", to, TARGETS)
     _check_draws(samples, seed)
     target, own, warning = TARGETS[to], found.identification, tuple[str, ...]()
     if not own.successful:

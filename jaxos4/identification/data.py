@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from .._custom_types import Positive
 from .._version import __version__
 from ..airframe import PRESETS
-from ..errors import InputError
+from ..errors import check_choice
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS
 from ..recording.checks import Finding
@@ -139,6 +139,5 @@ def name_and_class(estimator: str | AbstractEstimator) -> tuple[str, type[Abstra
     """The name and the class of an estimator. Raises `InputError` for an unknown name."""
     if not isinstance(estimator, str):
         return class_name(estimator, ESTIMATORS), type(estimator)
-    if estimator not in ESTIMATORS:
-        raise InputError(f"`estimator`: must be one of {', '.join(ESTIMATORS)}, got {estimator!r}.")
+    check_choice("estimator", estimator, ESTIMATORS)
     return estimator, ESTIMATORS[estimator]

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._custom_types import as_float
 from ..bracket import Bracket
-from ..errors import InputError, named, shortened
+from ..errors import InputError, check_choice, named, shortened
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, Hybrid, make_estimator
 from ..flight import STATE_NAMES
@@ -229,8 +229,7 @@ def _chosen_channels(name: str, measured: np.ndarray, channels: str | None) -> s
         raise InputError(f"{name}: neither rates nor attitude were measured; log p, q, r or phi, theta, psi.")
     if channels is None:
         return [choice for choice, measured_any in present.items() if measured_any][-1]
-    if channels not in CHANNELS:
-        raise InputError(f"`channels`: must be one of {', '.join(CHANNELS)}, got {channels!r}.")
+    check_choice("channels", channels, CHANNELS)
     if not present[channels]:
         missing = ", ".join(STATE_NAMES[i] for i in CASCADE_ORDER[_ADDED[channels]])
         raise InputError(f"{name}: `channels` {channels}: none of {missing} was measured; leave it out.")

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Parameters, Scalar, as_float, integer, setting
 from ..bracket import UNIFORM_PRIOR, Bracket
-from ..errors import named
+from ..errors import check_choice, named
 from ..estimate import AbstractEstimator, Calibration, Estimate
 from ..flight import STATE_NAMES
 from ..linalg import invert
@@ -83,8 +83,7 @@ class NetworkEstimator(eqx.Module):
 
     def __check_init__(self):
         for name, choices in (("features", FEATURES), ("channels", CHANNELS), ("architecture", ARCHITECTURES)):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+            check_choice(name, getattr(self, name), choices)
         if self.steps > MAX_STEPS:
             raise ValueError(f"`steps` must be at most {MAX_STEPS}, got {self.steps}.")
         setting("learning_rate", positive=True)(self.learning_rate)

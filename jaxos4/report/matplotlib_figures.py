@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from ..airframe import INERTIAS, MOTIONS
 from ..analysis.frequency_response import HIGHEST
 from ..analysis.prediction import decisive_horizon
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..flight import RATE_NAMES
 from ..identification.results import Identification, VehicleIdentification
 from ..identification.tables import physical_quantities
@@ -166,8 +166,7 @@ class Plots(NamedTuple):
 
 
 def _place(argument: str, value: str, names: tuple[str, ...]) -> int:
-    if value not in names:
-        raise InputError(f"`{argument}`: must be one of {', '.join(names)}, got {value!r}.")
+    check_choice(argument, value, names)
     return names.index(value)
 
 

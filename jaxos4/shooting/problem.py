@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._custom_types import Count, InitialState, InitialStates, Numeric, Parameters, Scalar, StateVector, as_float
 from ..batching import in_blocks
 from ..bracket import Bracket
+from ..errors import check_choice
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
@@ -79,10 +80,8 @@ class ShootingProblem(AbstractProblem):
         length: Length = None,
         unknowns: Unknowns | None = None,
     ):
-        if channels not in CHANNELS:
-            raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
-        if method not in STEPS:
-            raise ValueError(f"`method` must be one of {', '.join(STEPS)}, got {method!r}.")
+        check_choice("channels", channels, CHANNELS)
+        check_choice("method", method, STEPS)
         if np.shape(sigma) not in ((len(STATE_NAMES),), (len(CHANNEL_NAMES),)):
             raise ValueError(
                 "`sigma` must hold one value for each of the 12 states, and may hold three more for specific force, "
