@@ -87,16 +87,16 @@ def assert_same_directions(found, expected, *, atol):
 
 
 @pytest.mark.parametrize(
-    ("lags", "times", "parts", "columns"), [(10, (), 0, 0), (3, MEANS, 0, 0), (10, (), 1, 0), (3, MEANS, 4, 2)]
+    ("lags", "times", "speeds", "slow"),
+    [(10, (), 0, 0), (3, MEANS, 0, 0), (10, (), 1, 0), (10, (), 0, 2), (3, MEANS, 2, 2)],
 )
-def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lags, times, parts, columns):
+def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lags, times, speeds, slow):
     """Against a regression with the whole matrix. One stretch is too short for a row, and the controller integrates."""
     torque, rates = in_loop(rng, pilot=1.0, integral=1.0)
-    speeds, motion = (rng.normal(100.0, 0.3, size=(SAMPLES, width)) for width in (parts, columns))
-    torque[1:] += (speeds.sum(axis=1) + motion.sum(axis=1))[:-1, None, None]
+    speeds, slow = (rng.normal(100.0, 0.3, size=(SAMPLES, signals)) for signals in (speeds, slow))
+    torque[1:] += (speeds.sum(axis=1) + slow.sum(axis=1))[:-1, None, None]
     stretch = np.repeat([0, 1, 2], [250, lags - 2, SAMPLES - 248 - lags])
-    others = {"speeds": speeds if parts else None, "motion": motion if columns else None}
-    found = of_axes(torque, rates, stretch, memory=lags * DT, means=times, **others)
+    found = of_axes(torque, rates, stretch, memory=lags * DT, means=times, speeds=[*speeds.T], slow=[*slow.T])
     rows = np.concatenate([np.arange(lags, 250), np.arange(248 + 2 * lags, SAMPLES)])
     assert not np.delete(found, rows, axis=0).any()
     for axis in range(3):
@@ -104,7 +104,7 @@ def test_innovations_are_the_residuals_of_a_regression_within_stretches(rng, lag
         both = np.column_stack([torque[:, :, axis].mean(axis=1), rates[:, axis]])
         means = (means_of(both - both.mean(axis=0), stretch, time)[rows - 1] for time in times)
         past = np.column_stack([np.ones(len(rows)), *(samples[rows - lag] for lag in range(1, lags + 1)), *means])
-        past = np.hstack([past, motion[rows - 1]])
+        past = np.hstack([past, slow[rows - 1]])
         now = torque[rows, :, axis]
         rest = now - past @ np.linalg.lstsq(past, now)[0]
         directions = np.sqrt(len(rows)) * np.linalg.svd(rest, full_matrices=False)[0][:, :FEEDTHROUGHS]
@@ -147,23 +147,39 @@ def test_the_past_holds_a_measurement_before_the_torque(rng):
 
 
 @pytest.mark.parametrize("measured_first", [False, True])
-def test_the_past_holds_the_motion_that_a_controller_answers(rng, measured_first):
-    """An attitude is measured with the rate of its sample."""
+def test_a_slow_signal_that_a_controller_answers_tells_nothing_of_the_innovations(rng, measured_first):
+    """With `measured_first` the value in the sample itself is past, else that of the sample before."""
     torque, rates = in_loop(rng, pilot=1.0)
     angles = np.cumsum(rates, axis=0) * DT + 0.2 * rng.normal(size=rates.shape)
     answered = angles if measured_first else np.concatenate([angles[:1], angles[:-1]])
     torque -= 5 * answered[:, None]
-    found = of_axes(torque, rates, np.zeros(SAMPLES, int), motion=angles, measured_first=measured_first)[10:, 0]
-    assert (np.abs(np.mean(found * answered[10:], axis=0)) < 1e-9).all()
+    for slow, is_known in (([*angles.T], True), ((), False)):
+        found = of_axes(torque, rates, np.zeros(SAMPLES, int), slow=slow, measured_first=measured_first)[10:, 0]
+        correlations = np.abs(np.mean(found * answered[10:], axis=0))
+        assert (correlations < 1e-9 if is_known else correlations > 1e-3).all()
 
 
-def test_means_count_where_they_explain_more_than_chance_does(rng):
+def test_means_and_slow_signals_count_where_they_explain_more_than_chance_does(rng):
     """Regressors without effect would cost information about the parameters."""
-    stretch = np.zeros(SAMPLES, int)
+    stretch, noise = np.zeros(SAMPLES, int), [*rng.normal(size=(2, SAMPLES))]
     without, integrates = in_loop(rng, pilot=1.0), in_loop(rng, pilot=1.0, integral=1.0)
-    np.testing.assert_array_equal(of_axes(*without, stretch, means=MEANS), of_axes(*without, stretch))
-    found, short = (of_axes(*integrates, stretch, memory=3 * DT, means=times) for times in (MEANS, ()))
-    assert (found != short).any(axis=(0, 1)).all()
+    for more in ({"means": MEANS}, {"slow": noise}, {"means": MEANS, "slow": noise}):
+        np.testing.assert_array_equal(of_axes(*without, stretch, **more), of_axes(*without, stretch))
+    short = {"memory": 3 * DT}
+    found = of_axes(*integrates, stretch, **short, means=MEANS)
+    assert (found != of_axes(*integrates, stretch, **short)).any(axis=(0, 1)).all()
+    np.testing.assert_array_equal(of_axes(*integrates, stretch, **short, means=MEANS, slow=noise), found)
+
+
+def test_a_slow_signal_with_a_long_gap_is_left_out(rng):
+    """What stands in a gap would count as an answer to it."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    angle = np.cumsum(rates[:, 0])
+    torque[1:] -= angle[:-1, None, None]
+    for gap in (8, 100):
+        lost = np.where(np.abs(np.arange(SAMPLES) - 300) < gap / 2, np.nan, angle)
+        found, without = (of_axes(torque, rates, np.zeros(SAMPLES, int), slow=slow) for slow in ([lost], ()))
+        assert (found == without).all() == (gap == 100)
 
 
 @pytest.mark.parametrize("parts", [[0, 0, 1, 1], [0, 1, 2, 2]])
@@ -350,14 +366,21 @@ def test_commands_in_short_samples_have_innovations_of_earlier_samples(logged):
 
 
 @pytest.mark.parametrize("logged", ["commands", "speeds"])
-def test_measured_speeds_tell_nothing_of_the_later_innovations_of_yaw(logged):
-    """The reaction of the rotors goes with their speeds, the torque with the squares."""
-    flight = fly_standard(jaxos4.ClosedLoop(CINERAT, gust=2.0, logged=logged), duration=16.0, seed=0)
-    data = prepare_vehicle(as_recordings(flight), CINERAT, jaxos4.VehicleSettings())[0]
-    speeds = np.asarray(data.problem.flight.within)[:-1].mean(axis=1) @ CINERAT.rotor_spins
-    innovations = np.asarray(data.likelihood.input_innovations)[1 : data.time.size, 0, 2]
-    correlation = np.mean(innovations * (speeds - speeds.mean())) / speeds.std()
-    assert (abs(correlation) < 1e-6) == (logged == "speeds")
+def test_past_speeds_and_attitude_predict_the_torque_if_speeds_are_measured(logged):
+    """Here each row of the rotors answers the attitude of the row before, with a noise that no past torque predicts."""
+    loop = jaxos4.ClosedLoop(CINERAT, gust=2.0, logged=logged, attitude_noise=0.05)
+    (recording,) = as_recordings(fly_standard(loop, duration=16.0, seed=0))
+    omega = recording.omega.copy()
+    omega[1:] -= 20 * recording.states[:-1, [6]] * np.sign(CINERAT.rotor_positions[:, 1])
+    settings = jaxos4.VehicleSettings(holdout=0.0)
+    data = prepare_vehicle([recording._replace(omega=omega)], CINERAT, settings)[0]
+    flight = data.problem.flight
+    phi, theta = np.asarray(flight.states)[1:, [6, 8]].T
+    speeds = np.asarray(flight.within)[:-1].mean(axis=1) @ CINERAT.rotor_spins
+    innovations = np.asarray(data.likelihood.input_innovations)[1 : data.time.size, 0]
+    for signal, axis in ((np.cos(theta) * np.sin(phi), 0), (speeds, 2)):
+        correlation = np.mean(innovations[:, axis] * (signal - signal.mean())) / signal.std()
+        assert (abs(correlation) < 1e-6) == (logged == "speeds")
 
 
 def test_no_torque_before_an_instant_answers_what_is_measured_at_it():

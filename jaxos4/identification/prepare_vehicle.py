@@ -14,7 +14,6 @@ from ..bracket import Bracket
 from ..errors import InputError, shortened
 from ..flight import ANGLES, CHANNEL_NAMES, Flight
 from ..logs import Recording
-from ..logs.sampling import filled
 from ..models.flight_model import FlightModel
 from ..models.terms import COMMANDS, FULL_SCALE, SAG, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
 from ..recording.prepared import HOLDOUT, Prepared, prepare
@@ -161,6 +160,8 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
         commanded=commanded,
         is_lagged=is_lagged,
         means=MEANS if is_short else (),
+        # With commands, these make neither the moments of inertia nor the damping more accurate.
+        slow=_answered(flight) if is_short and not commanded else (),
         measured_first=measured_first,
     )
     return InnovationsProblem(
@@ -180,6 +181,7 @@ def _input_innovations(
     commanded: bool,
     is_lagged: bool,
     means: Sequence[float],
+    slow: Sequence[Float[np.ndarray, " rows"]],
     measured_first: bool,
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
     """Input innovations of body rates and vertical force, padded to `capacity`; `None` without `Flight.within`."""
@@ -187,12 +189,11 @@ def _input_innovations(
     if flight.within is None:
         return None
     dt, (samples,), stretch = float(flight.dt), flight.time.shape, np.asarray(flight.stretch_numbers)
-    within, mixer = np.asarray(flight.within), np.asarray(shooting.model.airframe.mixer)
-    inputs, yaw = np.square(within) @ mixer.T, AXES.index(YAW)
+    within, airframe = np.asarray(flight.within), shooting.model.airframe
+    inputs = np.square(within) @ np.asarray(airframe.mixer).T
     counts = LAGGED_COUNTS if is_lagged else COUNTS
-    # With commands, neither makes the moments of inertia more accurate.
-    speeds = None if commanded else within @ mixer[yaw]
-    motion = _motion(flight) if means and not commanded else None
+    # The reaction of the rotors goes with their speeds. Commands do not show these.
+    speeds = () if commanded else (within.mean(axis=1) @ np.asarray(airframe.rotor_spins),)
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
@@ -205,20 +206,20 @@ def _input_innovations(
                 stretch,
                 dt,
                 some,
-                speeds=speeds if axis == yaw else None,
+                speeds=speeds if axis == AXES.index(YAW) else (),
                 means=means,
-                motion=motion,
+                slow=slow,
                 measured_first=measured_first,
             )
             found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
     return found
 
 
-def _motion(flight: Flight) -> Float[np.ndarray, "samples columns"]:
-    """Roll, pitch and velocity, as far as they are known."""
-    angles = np.asarray(flight.states)[:, ANGLES[:2]]
-    velocity = np.zeros((len(angles), 0)) if flight.body_velocity is None else np.asarray(flight.body_velocity)
-    return np.hstack([filled(angles[:, ~np.isnan(angles).all(axis=0)]), velocity])
+def _answered(flight: Flight) -> list[Float[np.ndarray, " samples"]]:
+    """What a controller answers but heading: the upright direction along x and y, and the velocity if it is known."""
+    phi, theta = np.asarray(flight.states)[:, ANGLES[:2]].T
+    velocity = () if flight.body_velocity is None else np.asarray(flight.body_velocity).T
+    return [-np.sin(theta), np.cos(theta) * np.sin(phi), *velocity]
 
 
 def _held_out(

@@ -30,6 +30,8 @@ MEANS = 0.1, 0.3, 1.0
 """Time constants [s] of the means in which a controller's integral of attitude shows."""
 # A smaller share of a signal may be due to rounding.
 _ROUNDING = 1e-6
+# A slow signal is left out if it is missing in this share of the rows. Where all signals end, a slower one ends sooner.
+_LOST = 0.01
 # Rows of one matrix product. More would not fit the cache, and BLAS would divide so small a product among threads.
 _BLOCK = 2048
 
@@ -41,55 +43,57 @@ def input_innovations(
     dt: float,
     count: int,
     *,
-    speeds: Float[np.ndarray, "samples speeds"] | None = None,
+    speeds: Sequence[Float[np.ndarray, " samples"]] = (),
     memory: float = 0.1,
     means: Sequence[float] = (),
-    motion: Float[np.ndarray, "samples columns"] | None = None,
+    slow: Sequence[Float[np.ndarray, " samples"]] = (),
     measured_first: bool = False,
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
-    The prediction is a linear regression on earlier samples of the input, of the measured motion and of `speeds`, and,
-    where they explain more than chance does by Schwarz's criterion, on exponential means of the first two and on
-    `motion`. The result is the `count` combinations of the parts of a sample with most of the residual, with arbitrary
-    signs. It is 0 in the first `memory` of a stretch, and where measurements in the memory are missing for as long as
-    the memory, as held-out ones are: values in their place would distort the regression.
+    The prediction is a linear regression on earlier samples of the input, of `measured` and of `speeds`. Exponential
+    means of input and `measured`, and the `slow` signals besides, are added if they explain more than chance does by
+    Schwarz's criterion. The result is the `count` combinations of the parts of a sample with most of the residual, with
+    arbitrary signs. It is 0 in the first `memory` of a stretch, and where measurements in the memory are missing for as
+    long as the memory, as held-out ones are: values in their place would distort the regression.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN: missing. Shorter gaps than the memory are interpolated.
     - `stretch`: the number of the uninterrupted stretch of each sample.
-    - `speeds`: what else is known of the rotors, such as their speeds where the input is their squares.
     - `dt`: sample time [s]. `memory`: how far back single samples count [s]; at least three samples.
+    - `speeds`: further inputs, such as the rotor speeds if the input is their squares.
     - `means`: time constants of the means [s]. In longer gaps, the mean of all measurements takes the place of a
       missing one.
-    - `motion`: what else a controller answers, such as attitude and velocity; no NaN.
-    - `measured_first`: whether no torque before a sample's measurement can answer it. The measurement of the sample
-      itself then counts as past, although half of the sample's torque is earlier.
+    - `slow`: what a controller or a pilot answers besides, such as attitude and velocity; NaN: missing. Only the last
+      value before a sample counts. A signal with longer gaps than the memory is left out.
+    - `measured_first`: whether no torque before a sample's measurements can answer them. They then count as past,
+      although half of the sample's torque is earlier.
 
     Reference: Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978).
     """
     lags, (samples, parts) = max(round(memory / dt), 3), inputs.shape
     rows = np.arange(lags, samples)
     if measured_first:
-        measured = np.append(measured[1:], measured[-1])
-        motion = None if motion is None else np.concatenate([motion[1:], motion[-1:]])
+        measured, *slow = (np.append(each[1:], each[-1]) for each in (measured, *slow))
     measured, missing = _without_gaps(measured, lags)
     earlier = np.append(0, np.cumsum(missing))  # how many were missing before each sample
     rows = rows[(stretch[rows] == stretch[rows - lags]) & (earlier[rows] == earlier[rows - lags])]
-    others = () if speeds is None else (_standard(speeds),)
-    series = np.column_stack([_standard(inputs), _standard(measured), *others, np.ones(samples)])
+    series = np.column_stack([_standard(inputs), _standard(measured), *map(_standard, speeds), np.ones(samples)])
     spare = len(rows) - 1 - lags * (series.shape[1] - 1)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
+    slower = [_exponential_means(series, parts, stretch, dt, means)]
+    known = [_standard(each) for each, lost in (_without_gaps(x, lags) for x in slow) if lost[rows - 1].mean() < _LOST]
+    if known:
+        slower.append(np.column_stack([*slower, *known]))
     rest = _unexplained(series, parts, rows, lags)
-    columns = () if motion is None else map(_standard, motion.T)
-    slow = np.column_stack([_exponential_means(series, parts, stretch, dt, means), *columns])
-    if spare > slow.shape[1] > 0:
-        with_slow = _unexplained(series, parts, rows, lags, slow)
-        power, power_with_slow = (np.square(each.mean(axis=1)).mean() for each in (rest, with_slow))
-        if power_with_slow < power * spare ** (-slow.shape[1] / spare):
-            rest = with_slow
-        del with_slow
+    least = np.square(rest.mean(axis=1)).mean()
+    for each in slower:
+        if 0 < each.shape[1] < spare:
+            other = _unexplained(series, parts, rows, lags, each)
+            size = np.square(other.mean(axis=1)).mean() * spare ** (each.shape[1] / spare)
+            rest, least = (other, size) if size < least else (rest, least)
+            del other
     _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
     scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
@@ -139,9 +143,9 @@ def _exponential_means(
     dt: float,
     times: Sequence[float],
 ) -> Float[np.ndarray, "samples means"]:
-    """Exponential means, up to each sample, of input and motion, with these time constants [s]; 0 before a stretch.
+    """Exponential means, up to each sample, of input and measurement, with time constants [s]; 0 before a stretch.
 
-    `series`: the input in `parts`, then the motion, with mean 0.
+    `series`: the input in `parts`, then the measurement, with mean 0.
     """
     from scipy.linalg import solve_banded  # slow to import
 
@@ -160,13 +164,13 @@ def _unexplained(
     targets: int,
     rows: Int[np.ndarray, " rows"],
     lags: int,
-    means: Float[np.ndarray, "samples means"] | None = None,
+    slow: Float[np.ndarray, "samples slow"] | None = None,
 ) -> Float[np.ndarray, "rows targets"]:
     """The residual of the first `targets` series at these rows, after a regression on what came before.
 
-    Regressors are `lags` samples of all series, and `means` of the sample before. It uses normal equations, because the
-    matrix of the regression would not fit into memory. A ridge keeps them regular if series differ by rounding only. A
-    second pass removes the errors of the first by ridge and rounding.
+    Regressors are `lags` samples of all series, and the `slow` ones of the sample before. It uses normal equations,
+    because the matrix of the regression would not fit into memory. A ridge keeps them regular if series differ by
+    rounding only. A second pass removes the errors of the first by ridge and rounding.
     """
     from scipy.linalg import cho_factor, cho_solve  # slow to import
 
@@ -177,12 +181,12 @@ def _unexplained(
     windows = [series[block[0] - lags : block[-1] + 1] for block in rows_of_blocks]
     pasts = [[window[lags - lag : -lag] for lag in range(1, lags + 1)] for window in windows]
     products, sizes = _lagged_products(windows, lags), [series.shape[1]] * lags
-    if means is not None:
-        slow = [means[block[0] - 1 : block[-1]] for block in rows_of_blocks]
-        pasts = [[*past, own] for past, own in zip(pasts, slow, strict=True)]
-        products = np.pad(products, (0, means.shape[1]))
-        products[:, -means.shape[1] :] = _products(pasts, slow)
-        sizes.append(means.shape[1])
+    if slow is not None:
+        last = [slow[block[0] - 1 : block[-1]] for block in rows_of_blocks]
+        pasts = [[*past, own] for past, own in zip(pasts, last, strict=True)]
+        products = np.pad(products, (0, slow.shape[1]))
+        products[:, -slow.shape[1] :] = _products(pasts, last)
+        sizes.append(slow.shape[1])
     products.flat[:: len(products) + 1] += _ROUNDING**2 * len(rows)
     factor = cho_factor(products)
     for _ in range(2):
