@@ -51,11 +51,11 @@ def input_innovations(
 ) -> Float[np.ndarray, "samples count"]:
     """The part of the torque or thrust within each sample that the past does not predict, with mean square 1.
 
-    The prediction is a linear regression on earlier samples of the input, of `measured` and of `speeds`. Exponential
-    means of input and `measured`, and the `slow` signals besides, are added if they explain more than chance does by
-    Schwarz's criterion. The result is the `count` combinations of the parts of a sample with most of the residual, with
-    arbitrary signs. It is 0 in the first `memory` of a stretch, and where measurements in the memory are missing for as
-    long as the memory, as held-out ones are: values in their place would distort the regression.
+    The prediction is a linear regression on earlier samples of the input, of `measured` and of `speeds`, on the `slow`
+    signals, and on exponential means of input and `measured` if these explain more than chance does by Schwarz's
+    criterion. The result is the `count` combinations of the parts of a sample with most of the residual, with arbitrary
+    signs. It is 0 in the first `memory` of a stretch, and where measurements in the memory are missing for as long as
+    the memory, as held-out ones are: values in their place would distort the regression.
 
     - `inputs`: torque or thrust in equal parts of each sample, in any unit.
     - `measured`: the rate or specific force; NaN: missing. Shorter gaps than the memory are interpolated.
@@ -82,18 +82,16 @@ def input_innovations(
     spare = len(rows) - 1 - lags * (series.shape[1] - 1)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
-    slower = [_exponential_means(series, parts, stretch, dt, means)]
     known = [_standard(each) for each, lost in (_without_gaps(x, lags) for x in slow) if lost[rows - 1].mean() < _LOST]
-    if known:
-        slower.append(np.column_stack([*slower, *known]))
-    rest = _unexplained(series, parts, rows, lags)
-    least = np.square(rest.mean(axis=1)).mean()
-    for each in slower:
-        if 0 < each.shape[1] < spare:
-            other = _unexplained(series, parts, rows, lags, each)
-            size = np.square(other.mean(axis=1)).mean() * spare ** (each.shape[1] / spare)
-            rest, least = (other, size) if size < least else (rest, least)
-            del other
+    last = np.column_stack([np.zeros((samples, 0)), *known])
+    rest = _unexplained(series, parts, rows, lags, last)
+    if spare > 2 * len(means) > 0:
+        last = np.column_stack([last, _exponential_means(series, parts, stretch, dt, means)])
+        with_means = _unexplained(series, parts, rows, lags, last)
+        power, power_with_means = (np.square(each.mean(axis=1)).mean() for each in (rest, with_means))
+        if power_with_means < power * spare ** (-2 * len(means) / spare):
+            rest = with_means
+        del with_means
     _, sizes, directions = np.linalg.svd(np.linalg.qr(rest, mode="r"))
     is_signal = sizes > _ROUNDING * np.sqrt(len(rows))
     scaled = np.where(is_signal, directions.T, 0.0) / np.where(is_signal, sizes, 1.0)
@@ -164,11 +162,11 @@ def _unexplained(
     targets: int,
     rows: Int[np.ndarray, " rows"],
     lags: int,
-    slow: Float[np.ndarray, "samples slow"] | None = None,
+    others: Float[np.ndarray, "samples others"],
 ) -> Float[np.ndarray, "rows targets"]:
     """The residual of the first `targets` series at these rows, after a regression on what came before.
 
-    Regressors are `lags` samples of all series, and the `slow` ones of the sample before. It uses normal equations,
+    Regressors are `lags` samples of all series, and the `others` of the sample before. It uses normal equations,
     because the matrix of the regression would not fit into memory. A ridge keeps them regular if series differ by
     rounding only. A second pass removes the errors of the first by ridge and rounding.
     """
@@ -180,13 +178,11 @@ def _unexplained(
     blocks, rows_of_blocks = (np.split(each, firsts[1:]) for each in (rest, rows))
     windows = [series[block[0] - lags : block[-1] + 1] for block in rows_of_blocks]
     pasts = [[window[lags - lag : -lag] for lag in range(1, lags + 1)] for window in windows]
-    products, sizes = _lagged_products(windows, lags), [series.shape[1]] * lags
-    if slow is not None:
-        last = [slow[block[0] - 1 : block[-1]] for block in rows_of_blocks]
-        pasts = [[*past, own] for past, own in zip(pasts, last, strict=True)]
-        products = np.pad(products, (0, slow.shape[1]))
-        products[:, -slow.shape[1] :] = _products(pasts, last)
-        sizes.append(slow.shape[1])
+    last = [others[block[0] - 1 : block[-1]] for block in rows_of_blocks]
+    pasts = [[*past, own] for past, own in zip(pasts, last, strict=True)]
+    sizes = [*[series.shape[1]] * lags, others.shape[1]]
+    products = np.pad(_lagged_products(windows, lags), (0, others.shape[1]))
+    products[:, sum(sizes[:-1]) :] = _products(pasts, last)
     products.flat[:: len(products) + 1] += _ROUNDING**2 * len(rows)
     factor = cho_factor(products)
     for _ in range(2):
