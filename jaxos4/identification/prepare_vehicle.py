@@ -208,7 +208,7 @@ def _input_innovations(
                 some,
                 speeds=speeds if axis == AXES.index(YAW) else (),
                 means=means,
-                slow=slow,
+                slow=slow if axis < AXES.index(YAW) else (),
                 measured_first=measured_first,
             )
             found[:samples, :count, channel] = lagged(own[:, 0], stretch, count) if is_lagged else own
@@ -216,7 +216,7 @@ def _input_innovations(
 
 
 def _answered(flight: Flight) -> list[Float[np.ndarray, " samples"]]:
-    """What a controller answers but heading: the upright direction along x and y, and the velocity if it is known."""
+    """What roll and pitch answer: the upright direction along x and y, and the velocity if it is known."""
     phi, theta = np.asarray(flight.states)[:, ANGLES[:2]].T
     velocity = () if flight.body_velocity is None else np.asarray(flight.body_velocity).T
     return [-np.sin(theta), np.cos(theta) * np.sin(phi), *velocity]
