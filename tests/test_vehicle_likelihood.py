@@ -22,6 +22,7 @@ from jaxos4.identification.intervals import corrected
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.identification.results import Constant, FixedParameter, SampleTime
 from jaxos4.identification.search import (
+    USUAL_DELAY,
     USUAL_DELAY_OF_COMMANDS,
     Optimum,
     _lowest_in_delay,
@@ -292,6 +293,32 @@ def test_the_search_begins_again_near_the_usual_delay(delay, compared, cost, cho
     if starts:
         assert [free for free, _ in starts] == [False, True]
         assert starts[1][1] == USUAL_DELAY_OF_COMMANDS
+
+
+@pytest.mark.parametrize(("cost_at_zero", "chosen"), [(2.5, False), (3.5, True)])
+def test_a_minimum_of_another_delay_counts_without_what_is_negative(cost_at_zero, chosen):
+    """At a wrong delay, a negative reaction of the rotors answered the noise of the gyro: the cost was 279 lower."""
+    terms = jaxos4.VehicleSettings(terms=("offset", "damping", "lag", "delay"), sample_time=DT)
+    data = prepare_vehicle(as_recordings(flown()), CRAZYFLIE, terms)[0]
+    likelihood = dataclasses.replace(data.likelihood, answers_within=jnp.array(False))
+    names = likelihood.problem.unknowns.names
+
+    def estimate(delay, damping, cost):
+        values = jnp.zeros(likelihood.unknowns.count).at[names.index("rotor_delay")].set(delay)
+        values, counts = values.at[names.index("roll_damping")].set(damping), (jnp.asarray(5), jnp.asarray(1))
+        return jaxos4.Estimate(
+            values, jnp.eye(values.size), jnp.zeros(0), jnp.asarray(cost), *counts, RESULTS.successful
+        )
+
+    def estimator(problem):
+        if problem.problem.unknowns.free[names.index("roll_damping")]:
+            return estimate(USUAL_DELAY, 1.0, 3.0)
+        return estimate(0.012, 0.0, cost_at_zero)
+
+    first = Optimum(data, likelihood, *2 * [estimate(0.012, -3.0, 2.0)], likelihood.problem.unknowns, 0)
+    after = _lowest_in_delay(estimator, first, USUAL_DELAY)
+    assert (after.estimate is not first.estimate) == chosen
+    assert (after.rollouts, float(after.cost)) == (15, 3.0 if chosen else 2.0)
 
 
 @pytest.mark.parametrize("result", [RESULTS.successful, RESULTS.nonfinite_trajectory])

@@ -156,7 +156,8 @@ def _lowest_in_delay(
 ) -> Optimum:
     """The optimum, or a lower minimum near the `usual` delay of the rotors [s].
 
-    A delay near the one that was `compared` for longer samples is not compared again.
+    A delay near the one that was `compared` for longer samples is not compared again. A minimum with parameters that
+    must not be negative counts with these at 0: at a wrong delay, the torque can answer the noise of the gyro.
     """
     likelihood, found, names = first.likelihood, first.estimate, first.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(found.result):
@@ -174,16 +175,24 @@ def _lowest_in_delay(
         return first._replace(rollouts=spent)
     other = jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
     spent += int(other.rollouts)
-    if has_answer(other.result) and float(found.cost) - float(other.cost) > LOWER:
-        return first._replace(estimate=other, unrestricted=other, rollouts=spent)
+    if has_answer(other.result):
+        rival = first._replace(rollouts=spent)
+        if negative := _negative(first):
+            rival = rival.restricted(estimator, dict.fromkeys(negative, 0.0))
+        spent = rival.rollouts
+        if not has_answer(rival.estimate.result) or rival.cost - float(other.cost) > LOWER:
+            return first._replace(estimate=other, unrestricted=other, rollouts=spent)
     return first._replace(compared_delay=delay, rollouts=spent)
+
+
+def _negative(optimum: Optimum) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation of the parameters that are negative, though physics forbids it."""
+    return {row.name: (value, std) for row, value, std in _rows(optimum) if row.nonnegative and value < -NEGATIVE * std}
 
 
 def _without_negative(estimator: Search, before: Optimum, progress: Progress) -> Optimum:
     """The parameters that are negative, though physics forbids it, fixed at 0, if that leaves an answer."""
-    negative = {
-        row.name: (value, std) for row, value, std in _rows(before) if row.nonnegative and value < -NEGATIVE * std
-    }
+    negative = _negative(before)
     if not negative or not before.converged:  # away from a minimum, signs and standard deviations mean nothing
         return before
     progress("fitting again without what came out negative")
