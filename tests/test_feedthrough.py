@@ -147,7 +147,7 @@ def test_the_past_holds_a_measurement_before_the_torque(rng):
 
 
 @pytest.mark.parametrize("measured_first", [False, True])
-def test_a_slow_signal_that_a_controller_answers_tells_nothing_of_the_innovations(rng, measured_first):
+def test_innovations_do_not_correlate_with_a_known_slow_signal(rng, measured_first):
     """With `measured_first` the value in the sample itself is past, else that of the sample before."""
     torque, rates = in_loop(rng, pilot=1.0)
     angles = np.cumsum(rates, axis=0) * DT + 0.2 * rng.normal(size=rates.shape)
@@ -169,14 +169,23 @@ def test_means_count_where_they_explain_more_than_chance_does(rng):
 
 
 def test_a_slow_signal_with_a_long_gap_is_left_out(rng):
-    """What stands in a gap would count as an answer to it."""
+    """The values that fill a gap would act as a regressor."""
     torque, rates = in_loop(rng, pilot=1.0)
     angle = np.cumsum(rates[:, 0])
     torque[1:] -= angle[:-1, None, None]
-    for gap in (8, 100):
+    for gap, is_left_out in ((8, False), (100, True)):
         lost = np.where(np.abs(np.arange(SAMPLES) - 300) < gap / 2, np.nan, angle)
         found, without = (of_axes(torque, rates, np.zeros(SAMPLES, int), slow=slow) for slow in ([lost], ()))
-        assert (found == without).all() == (gap == 100)
+        assert (found == without).all() == is_left_out
+
+
+def test_a_slow_signal_of_a_slower_sensor_is_held(rng):
+    """Its next value is an answer to the torque in between."""
+    torque, rates = in_loop(rng, pilot=1.0)
+    angle = np.where(np.arange(SAMPLES) % 5 == 0, np.cumsum(rates[:, 0]), np.nan)
+    held = np.repeat(angle[::5], 5)
+    found, same = (of_axes(torque, rates, np.zeros(SAMPLES, int), slow=[x]) for x in (angle, held))
+    np.testing.assert_array_equal(found, same)
 
 
 @pytest.mark.parametrize("parts", [[0, 0, 1, 1], [0, 1, 2, 2]])
@@ -364,18 +373,22 @@ def test_commands_in_short_samples_have_innovations_of_earlier_samples(logged):
 
 @pytest.mark.parametrize("logged", ["commands", "speeds"])
 def test_past_speeds_and_attitude_predict_the_torque_if_speeds_are_measured(logged):
-    """Here each row of the rotors answers the attitude of the row before, with a noise that no past torque predicts."""
+    """Each row of the rotors also responds to the attitude of the row before, whose noise no past torque predicts."""
     loop = jaxos4.ClosedLoop(CINERAT, gust=2.0, logged=logged, attitude_noise=0.05)
     (recording,) = as_recordings(fly_standard(loop, duration=16.0, seed=0))
-    omega = recording.omega.copy()
-    omega[1:] -= 20 * recording.states[:-1, [6]] * np.sign(CINERAT.rotor_positions[:, 1])
+    omega, (x, y) = recording.omega.copy(), np.sign(CINERAT.rotor_positions).T
+    omega[1:] -= 20 * (recording.states[:-1, [6]] * y - recording.states[:-1, [8]] * x)
     settings = jaxos4.VehicleSettings(holdout=0.0)
     data = prepare_vehicle([recording._replace(omega=omega)], CINERAT, settings)[0]
     flight = data.problem.flight
     phi, theta = np.asarray(flight.states)[1:, [6, 8]].T
+    vx, vy, _ = np.asarray(flight.body_velocity)[1:].T
     speeds = np.asarray(flight.within)[:-1].mean(axis=1) @ CINERAT.rotor_spins
     innovations = np.asarray(data.likelihood.input_innovations)[1 : data.time.size, 0]
-    for signal, axis in ((np.cos(theta) * np.sin(phi), 0), (speeds, 2)):
+    for signal, axis in (
+        *((each, axis) for axis in (0, 1) for each in (np.cos(theta) * np.sin(phi), np.sin(theta), vx, vy)),
+        (speeds, 2),
+    ):
         correlation = np.mean(innovations[:, axis] * (signal - signal.mean())) / signal.std()
         assert (abs(correlation) < 1e-6) == (logged == "speeds")
 

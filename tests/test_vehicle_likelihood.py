@@ -295,30 +295,41 @@ def test_the_search_begins_again_near_the_usual_delay(delay, compared, cost, cho
         assert starts[1][1] == USUAL_DELAY_OF_COMMANDS
 
 
-@pytest.mark.parametrize(("cost_at_zero", "chosen"), [(2.5, False), (3.5, True)])
-def test_a_minimum_of_another_delay_counts_without_what_is_negative(cost_at_zero, chosen):
-    """At a wrong delay, a negative reaction of the rotors answered the noise of the gyro: the cost was 279 lower."""
+@pytest.mark.parametrize(
+    ("at_zero", "result", "other", "chosen"),
+    [
+        (2.5, RESULTS.successful, 1.0, False),
+        (3.5, RESULTS.successful, 1.0, True),
+        (3.0, RESULTS.successful, 1.0, True),  # the search at 0 ended near the usual delay
+        (3.5, RESULTS.nonfinite_trajectory, 1.0, False),
+        (3.5, RESULTS.successful, -3.0, False),  # both are negative, and the other one costs more then
+    ],
+)
+def test_minima_of_two_delays_are_compared_without_what_is_negative(at_zero, result, other, chosen):
+    """At a wrong delay, a negative reaction of the rotors predicted the noise of the gyro: the cost was 279 lower."""
     terms = jaxos4.VehicleSettings(terms=("offset", "damping", "lag", "delay"), sample_time=DT)
     data = prepare_vehicle(as_recordings(flown()), CRAZYFLIE, terms)[0]
     likelihood = dataclasses.replace(data.likelihood, answers_within=jnp.array(False))
     names = likelihood.problem.unknowns.names
+    damping = names.index("roll_damping")
+    assert float(likelihood.problem.unknowns.center[damping]) == 0  # fixed there, its prior adds nothing
 
-    def estimate(delay, damping, cost):
+    def estimate(delay, value, cost, result=RESULTS.successful):
         values = jnp.zeros(likelihood.unknowns.count).at[names.index("rotor_delay")].set(delay)
-        values, counts = values.at[names.index("roll_damping")].set(damping), (jnp.asarray(5), jnp.asarray(1))
-        return jaxos4.Estimate(
-            values, jnp.eye(values.size), jnp.zeros(0), jnp.asarray(cost), *counts, RESULTS.successful
-        )
+        values, counts = values.at[damping].set(value), map(jnp.asarray, (cost, 5, 1))
+        return jaxos4.Estimate(values, jnp.eye(values.size), jnp.zeros(0), *counts, result)
 
     def estimator(problem):
-        if problem.problem.unknowns.free[names.index("roll_damping")]:
-            return estimate(USUAL_DELAY, 1.0, 3.0)
-        return estimate(0.012, 0.0, cost_at_zero)
+        if problem.problem.unknowns.free[damping]:
+            return estimate(USUAL_DELAY, other, 3.0)
+        starts_at_usual = float(problem.start[names.index("rotor_delay")]) == USUAL_DELAY
+        return estimate(USUAL_DELAY, 0.0, 4.0) if starts_at_usual else estimate(0.012, 0.0, at_zero, result)
 
     first = Optimum(data, likelihood, *2 * [estimate(0.012, -3.0, 2.0)], likelihood.problem.unknowns, 0)
     after = _lowest_in_delay(estimator, first, USUAL_DELAY)
     assert (after.estimate is not first.estimate) == chosen
-    assert (after.rollouts, float(after.cost)) == (15, 3.0 if chosen else 2.0)
+    assert after.rollouts == (15 if other > 0 else 20)
+    assert after.compared_delay == (None if chosen else 0.012)
 
 
 @pytest.mark.parametrize("result", [RESULTS.successful, RESULTS.nonfinite_trajectory])

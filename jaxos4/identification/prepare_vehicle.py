@@ -160,8 +160,6 @@ def _innovations(shooting: ShootingProblem, prepared: Prepared, finest: Prepared
         commanded=commanded,
         is_lagged=is_lagged,
         means=MEANS if is_short else (),
-        # With commands, these make neither the moments of inertia nor the damping more accurate.
-        slow=_answered(flight) if is_short and not commanded else (),
         measured_first=measured_first,
     )
     return InnovationsProblem(
@@ -181,7 +179,6 @@ def _input_innovations(
     commanded: bool,
     is_lagged: bool,
     means: Sequence[float],
-    slow: Sequence[Float[np.ndarray, " rows"]],
     measured_first: bool,
 ) -> Float[np.ndarray, "samples feedthroughs channels"] | None:
     """Input innovations of body rates and vertical force, padded to `capacity`; `None` without `Flight.within`."""
@@ -192,8 +189,10 @@ def _input_innovations(
     within, airframe = np.asarray(flight.within), shooting.model.airframe
     inputs = np.square(within) @ np.asarray(airframe.mixer).T
     counts = LAGGED_COUNTS if is_lagged else COUNTS
-    # The reaction of the rotors goes with their speeds. Commands do not show these.
+    # The reaction torque follows the change of the speeds, which past torque does not determine.
     speeds = () if commanded else (within.mean(axis=1) @ np.asarray(airframe.rotor_spins),)
+    # With commands, slow signals improve neither the moments of inertia nor the damping.
+    slow = _slow_signals(flight) if means and not commanded else ()
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
@@ -215,8 +214,8 @@ def _input_innovations(
     return found
 
 
-def _answered(flight: Flight) -> list[Float[np.ndarray, " samples"]]:
-    """What roll and pitch answer: the upright direction along x and y, and the velocity if it is known."""
+def _slow_signals(flight: Flight) -> list[Float[np.ndarray, " samples"]]:
+    """To these respond roll and pitch: the upright direction along x and y, and the velocity if it is known."""
     phi, theta = np.asarray(flight.states)[:, ANGLES[:2]].T
     velocity = () if flight.body_velocity is None else np.asarray(flight.body_velocity).T
     return [-np.sin(theta), np.cos(theta) * np.sin(phi), *velocity]

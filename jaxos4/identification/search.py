@@ -156,8 +156,8 @@ def _lowest_in_delay(
 ) -> Optimum:
     """The optimum, or a lower minimum near the `usual` delay of the rotors [s].
 
-    A delay near the one that was `compared` for longer samples is not compared again. A minimum with parameters that
-    must not be negative counts with these at 0: at a wrong delay, the torque can answer the noise of the gyro.
+    A delay near the one that was `compared` for longer samples is not compared again. Minima are compared with what is
+    negative in them at 0: at a wrong delay, a negative value can predict the noise of the gyro.
     """
     likelihood, found, names = first.likelihood, first.estimate, first.unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(found.result):
@@ -176,13 +176,21 @@ def _lowest_in_delay(
     other = jax.block_until_ready(estimator(likelihood.starting_from(near.parameters)))
     spent += int(other.rollouts)
     if has_answer(other.result):
-        rival = first._replace(rollouts=spent)
-        if negative := _negative(first):
-            rival = rival.restricted(estimator, dict.fromkeys(negative, 0.0))
-        spent = rival.rollouts
-        if not has_answer(rival.estimate.result) or rival.cost - float(other.cost) > LOWER:
-            return first._replace(estimate=other, unrestricted=other, rollouts=spent)
+        rival = first._replace(estimate=other, unrestricted=other, rollouts=spent)
+        own, theirs = (_with_negative_at_zero(estimator, each) for each in (first, rival))
+        spent = own.rollouts - first.rollouts + theirs.rollouts
+        # A search with some parameters at 0 may itself end near the usual delay.
+        margin = LOWER if own is first else -LOWER
+        if own.cost - theirs.cost > margin:
+            return rival._replace(rollouts=spent)
     return first._replace(compared_delay=delay, rollouts=spent)
+
+
+def _with_negative_at_zero(estimator: Search, optimum: Optimum) -> Optimum:
+    """The optimum with what is negative in it fixed at 0, if that leaves an answer."""
+    negative = _negative(optimum)
+    after = optimum.restricted(estimator, dict.fromkeys(negative, 0.0)) if negative else optimum
+    return after if has_answer(after.estimate.result) else optimum._replace(rollouts=after.rollouts)
 
 
 def _negative(optimum: Optimum) -> dict[str, tuple[float, float]]:

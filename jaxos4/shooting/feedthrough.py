@@ -30,7 +30,8 @@ MEANS = 0.1, 0.3, 1.0
 """Time constants [s] of the means in which a controller's integral of attitude shows."""
 # A smaller share of a signal may be due to rounding.
 _ROUNDING = 1e-6
-# A slow signal is left out if it is missing in this share of the rows. Where all signals end, a slower one ends sooner.
+# A slow signal is left out if it is missing in this share of the rows. Not 0: before a held-out part, a slower sensor
+# ends some rows before the gyro.
 _LOST = 0.01
 # Rows of one matrix product. More would not fit the cache, and BLAS would divide so small a product among threads.
 _BLOCK = 2048
@@ -64,10 +65,10 @@ def input_innovations(
     - `speeds`: further inputs, such as the rotor speeds if the input is their squares.
     - `means`: time constants of the means [s]. In longer gaps, the mean of all measurements takes the place of a
       missing one.
-    - `slow`: what a controller or a pilot answers besides, such as attitude and velocity; NaN: missing. Only the last
-      value before a sample counts. A signal with longer gaps than the memory is left out.
-    - `measured_first`: whether no torque before a sample's measurements can answer them. They then count as past,
-      although half of the sample's torque is earlier.
+    - `slow`: other signals to which a controller or a pilot responds, such as attitude and velocity; NaN: missing.
+      Only the last value before a sample counts. A signal with gaps that are longer than the memory is left out.
+    - `measured_first`: whether no torque before a sample's measurements can answer them. `measured` and `slow` of the
+      sample itself then count as past, although half of its torque is earlier.
 
     Reference: Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978).
     """
@@ -79,10 +80,10 @@ def input_innovations(
     earlier = np.append(0, np.cumsum(missing))  # how many were missing before each sample
     rows = rows[(stretch[rows] == stretch[rows - lags]) & (earlier[rows] == earlier[rows - lags])]
     series = np.column_stack([_standard(inputs), _standard(measured), *map(_standard, speeds), np.ones(samples)])
-    spare = len(rows) - 1 - lags * (series.shape[1] - 1)  # degrees of freedom
+    known = [_standard(_held(x)) for x in slow if _without_gaps(x, lags)[1][rows - 1].mean() < _LOST]
+    spare = len(rows) - 1 - lags * (series.shape[1] - 1) - len(known)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
-    known = [_standard(each) for each, lost in (_without_gaps(x, lags) for x in slow) if lost[rows - 1].mean() < _LOST]
     last = np.column_stack([np.zeros((samples, 0)), *known])
     rest = _unexplained(series, parts, rows, lags, last)
     if spare > 2 * len(means) > 0:
@@ -126,6 +127,13 @@ def _without_gaps(
     missing = after - before > longest
     filled = np.interp(place, place[known], measured[known])
     return np.where(missing, measured[known].mean(), filled), missing
+
+
+def _held(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """A signal whose gaps have the value before them, or the first one. Interpolation would tell what comes later."""
+    known = np.flatnonzero(np.isfinite(signal))
+    last = np.searchsorted(known, np.arange(len(signal)), side="right") - 1
+    return signal[known[np.maximum(last, 0)]]
 
 
 def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
