@@ -189,10 +189,10 @@ def _input_innovations(
     within, airframe = np.asarray(flight.within), shooting.model.airframe
     inputs = np.square(within) @ np.asarray(airframe.mixer).T
     counts = LAGGED_COUNTS if is_lagged else COUNTS
-    # The reaction torque follows the change of the speeds, which past torque does not determine.
-    speeds = () if commanded else (within.mean(axis=1) @ np.asarray(airframe.rotor_spins),)
-    # With commands, slow signals improve neither the moments of inertia nor the damping.
-    slow = _slow_signals(flight) if means and not commanded else ()
+    speeds, slow = (), ()
+    if means and not commanded:
+        # The reaction torque follows the change of the speeds, which past torque does not determine.
+        speeds, slow = (within.mean(axis=1) @ np.asarray(airframe.rotor_spins),), _slow_signals(flight)
     found = np.zeros((capacity, max(LAGGED_COUNTS) if commanded else FEEDTHROUGHS, columns.size))
     for channel, (column, measured) in enumerate(zip(columns, shooting.recorded().T, strict=True)):
         axis = channel if channel < 3 else 3 if CHANNEL_NAMES[column] == "az" else None
