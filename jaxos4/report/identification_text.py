@@ -83,7 +83,7 @@ def warning_lines(found: Identification) -> list[str]:
     """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
     widened = found.widened if isinstance(found, VehicleIdentification) else {}
     wide = {name: factor for name, factor in widened.items() if factor > _WIDENED}
-    factors = sorted({f"{each:.1f}" for each in (min(wide.values(), default=1.0), max(wide.values(), default=1.0))})
+    factors = dict.fromkeys(f"{pick(wide.values(), default=1.0):.1f}" for pick in (min, max))
     flights, other = ("flights", ", or the flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "")
     said = f"warning: parts of the {flights} disagree, so that intervals were widened {' to '.join(factors)} times: "
     lacking = f"{said}{', '.join(wide)}. The model lacks an effect{other}."
