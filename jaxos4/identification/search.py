@@ -207,10 +207,8 @@ def _without_negative(estimator: Search, before: Optimum, progress: Progress) ->
     places = [before.unknowns.names.index(name) for name in negative]
     covariance = np.asarray(before.estimate.covariance)
     freed = covariance[:, places] @ np.linalg.pinv(covariance[np.ix_(places, places)]) @ covariance[places]
-    after = before.restricted(estimator, dict.fromkeys(negative, 0.0))
-    if not has_answer(after.estimate.result):
-        return before._replace(rollouts=after.rollouts)
-    return after._replace(negative=negative, freed=freed)
+    after = _with_negative_at_zero(estimator, before)
+    return after if after.estimate is before.estimate else after._replace(negative=negative, freed=freed)
 
 
 def _at_nominal_values(estimator: Search, before: Optimum, progress: Progress) -> Optimum:
