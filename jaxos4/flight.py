@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ._custom_types import Count, Numeric, RotorSpeeds, Scalar, States, as_float
 from .results import RESULTS
@@ -204,3 +204,14 @@ def with_force(states: Any, force: Any, numpy: Any) -> Any:
     """The channels of a flight as one array of `numpy` or `jax.numpy`; NaN: not measured."""
     nothing = numpy.full((*states.shape[:-1], len(FORCE_NAMES)), numpy.nan, states.dtype)
     return numpy.concatenate([states, nothing if force is None else force], axis=-1)
+
+
+def last_measured(measured: Bool[np.ndarray, "samples *columns"]) -> Int[np.ndarray, "samples *columns"]:
+    """The last measured sample up to each sample; before the first one, the first."""
+    own = np.arange(len(measured)).reshape(-1, *[1] * (measured.ndim - 1))
+    return np.maximum(np.maximum.accumulate(np.where(measured, own, -1), axis=0), measured.argmax(axis=0))
+
+
+def filled(values: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
+    """Each gap gets the value before it, or the first one."""
+    return np.take_along_axis(values, last_measured(~np.isnan(values)), axis=0)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from .table import counted
 
@@ -239,17 +239,6 @@ def held_regularly(t: Times) -> bool:
         return False
     low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
     return bool(high - low <= REGULAR * middle)
-
-
-def last_measured(measured: Bool[np.ndarray, "samples *columns"]) -> Int[np.ndarray, "samples *columns"]:
-    """The last measured sample up to each sample; before the first one, the first."""
-    own = np.arange(len(measured)).reshape(-1, *[1] * (measured.ndim - 1))
-    return np.maximum(np.maximum.accumulate(np.where(measured, own, -1), axis=0), measured.argmax(axis=0))
-
-
-def filled(values: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
-    """Each gap gets the value before it, or the first one."""
-    return np.take_along_axis(values, last_measured(~np.isnan(values)), axis=0)
 
 
 def runs(where: Bool[np.ndarray, " samples"]) -> list[tuple[int, int]]:

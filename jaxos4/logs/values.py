@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..airframe import STANDARD_GRAVITY
-from ..flight import COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SIGNALS, SPEED_NAMES, UNITS
-from .sampling import filled, runs
+from ..flight import COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SIGNALS, SPEED_NAMES, UNITS, filled
+from .sampling import runs
 from .table import Recording, Table
 
 

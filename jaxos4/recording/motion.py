@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..airframe import GRAVITY, MOTIONS, Airframe
-from ..flight import ANGLES, RATES, VELOCITY, Flight
+from ..flight import ANGLES, RATES, VELOCITY, Flight, filled
 from ..logs import Recording, as_recording
-from ..logs.sampling import averages, filled
+from ..logs.sampling import averages
 from ..rotations import rotations_to_body
 from .sensor_errors import Ups, white_noise
 

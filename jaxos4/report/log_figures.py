@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import MOTIONS
-from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES, RATES
+from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES, RATES, filled
 from ..logs import Recording
-from ..logs.sampling import filled
 from ..recording.inspection import Inspection
 from . import timeline
 from .panels import BOUND_DASHES, EVERYWHERE, Band, Figure, Line, Panel, Scale, style

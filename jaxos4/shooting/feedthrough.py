@@ -19,6 +19,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..flight import filled
+
 COUNTS = (2, 2, 1, 1)
 """The numbers of input innovations of roll, pitch, yaw and thrust. A second one of yaw would hide the reaction of the
 rotors."""
@@ -80,7 +82,8 @@ def input_innovations(
     earlier = np.append(0, np.cumsum(missing))  # how many were missing before each sample
     rows = rows[(stretch[rows] == stretch[rows - lags]) & (earlier[rows] == earlier[rows - lags])]
     series = np.column_stack([_standard(inputs), _standard(measured), *map(_standard, speeds), np.ones(samples)])
-    known = [_standard(_held(x)) for x in slow if _without_gaps(x, lags)[1][rows - 1].mean() < _LOST]
+    # Gaps are not interpolated, because that would tell what comes later.
+    known = [_standard(filled(x)) for x in slow if _without_gaps(x, lags)[1][rows - 1].mean() < _LOST]
     spare = len(rows) - 1 - lags * (series.shape[1] - 1) - len(known)  # degrees of freedom
     if spare <= 0:
         return np.zeros((samples, count))
@@ -125,15 +128,8 @@ def _without_gaps(
     before = np.maximum.accumulate(np.where(known, place, -1))
     after = np.minimum.accumulate(np.where(known, place, len(measured))[::-1])[::-1]
     missing = after - before > longest
-    filled = np.interp(place, place[known], measured[known])
-    return np.where(missing, measured[known].mean(), filled), missing
-
-
-def _held(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """A signal whose gaps have the value before them, or the first one. Interpolation would tell what comes later."""
-    known = np.flatnonzero(np.isfinite(signal))
-    last = np.searchsorted(known, np.arange(len(signal)), side="right") - 1
-    return signal[known[np.maximum(last, 0)]]
+    between = np.interp(place, place[known], measured[known])
+    return np.where(missing, measured[known].mean(), between), missing
 
 
 def _standard(columns: Float[np.ndarray, "samples *columns"]) -> Float[np.ndarray, "samples *columns"]:
