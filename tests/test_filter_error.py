@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from disturbances import joint_cost, transition
-from helpers import DT, noisy_states, standard_flight, standard_problem
+from helpers import CRAZYFLIE, DT, noisy_states, standard_flight, standard_problem
 from lanes import LANES, names
 
 import jaxos4
@@ -204,6 +204,36 @@ def test_lanes_may_differ_in_everything_and_padding_changes_nothing():
     one = eqx.filter_jit(at)
     others = [(one(jnp.asarray(float(i))), i) for i in range(3)] + [(one(jnp.asarray(0.0), 200.0, 600), 0)]
     for alone, i in others:
+        for name, expected, found in zip(alone._fields, alone, together, strict=True):
+            atol = 1e-9 * np.abs(expected).max()
+            np.testing.assert_allclose(found[i], expected, rtol=1e-9, atol=atol, err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("own_speeds", [False, True])
+def test_lanes_look_up_the_forcing_of_their_own_flight(own_speeds):
+    """The forcing depends on parameters. Lanes share it, or each has its own, of which the velocity is shared."""
+    rng, samples = np.random.default_rng(3), 300
+    states = np.full((samples, 12), np.nan)
+    states[:, RATES] = 0.1 * rng.normal(size=(samples, 3))
+    speeds = float(CRAZYFLIE.hover_speed) * (1 + 0.05 * rng.normal(size=(samples, 4)))
+    flight = jaxos4.Flight(DT * np.arange(samples), speeds, states, body_velocity=rng.normal(size=(samples, 3)))
+    model = jaxos4.FlightModel(CRAZYFLIE, terms=("offset", "velocity", "lag", "delay"))
+    problem = jaxos4.ShootingProblem(model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4")
+
+    def at(i):
+        own, parameters = problem, model.alpha
+        if own_speeds:
+            own = eqx.tree_at(lambda p: p.flight.omega, own, own.flight.omega * (1 + 0.02 * i))
+            parameters = parameters * (1 + 0.1 * i)
+        noise = LogNoise(*(leaf + 0.1 * i for leaf in NOISE[:3]))
+        return InnovationsProblem(own, segments=3, settling=50).innovations(parameters, noise)
+
+    together, one = eqx.filter_jit(eqx.filter_vmap(at))(jnp.arange(2.0)), eqx.filter_jit(at)
+    for i in range(2):
+        alone = one(jnp.asarray(float(i)))
+        slopes = alone.gradient[:, list(model.forcing_parameters)]
+        assert (np.abs(slopes).max(axis=(0, 2)) > 0).all()
         for name, expected, found in zip(alone._fields, alone, together, strict=True):
             atol = 1e-9 * np.abs(expected).max()
             np.testing.assert_allclose(found[i], expected, rtol=1e-9, atol=atol, err_msg=name)

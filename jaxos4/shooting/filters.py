@@ -8,14 +8,13 @@ Arrays have the axes (time, channels, segments). A segment is one part of the fl
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Scalar
-from ..batching import computed_once, with_batch
+from ..batching import computed_once
 from ..models.state import Forcing, Rates, State
 from .gains import (
     RATE_COUNT,
@@ -74,8 +73,9 @@ class Segmented(NamedTuple):
     - `counts`: whether the innovations at a sample count.
     - `known`: the rates at the first sample. `None`: unknown.
     - `inputs`: input innovations, see `jaxos4.shooting.feedthrough`.
-    - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
-      parameters on which they depend.
+    - `place`: the sample of the flight in each row.
+    - `forcing`: leaves (samples). `forcing_tangents`: their derivatives (positions, samples) in the parameters on which
+      they depend. Both change with the parameters, and most rows may be padding, so they are looked up block by block.
     - `rows`: the number of rows that are filtered; the others are padding.
     - `window`: the part of a sample that a measurement averages.
     """
@@ -85,6 +85,7 @@ class Segmented(NamedTuple):
     counts: Bool[Array, "time segments"]
     known: Float[Array, "3 segments"] | None
     inputs: Float[Array, "time feedthroughs channels segments"]
+    place: Int[Array, "time segments"]
     forcing: Forcing
     forcing_tangents: Forcing | None
     rows: Count | int
@@ -127,66 +128,13 @@ class _Row(NamedTuple):
     restart_next: Bool[Array, " segments"]
 
 
-def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
-    """Filter all segments. The likelihood of the innovations has derivatives in all unknowns.
+def innovations_at(
+    functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point
+) -> Innovations:
+    """The innovations of all segments; see `innovate`.
 
-    In the derivatives, the noise of a channel affects its own innovations only.
-
-    - `functions`: three functions of a state, the forcing and the parameters. They return the state one sample later,
-      its mean over the window of a measurement, and the outputs of the sensors.
-    - `positions`: indices of the parameters on which the forcing depends.
+    `functions` act on all segments. Arrays in `at` may have segments as last axis.
     """
-    return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)()
-
-
-def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
-    """The innovations of a batch, whose lanes become segments. The segments of a lane are adjacent."""
-    (moving, _, flight, at), (fixed, positions, fixed_flight, fixed_at) = many, shared
-    segments = eqx.combine(flight, fixed_flight).measured.shape[-1]
-
-    def lanes_before_last(one: Any, same: Any) -> Any:
-        one = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2), one)
-        same = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], lanes, segments)), same
-        )
-        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes * segments), eqx.combine(one, same))
-
-    def repeated(leaf: Array) -> Array:
-        return jnp.repeat(leaf, segments, axis=0)
-
-    def in_each_segment(one: Any, same: Any) -> Any:
-        """Values in each segment, from values common to a lane or of each segment."""
-        one = jax.tree.map(lambda leaf: leaf if leaf.ndim > 2 else jnp.repeat(leaf[..., None], segments, 2), one)
-        same = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else jnp.repeat(leaf[:, None], segments, 1), same)
-        return lanes_before_last(one, same)
-
-    own = jax.tree.map(repeated, moving)
-
-    def each(which: int) -> Callable:
-        def function(*at: Any) -> Any:
-            return jax.vmap(lambda one, *at: eqx.combine(one, fixed[which])(*at))(own[which], *at)
-
-        return function
-
-    rows = fixed_flight.rows if flight.rows is None else flight.rows.max()  # surplus rows of shorter lanes do not count
-    series = lanes_before_last(*(part._replace(rows=None, dt=None, window=None) for part in (flight, fixed_flight)))
-    own_step, fixed_step = (flight.dt, flight.window), (fixed_flight.dt, fixed_flight.window)
-    dt, window = eqx.combine(jax.tree.map(repeated, own_step), fixed_step)
-    flight = series._replace(rows=rows, dt=dt, window=window)
-    functions = each(0), each(1), each(2)
-    found = _filter(functions, positions, flight, in_each_segment(at, fixed_at))
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
-
-
-def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
-    """The innovations of one flight."""
-    own = None if at.parameters.ndim == 1 else 0
-    move, average, observe = (jax.vmap(function, in_axes=(0, 0, own)) for function in functions)
-    return _filter((move, average, observe), positions, flight, at)
-
-
-def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
-    """See `innovate`. `functions` act on all segments. Arrays in `at` may have segments as last axis."""
     (count, *own), (time, channels, segments) = at.parameters.shape, flight.measured.shape
     driving = count + len(jax.tree.leaves((at.noise, at.input_gains)))  # the unknowns that change the estimates
     unknowns, levels = driving + len(at.feedthrough), slice(count, count + len(jax.tree.leaves(at.noise)))
@@ -202,7 +150,7 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
         restart=flight.restart,
         restart_next=jnp.roll(flight.restart, -1, axis=0),
     )
-    data = row, flight.counts, flight.forcing, flight.forcing_tangents
+    data = row, flight.counts, flight.place
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
     def sample(carry, rows):
@@ -237,7 +185,9 @@ def _filter(functions: tuple[Callable, ...], positions: tuple[int, ...], flight:
     def block(i: Count, carry: tuple) -> tuple:
         """The filters after some more rows, the last standardised innovations, and the sums of the likelihood."""
         filters, last, sums = carry
-        row, counts, forcing, tangents = jax.tree.map(lambda leaf: leaf[i], blocks)
+        row, counts, place = jax.tree.map(lambda leaf: leaf[i], blocks)
+        forcing = jax.tree.map(lambda leaf: leaf[place], flight.forcing)
+        tangents = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[:, place], 0, 1), flight.forcing_tangents)
         filters, found = jax.lax.scan(sample, filters, (forcing, tangents, row))
         (errors, slopes), variance, variance_slopes = found
         counts = row.is_measured & counts[:, None]

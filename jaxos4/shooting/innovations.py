@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._custom_types import Count, Numeric, Parameters, as_float
 from ..bracket import Bracket
@@ -26,7 +26,8 @@ from ..models.abstract import AbstractModel, ByRecording
 from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
-from .filters import LAGS, Innovations, Point, Segmented, innovate
+from .filter_lanes import innovate
+from .filters import LAGS, Innovations, Point, Segmented
 from .gains import INSTANT, LogNoise
 from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, joined, levels, own_names, placed, with_noise
@@ -264,11 +265,6 @@ class InnovationsProblem(AbstractProblem):
 
         return at
 
-    @property
-    def _place(self) -> Int[Array, "segments time"]:
-        """The samples of each segment. An index beyond the flight is replaced by that of its last sample."""
-        return jnp.minimum(jnp.asarray(self.segmentation.place), self.flight.time.shape[0] - 1)
-
     def innovations(
         self,
         parameters: Parameters,
@@ -293,7 +289,7 @@ class InnovationsProblem(AbstractProblem):
             problem = dataclasses.replace(problem, model=each.model)
             places = jnp.asarray(each.places)[self.segmentation.recording].T
         model = problem.model
-        inputs = jnp.moveaxis(self.input_innovations[self._place], 0, -1)
+        inputs = jnp.moveaxis(self.input_innovations[observed["place"]], 1, -1)
         rows, dt, window = self.segmentation.rows, self.flight.dt, INSTANT
         if self.flight.within is not None:  # measurements are means
             window = (dt - self.flight.averaging_time) / 2, self.flight.averaging_time
@@ -303,7 +299,13 @@ class InnovationsProblem(AbstractProblem):
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
             flight = Segmented(
-                **observed, inputs=inputs, forcing=forcing, forcing_tangents=tangents, rows=rows, dt=dt, window=window
+                **observed,
+                inputs=inputs,
+                forcing=forcing,
+                forcing_tangents=tangents,
+                rows=rows,
+                dt=dt,
+                window=window,
             )
             driven, disturbance, feedthrough = (tuple(each.T) for each in input_unknowns)
             point = Point(own, noise, feedthrough, tuple(noise_feedthrough.T), (driven, disturbance))
@@ -312,23 +314,20 @@ class InnovationsProblem(AbstractProblem):
         return at
 
     def _forced(self) -> Callable[[Parameters], tuple[Forcing, Forcing | None]]:
-        """The forcing of all segments and its tangents, as functions of the parameters; segments are the last axis."""
-        inputs, samples = self.flight.inputs._replace(length=self.problem.length), self._place
-
-        def segments_last(forcing: Forcing) -> Forcing:
-            forcing = forcing._replace(recording=())  # a segment belongs to one recording
-            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
+        """The forcing of all samples and its tangents, as functions of the parameters."""
+        inputs, model = self.flight.inputs._replace(length=self.problem.length), self.model
 
         def of(parameters: Parameters) -> Forcing:
-            return jax.tree.map(lambda leaf: leaf[samples], self.model.mean_forcing(inputs, parameters))
+            # A segment belongs to one recording, so its forcing names none.
+            return model.mean_forcing(inputs, parameters)._replace(recording=())
 
-        if not self.model.forcing_parameters:
-            known = segments_last(of(self.model.alpha))
+        if not model.forcing_parameters:
+            known = of(model.alpha)
             return lambda parameters: (known, None)
 
-        def forced(parameters: Parameters) -> tuple[Forcing, Forcing | None]:
-            forcing, tangents = with_tangents(of, parameters, self.model.forcing_parameters)
-            return segments_last(forcing), segments_last(tangents)
+        def forced(parameters: Parameters) -> tuple[Forcing, Forcing]:
+            forcing, tangents = with_tangents(of, parameters, model.forcing_parameters)
+            return forcing, jax.tree.map(jnp.transpose, tangents)  # positions first
 
         return forced
 

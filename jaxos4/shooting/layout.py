@@ -86,7 +86,7 @@ class Segments(NamedTuple):
 
 
 def observe_in_segments(problem: "InnovationsProblem") -> dict[str, Any]:
-    """The fields `measured`, `restart`, `counts` and `known` of `Segmented`.
+    """The fields `place`, `measured`, `restart`, `counts` and `known` of `Segmented`.
 
     A filter restarts in a gap, and where a stretch begins. Its innovations do not count until it has settled. Only a
     flight without stretches counts from its first sample, because a simulation begins at rest.
@@ -109,7 +109,7 @@ def observe_in_segments(problem: "InnovationsProblem") -> dict[str, Any]:
     restart = in_segments(restart) | begins | ~exists
     measured = jnp.where(exists[:, None], in_segments(measured), jnp.nan)
     counts = in_segments(settled) & segments.owned.T
-    return {"measured": measured, "restart": restart, "counts": counts, "known": known}
+    return {"place": place.T, "measured": measured, "restart": restart, "counts": counts, "known": known}
 
 
 def _restarts(
