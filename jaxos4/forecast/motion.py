@@ -146,7 +146,7 @@ def known_at_samples(
     noise: LogNoise,
     prior: Float[Array, "6"],
 ) -> tuple[Known, Forcing, Float[Array, "futures samples 6"]]:
-    """What is known at each sample by the first row of `parameters`; forcing and offsets by each row, see `Futures`.
+    """The `Known` of each sample by the first row of `parameters`; forcing and offsets by each row, see `Futures`.
 
     The forcing has no velocity, because a prediction simulates it.
 

@@ -19,7 +19,7 @@ from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCIT
 from . import windows
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
-from .sensor_errors import force_level, force_noise, vibrating_rates, without_noise
+from .sensor_errors import force_level, force_noise, smoothed, vibrating_rates
 from .stretches import Stretch, cut, end_of_tumble, nothing_usable
 from .windows import averaged, concatenate, fair_share, hold_out, whole_windows
 
@@ -37,7 +37,6 @@ SHORTEST, SHORTEST_OF_COMMANDS = 0.002, 0.004
 LONGEST = 0.032  # s; the longest sample at which an answer is compared with that of shorter ones
 # A given sample time becomes a multiple of the log's if that changes it by less than this share.
 WHOLE = 0.05
-NOISY = 0.1  # a larger share of noise in the changes of rotor speeds is noted
 FULL = 0.999  # share of full speed at which a rotor is at its limit
 OFTEN = 0.01  # a larger share of the time at this limit is noted
 
@@ -103,15 +102,7 @@ def prepare(
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
-    if sample_time is not None and not 0 < sample_time < math.inf:
-        raise InputError(f"`sample_time`: must be a positive number of seconds, got {sample_time:g}.")
-    if not 0 <= holdout <= 0.5:
-        raise InputError(f"`holdout`: must be a share from 0 to 0.5, got {holdout:g}.")
-    if begin is not None and end is not None and not begin < end:
-        raise InputError(f"`begin` {begin:g} `end` {end:g}: must be in this order.")
-    for number, recording in enumerate(recordings):
-        if any(recording.same_data(earlier) for earlier in recordings[:number]):
-            raise InputError(f"{recording.name}: given twice; give each log once.")
+    _check_arguments(recordings, begin, end, sample_time, holdout)
     commanded = any(each.commanded for each in recordings)
     logged = max(each.dt for each in recordings)
     step = finest(logged, sample_time, commands=logged * commanded)
@@ -129,14 +120,8 @@ def prepare(
         )
     if (different := different_thrust(evidences)) is not None:
         found.append(different)
-    numbers, stretched = [], []
-    for number, (recording, stretches) in enumerate(zip(recordings, pieces, strict=True)):
-        smooth, noise, share = without_noise(stretches, airframe)
-        numbers += [number] * len(smooth)
-        stretched += smooth
-        if share > NOISY:
-            how = f"{noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
-            notes.append(f"{recording.name}: rotor speeds are noisy ({how}) and were smoothed")
+    numbers, stretched, remarks = smoothed(recordings, pieces, airframe)
+    notes += remarks
     slowest = max(stretch.dt for stretch in stretched)
     motor_step = max(slowest, *(each.motor_step for each in evidences))
     commands = motor_step * commanded
@@ -155,6 +140,25 @@ def prepare(
         )
         for step, flown in zip(steps, coarse, strict=True)
     )
+
+
+def _check_arguments(
+    recordings: Sequence[Recording],
+    begin: float | None,
+    end: float | None,
+    sample_time: float | None,
+    holdout: float,
+) -> None:
+    """Raises `InputError` for an argument out of range, and for a log that is given twice."""
+    if sample_time is not None and not 0 < sample_time < math.inf:
+        raise InputError(f"`sample_time`: must be a positive number of seconds, got {sample_time:g}.")
+    if not 0 <= holdout <= 0.5:
+        raise InputError(f"`holdout`: must be a share from 0 to 0.5, got {holdout:g}.")
+    if begin is not None and end is not None and not begin < end:
+        raise InputError(f"`begin` {begin:g} `end` {end:g}: must be in this order.")
+    for number, recording in enumerate(recordings):
+        if any(recording.same_data(earlier) for earlier in recordings[:number]):
+            raise InputError(f"{recording.name}: given twice; give each log once.")
 
 
 def _cleaned(

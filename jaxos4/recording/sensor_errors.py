@@ -94,6 +94,27 @@ def without_noise(stretches: Sequence[Recording], airframe: Airframe) -> tuple[l
     return smooth, float(np.sqrt(noise.mean() / 2)), share
 
 
+NOISY = 0.1  # a larger share of noise in the changes of rotor speeds is noted
+
+
+def smoothed(
+    recordings: Sequence[Recording], pieces: Sequence[Sequence[Recording]], airframe: Airframe
+) -> tuple[list[int], list[Recording], list[str]]:
+    """The number of the recording of each stretch, the stretches without noise of the rotor speeds, and notes.
+
+    `pieces`: the stretches of each recording.
+    """
+    numbers, stretched, notes = [], [], []
+    for number, (recording, stretches) in enumerate(zip(recordings, pieces, strict=True)):
+        smooth, noise, share = without_noise(stretches, airframe)
+        numbers += [number] * len(smooth)
+        stretched += smooth
+        if share > NOISY:
+            how = f"{noise:.2g} rad/s, {100 * share:.0f} % of their changes from sample to sample"
+            notes.append(f"{recording.name}: rotor speeds are noisy ({how}) and were smoothed")
+    return numbers, stretched, notes
+
+
 MIN_SAMPLES = 32  # of one spectrum
 NEIGHBOURS = 2  # frequencies to either side over which spectra are averaged
 
