@@ -23,7 +23,12 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 sys.dont_write_bytecode = False
 # Tests compile for longer than they compute: XLA hardly optimises their programs, which then compile in a third of the
 # time, and compute three to five times as long. The other cores have workers, so a program is compiled in one part.
-QUICK = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+# Tests with `optimised` have level 1, with which loops run as fast as by default.
+QUICK = [
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",
+    "--xla_backend_optimization_level=1",
+]
 os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*os.environ.get("XLA_FLAGS", "").split(), *QUICK]))
 jax.config.update("jax_disable_most_optimizations", True)
 # Files of the package whose annotations are not checked. The one that decodes a log number by number has no arrays, and
@@ -46,10 +51,12 @@ hypothesis.settings.load_profile("ci")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Checks shapes and types of all annotated functions and modules; in the daily loop only if CI asks for it."""
+    """Checks shapes and types at each call if `JAXOS4_CHECK_TYPES` is set. Workers get one thread of OpenBLAS each."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        # Workers inherit this. They keep the cores busy, so that more threads would wait for each other.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         return  # this process only hands tests to workers
-    if config.option.markexpr != "not slow" or os.environ.get("JAXOS4_CHECK_TYPES"):
+    if os.environ.get("JAXOS4_CHECK_TYPES"):
         package = pathlib.Path(__file__).resolve().parents[1] / "jaxos4"
         modules = [path.relative_to(package.parent) for path in package.rglob("*.py") if path.stem not in UNCHECKED]
         jaxtyping.install_import_hook([".".join(each.with_suffix("").parts) for each in modules], "typechecker.check")

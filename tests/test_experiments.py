@@ -254,6 +254,7 @@ def test_networks(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_precision(tmp_path):
     """In a process of its own: JAX keeps the constants of a program in the precision of their first use."""
     # How far the answers of a flight may be apart, in bounds.
@@ -261,10 +262,8 @@ def test_precision(tmp_path):
     most |= {"filter-error": 2.0}
     command = [sys.executable, "-m", "experiments", "precision.run", "--flights", "64", "--out", str(out)]
     options = [each for name in most for each in ("--estimators", name)]
-    quick = how_we_compile() | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "True"}  # ten programs: they compile for longest
-    subprocess.run(
-        [*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent, env=os.environ | quick
-    )
+    environment = os.environ | how_we_compile()  # also `optimised`
+    subprocess.run([*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent, env=environment)
     report = json.loads(out.read_text())
     rows = {(row["estimator"], row["precision"]): row for row in report["rows"]}
     assert len(rows) == 2 * len(most)

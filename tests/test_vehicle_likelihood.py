@@ -37,6 +37,8 @@ from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.gains import LogNoise
 from jaxos4.shooting.innovations import SETTLING
 
+pytestmark = pytest.mark.usefixtures("all_optimised")  # a search computes for longer than it compiles
+
 DT, SAMPLES = 0.004, SETTLING + 8 * 384
 ANGLES_AND_RATES = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "p", "q", "r")]
 TERMS = ("offset", "lag", "delay", "accelerometer")
