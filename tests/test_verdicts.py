@@ -17,7 +17,7 @@ from jaxos4.flight import ANGLES, RATES
 from jaxos4.identification import verdict
 from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.intervals import consequences, corrected
-from jaxos4.identification.issues import few_parts, issues_of_log, stronger_or_weaker
+from jaxos4.identification.issues import few_parts, issues_of_log, parts_disagree, stronger_or_weaker
 from jaxos4.identification.issues_of_values import issues_of_values
 from jaxos4.identification.judge import judge_vehicle
 from jaxos4.identification.prepare_vehicle import prepare_vehicle
@@ -107,6 +107,20 @@ def test_a_quantity_that_is_hardly_known_is_not_identified(monkeypatch):
     assert (missing.status, missing.reasons) == (MISSING, ("it hardly yaws",))
     monkeypatch.setattr(verdict, "TOO_UNCERTAIN", 0.05)
     assert verdict_of("Ix", Quantity(spread=0.1), []).status == MISSING
+
+
+def test_parts_that_disagree_on_a_parameter_make_a_reservation_about_what_depends_on_it():
+    """The parts of one log may belong to two vehicles."""
+    model = jaxos4.FlightModel(CRAZYFLIE, terms=("offset", "damping", "lag"))
+    assert [*parts_disagree(model, {"alpha6": 2.9, "rotor_lag": 3.0})] == []
+    (issue,) = parts_disagree(model, {"alpha3": 2.9, "alpha6": 5.2, "pitch_damping": 8.93})
+    assert "alpha6, pitch_damping, by up to 8.9 times" in issue.cause
+    statuses = {name: verdict_of(name, Quantity(), [issue]).status for name in ("Ix", "Iy", "Iz", "damping", "motors")}
+    assert statuses == dict.fromkeys(statuses, IDENTIFIED) | dict.fromkeys(("Iy", "damping"), RESERVED)
+    assert issue.remedy == "fit parts of the flight by `begin` and `end`"
+    (issue,) = parts_disagree(model, {"rotor_lag": 8.0}, logs=2)
+    assert issue.remedy == "fit the logs one by one"
+    assert set(issue.moves) == {"Ix", "Iy", "Iz", "motors"}
 
 
 def test_a_flight_with_too_few_parts_identifies_no_inertia():
