@@ -262,7 +262,7 @@ def test_precision(tmp_path):
     most |= {"filter-error": 2.0}
     command = [sys.executable, "-m", "experiments", "precision.run", "--flights", "64", "--out", str(out)]
     options = [each for name in most for each in ("--estimators", name)]
-    environment = os.environ | how_we_compile()  # also `optimised`
+    environment = os.environ | how_we_compile()  # its level of optimisation too
     subprocess.run([*command, *options], check=True, capture_output=True, cwd=EXPERIMENTS.parent, env=environment)
     report = json.loads(out.read_text())
     rows = {(row["estimator"], row["precision"]): row for row in report["rows"]}

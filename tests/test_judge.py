@@ -288,6 +288,7 @@ def test_a_recorded_flight_does_not_end_successful_without_skill_or_against_phys
     assert any(skill is not None and skill <= 0 for skill in skills)
     assert found.result == "unidentifiable"
     assert found.verdicts["predictions"].status == "not identified"
-    # In 2.8 s of flight the cost has several minima. Rounding decides which one a search finds: then two sample times
-    # contradict each other, or the inertias are too uncertain.
-    assert {found.verdicts[name].status for name in ("Ix", "Iy")} <= {"contradicted", "not identified"}
+    # Rounding decides which minimum a search finds in 2.8 s. Besides the short flight there is another reason.
+    for name in ("Ix", "Iy"):
+        reasons = found.verdicts[name].reasons
+        assert any("depends on the sample time" in why or why.startswith("it is known to") for why in reasons)

@@ -110,17 +110,22 @@ def test_a_quantity_that_is_hardly_known_is_not_identified(monkeypatch):
 
 
 def test_parts_that_disagree_on_a_parameter_make_a_reservation_about_what_depends_on_it():
-    """The parts of one log may belong to two vehicles."""
+    """The parts of one log may belong to two vehicles. A quantity is blamed for its own parameters only."""
     model = jaxos4.FlightModel(CRAZYFLIE, terms=("offset", "damping", "lag"))
-    assert [*parts_disagree(model, {"alpha6": 2.9, "rotor_lag": 3.0})] == []
-    (issue,) = parts_disagree(model, {"alpha3": 2.9, "alpha6": 5.2, "pitch_damping": 8.93})
-    assert "alpha6, pitch_damping, by up to 8.9 times" in issue.cause
-    statuses = {name: verdict_of(name, Quantity(), [issue]).status for name in ("Ix", "Iy", "Iz", "damping", "motors")}
+    assert [*parts_disagree(model, {"alpha6": 2.9, "rotor_lag": 4.0})] == []
+    found = [*parts_disagree(model, {"alpha3": 2.9, "alpha6": 4.1, "pitch_offset": 5.0, "pitch_damping": 8.93})]
+    causes = {tuple(issue.moves): issue.cause for issue in found}
+    assert {*causes} == {("Iy",), ("Iy", "damping")}
+    own = "alpha6 (interval widened 4.1 times), pitch_offset (interval widened 5.0 times): the vehicle changed"
+    assert causes["Iy",].startswith(f"parts of the flight disagree on {own}")
+    assert "on pitch_damping (interval widened 8.9 times):" in causes["Iy", "damping"]
+    statuses = {name: verdict_of(name, Quantity(), found).status for name in ("Ix", "Iy", "Iz", "damping", "motors")}
     assert statuses == dict.fromkeys(statuses, IDENTIFIED) | dict.fromkeys(("Iy", "damping"), RESERVED)
-    assert issue.remedy == "fit parts of the flight by `begin` and `end`"
+    assert {issue.remedy for issue in found} == {"fit parts of the flight with `begin` and `end`, and compare them"}
     (issue,) = parts_disagree(model, {"rotor_lag": 8.0}, logs=2)
-    assert issue.remedy == "fit the logs one by one"
     assert set(issue.moves) == {"Ix", "Iy", "Iz", "motors"}
+    assert issue.cause.startswith("parts of the flights disagree on rotor_lag")
+    assert issue.remedy == "fit the logs one by one"
 
 
 def test_a_flight_with_too_few_parts_identifies_no_inertia():
@@ -268,6 +273,11 @@ def test_yaw_that_is_not_identified_does_not_refuse_the_other_axes(fitted):
     assert {*written["verdicts"]} > {"Ix", "Iy", "Iz", "thrust", "motors", "center of mass", "damping", "predictions"}
     assert written["verdicts"]["Iz"]["status"] == MISSING
     assert all(set(issue) == {"result", "cause", "remedy", "moves"} for issue in written["doubts"])
+
+
+def test_an_answer_with_a_much_wider_interval_has_a_reservation(fitted):
+    found = judge_vehicle(dataclasses.replace(fitted, widened={"alpha3": 9.0}), (), "filter-error")
+    assert any("disagree on alpha3 (interval widened 9.0 times)" in why for why in found.verdicts["Ix"].reasons)
 
 
 def test_the_gain_of_the_thrust_has_the_error_of_the_accelerometers_scale(fitted):

@@ -3,7 +3,7 @@
 The covariance of a search assumes that the model is right and the cost quadratic. Standard deviations are therefore
 multiplied by two factors, which are at least 1:
 
-- **jackknife**: if parts of the flights give different answers, the model lacks an effect.
+- **jackknife**: if parts of the flights give different answers, the model lacks an effect, or the vehicle changed.
 - **profile**: under a controller, strength and time constant of the disturbance can compensate for a wrong alpha, so
   the cost is flat above an alpha that came out too small. The profile needs no covariance: a 95 % interval ends where
   the cost, minimised over all other unknowns, has risen by 1.96^2/2. Only the upper ends for poorly known moments of

@@ -37,8 +37,8 @@ from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_B
 MIN_SECONDS = 10.0
 VIBRATION = 0.4  # if innovations correlate more, filter error is biased by more than its intervals say
 MAX_SAMPLE = 0.008  # s; longer samples would hide the motion along with the vibration
-# A parameter whose interval is widened by a larger factor makes a reservation. Of 107 simulated flights of one vehicle,
-# none has a factor above 2; a log of two vehicles has 9, and logs of real vehicles have 3 to 6.
+# A parameter whose interval is widened by a larger factor makes a reservation. In 107 simulated logs, each of a single
+# vehicle, no factor exceeds 2; a log of two vehicles has 9, and some real logs have 3 to 6.
 DISAGREE = 4.0
 NO_SKILL = 2.0  # standard errors; an inertia is not identified if the skill at the shortest horizon is so far below 0
 _NOT_LOWEST = (
@@ -171,17 +171,19 @@ def parts_disagree(model: AbstractModel, widened: Mapping[str, float], logs: int
 
     `widened`: see `VehicleAnswer`. `logs`: how many were fitted together.
     """
-    far = {name: factor for name, factor in widened.items() if factor > DISAGREE}
-    if far:
-        flights, remedy = "flight", "fit parts of the flight by `begin` and `end`"
-        if logs > 1:
-            flights, remedy = "flights", "fit the logs one by one"
+    remedy = "fit parts of the flight with `begin` and `end`, and compare them"
+    concerned: dict[tuple[str, ...], list[str]] = {}
+    for name, factor in widened.items():
+        if factor > DISAGREE:
+            said = f"{name} (interval widened {factor:.1f} times)"
+            concerned.setdefault(model_quantities(model, name), []).append(said)
+    for quantities, said in concerned.items():
         yield Issue(
             RESERVATION,
-            f"parts of the {flights} disagree on {', '.join(far)}, by up to {max(far.values()):.1f} times what chance "
-            "allows: the vehicle changed, or the model lacks an effect",
-            remedy,
-            dict.fromkeys(quantity for name in far for quantity in model_quantities(model, name)),
+            f"parts of the flight{'s' * (logs > 1)} disagree on {', '.join(said)}: the vehicle changed, or the model "
+            "lacks an effect",
+            "fit the logs one by one" if logs > 1 else remedy,
+            dict.fromkeys(quantities),
         )
 
 

@@ -84,9 +84,11 @@ def warning_lines(found: Identification) -> list[str]:
     widened = found.widened if isinstance(found, VehicleIdentification) else {}
     wide = {name: factor for name, factor in widened.items() if factor > _WIDENED}
     factors = dict.fromkeys(f"{pick(wide.values(), default=1.0):.1f}" for pick in (min, max))
-    flights, other = ("flights", ", or the flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "")
+    flights, other = (
+        ("flights", "flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "vehicle changed")
+    )
     said = f"warning: parts of the {flights} disagree, so that intervals were widened {' to '.join(factors)} times: "
-    lacking = f"{said}{', '.join(wide)}. The model lacks an effect{other}."
+    lacking = f"{said}{', '.join(wide)}. The model lacks an effect, or the {other}."
     return [*reason_lines(found.verdicts, found.issues), *[lacking] * bool(wide)]
 
 

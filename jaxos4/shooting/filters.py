@@ -131,7 +131,7 @@ class _Row(NamedTuple):
 def innovations_at(
     functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point
 ) -> Innovations:
-    """The innovations of all segments; see `innovate`.
+    """The innovations of all segments; see `filter_lanes.innovate`.
 
     `functions` act on all segments. Arrays in `at` may have segments as last axis.
     """
