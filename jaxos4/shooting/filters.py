@@ -131,10 +131,7 @@ class _Row(NamedTuple):
 def innovations_at(
     functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point
 ) -> Innovations:
-    """The innovations of all segments; see `filter_lanes.innovate`.
-
-    `functions` act on all segments. Arrays in `at` may have segments as last axis.
-    """
+    """See `filter_lanes.innovate`. `functions` act on all segments. Arrays in `at` may have segments as last axis."""
     (count, *own), (time, channels, segments) = at.parameters.shape, flight.measured.shape
     driving = count + len(jax.tree.leaves((at.noise, at.input_gains)))  # the unknowns that change the estimates
     unknowns, levels = driving + len(at.feedthrough), slice(count, count + len(jax.tree.leaves(at.noise)))
