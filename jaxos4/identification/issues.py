@@ -171,7 +171,9 @@ def parts_disagree(model: AbstractModel, widened: Mapping[str, float], logs: int
 
     `widened`: see `VehicleAnswer`. `logs`: how many were fitted together.
     """
-    remedy = "fit parts of the flight with `begin` and `end`, and compare them"
+    flights, remedy = "flight", "fit parts of the flight with `begin` and `end`, and compare them"
+    if logs > 1:
+        flights, remedy = "flights", "fit the logs one by one"
     concerned: dict[tuple[str, ...], list[str]] = {}
     for name, factor in widened.items():
         if factor > DISAGREE:
@@ -180,9 +182,8 @@ def parts_disagree(model: AbstractModel, widened: Mapping[str, float], logs: int
     for quantities, said in concerned.items():
         yield Issue(
             RESERVATION,
-            f"parts of the flight{'s' * (logs > 1)} disagree on {', '.join(said)}: the vehicle changed, or the model "
-            "lacks an effect",
-            "fit the logs one by one" if logs > 1 else remedy,
+            f"parts of the {flights} disagree on {', '.join(said)}: the vehicle changed, or the model lacks an effect",
+            remedy,
             dict.fromkeys(quantities),
         )
 

@@ -10,7 +10,12 @@ import numpy as np
 from jaxtyping import Array
 
 from ..batching import with_batch
-from .filters import Functions, Innovations, Point, Segmented, innovations_at
+from ..models.state import Forcing, State
+from .filters import Innovations, Point, Scalars, Segmented, innovations_at
+
+Move = Callable[[State, Forcing, Scalars], State]
+Observe = Callable[[State, Forcing, Scalars], Scalars]
+Functions = tuple[Move, Move, Observe]
 
 
 def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
@@ -30,12 +35,12 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
     (moving, _, flight, at), (fixed, positions, fixed_flight, fixed_at) = many, shared
     segments = eqx.combine(flight, fixed_flight).measured.shape[-1]
 
-    def lanes_before_last(one: Any, same: Any) -> Any:
+    def one_after_the_other(one: Any, same: Any) -> Any:
+        """The segments or samples of the first lane, then those of the next, along the last axis."""
         one = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2), one)
-        same = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], lanes, segments)), same
-        )
-        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes * segments), eqx.combine(one, same))
+        same = jax.tree.map(lambda leaf: jnp.repeat(leaf[..., None, :], lanes, -2), same)
+        joined = eqx.combine(one, same)
+        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes * leaf.shape[-1]), joined)
 
     def repeated(leaf: Array) -> Array:
         return jnp.repeat(leaf, segments, axis=0)
@@ -44,7 +49,7 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
         """Values in each segment, from values common to a lane or of each segment."""
         one = jax.tree.map(lambda leaf: leaf if leaf.ndim > 2 else jnp.repeat(leaf[..., None], segments, 2), one)
         same = jax.tree.map(lambda leaf: leaf if leaf.ndim > 1 else jnp.repeat(leaf[:, None], segments, 1), same)
-        return lanes_before_last(one, same)
+        return one_after_the_other(one, same)
 
     own = jax.tree.map(repeated, moving)
 
@@ -54,24 +59,13 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
 
         return function
 
-    def one_after_the_other(one: Any, same: Any) -> Any:
-        """The samples of the first lane, then those of the next, along the last axis."""
-        same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), same)
-        joined = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2), eqx.combine(one, same))
-        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], -1), joined)
-
     rows = fixed_flight.rows if flight.rows is None else flight.rows.max()  # surplus rows of shorter lanes do not count
-    without_segments = dict.fromkeys(("forcing", "forcing_tangents", "rows", "dt", "window"))
-    series = lanes_before_last(*(part._replace(**without_segments) for part in (flight, fixed_flight)))
-    forced = [(part.forcing, part.forcing_tangents) for part in (flight, fixed_flight)]
-    forcing, tangents = one_after_the_other(*forced)
+    series = one_after_the_other(*(part._replace(rows=None, dt=None, window=None) for part in (flight, fixed_flight)))
     # The first sample of the lane of each segment.
-    first = np.repeat(np.arange(lanes) * (forcing.roll.shape[0] // lanes), segments)
+    first = np.repeat(np.arange(lanes) * (series.forcing.roll.shape[0] // lanes), segments)
     own_step, fixed_step = (flight.dt, flight.window), (fixed_flight.dt, fixed_flight.window)
     dt, window = eqx.combine(jax.tree.map(repeated, own_step), fixed_step)
-    flight = series._replace(
-        place=series.place + first, forcing=forcing, forcing_tangents=tangents, rows=rows, dt=dt, window=window
-    )
+    flight = series._replace(place=series.place + first, rows=rows, dt=dt, window=window)
     functions = each(0), each(1), each(2)
     found = innovations_at(functions, positions, flight, in_each_segment(at, fixed_at))
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)

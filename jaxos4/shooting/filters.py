@@ -36,9 +36,6 @@ from .gains import (
 from .scans import FASTEST
 
 Scalars = tuple[Float[Array, "*#segments"], ...]
-Move = Callable[[State, Forcing, Scalars], State]
-Observe = Callable[[State, Forcing, Scalars], Scalars]
-Functions = tuple[Move, Move, Observe]
 
 BLOCK = 32
 """The number of rows that are filtered before their likelihood is summed."""
