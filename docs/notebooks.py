@@ -17,6 +17,9 @@ from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 
+from jaxos4._xla import add_flags
+
+add_flags(quick=True, brief=True)  # before JAX computes: tutorials compile for longer than they compute
 TUTORIALS = Path(__file__).resolve().parent / "tutorials"
 
 

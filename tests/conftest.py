@@ -86,7 +86,7 @@ def pytest_collection_finish() -> None:
     """Tracing makes few cycles and much else: the garbage collector comes rarely, and skips what was imported."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(10_000, 20, 20)
+    gc.set_threshold(200_000, 10, 10)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -326,8 +326,8 @@ def test_robust_intervals():
 def test_times_of_commands(monkeypatch):
     monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
     main_of("speed.commands")(repeats=1, commands=["simulate --help"])
-    ((command, cold, again),) = RECORDER.tables[-1].rows
-    assert command == "jaxos4 simulate --help"
+    unit, (command, cold, again) = RECORDER.tables[-1].rows
+    assert (unit[0], command) == ("import jax", "jaxos4 simulate --help")
     assert 0 < float(cold)
     assert again.count(again.split()[0]) == 3  # one run: median, least and most are one number
     with pytest.raises(SystemExit, match="missing.csv"):

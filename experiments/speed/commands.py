@@ -1,6 +1,7 @@
 """How long do whole commands take, with an empty cache of compiled programs, and once more?
 
-Each command runs in a process of its own, as a user runs it. `--flights` adds a log of a real vehicle.
+Each command runs in a process of its own, as a user runs it. `import jax` shows how fast the machine is. `--flights`
+adds a log of a real vehicle.
 """
 
 import os
@@ -36,16 +37,16 @@ COMMANDS = (
 )
 
 
-def seconds_of(command: str, folder: Path, cache: Path) -> float:
-    """The wall time of a command. Ends the script if the command fails by an exception or a user's mistake."""
+def seconds_of(arguments: str, folder: Path, cache: Path) -> float:
+    """The wall time of `python ARGUMENTS`. Ends the script if it fails by an exception or a user's mistake."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
     begin = time.perf_counter()
     ended = subprocess.run(
-        [sys.executable, "-m", "jaxos4", *shlex.split(command)],
+        [sys.executable, *shlex.split(arguments)],
         cwd=folder, env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
     if ended.returncode > 1:
-        raise SystemExit(f"jaxos4 {command}: {ended.stderr}")
+        raise SystemExit(f"python {arguments}: {ended.stderr}")
     return time.perf_counter() - begin
 
 
@@ -62,13 +63,14 @@ def main(repeats: int = 3, commands: list[str] = COMMANDS, flights: Flights = No
             (folder / REAL).symlink_to(real.resolve())
         for name, command in PREPARED.items():
             if any(name in each.split() for each in chosen):
-                seconds_of(command, folder, folder / "prepared")
-        for number, command in enumerate(chosen):
+                seconds_of(f"-m jaxos4 {command}", folder, folder / "prepared")
+        timed = {"import jax": "-c 'import jax'"} | {f"jaxos4 {each}": f"-m jaxos4 {each}" for each in chosen}
+        for number, (name, arguments) in enumerate(timed.items()):
             cache = folder / f"cache{number}"
-            cold = seconds_of(command, folder, cache)
-            again = [seconds_of(command, folder, cache) for _ in range(repeats)]
+            cold = seconds_of(arguments, folder, cache)
+            again = [seconds_of(arguments, folder, cache) for _ in range(repeats)]
             spread = f"{statistics.median(again):.1f} ({min(again):.1f} to {max(again):.1f})"
-            yield f"jaxos4 {command}", f"{cold:.1f}", spread
+            yield name, f"{cold:.1f}", spread
 
     with tempfile.TemporaryDirectory() as folder:
         headings = "command", "cold [s]", "again [s]"

@@ -1,5 +1,6 @@
-"""How a command prepares JAX: precision, how loops compile, threads of OpenBLAS, where compiled programs are kept."""
+"""How a command prepares JAX: precision, how loops compile, threads, garbage, where compiled programs are kept."""
 
+import gc
 import os
 import stat
 import tempfile
@@ -24,6 +25,8 @@ def prepare(*, batch: bool) -> None:
         add_flags(quick=True)
     # Matrices have at most some hundred columns: threads of OpenBLAS would wait for longer than they compute.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Tracing makes many objects and few cycles: to look for cycles took a tenth of a command's time.
+    gc.set_threshold(200_000, 10, 10)
 
     import jax
 
