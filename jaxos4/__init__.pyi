@@ -60,6 +60,7 @@ from .analysis.inertia import (
     fit_inertia as fit_inertia,
 )
 from .analysis.prediction import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
+from .batching import on_all_cores as on_all_cores
 from .bracket import Bracket as Bracket
 from .closed_loop import (
     Air as Air,
@@ -130,6 +131,5 @@ from .shooting import (
     InnovationsProblem as InnovationsProblem,
     ShootingProblem as ShootingProblem,
     Unknowns as Unknowns,
-    on_all_cores as on_all_cores,
 )
 from .simulation import simulate as simulate

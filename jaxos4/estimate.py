@@ -12,10 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar
+from .batching import in_blocks
 from .bracket import NO_PRIOR, Bracket
 from .linalg import invert
 from .results import RESULTS
-from .shooting import AbstractProblem, Parts, ShootingProblem, in_blocks
+from .shooting import AbstractProblem, Parts, ShootingProblem
 
 REACH = 4.0  # how many half-widths an answer may lie away from the center of its bracket
 # Gauss-Newton steps to an initial state, with the parameters known: the trajectory is nearly linear in that state.

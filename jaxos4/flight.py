@@ -110,8 +110,8 @@ _STATES = Signal((len(STATE_NAMES),), dict(zip(STATE_NAMES, STATE_UNITS, strict=
 class Flight(eqx.Module):
     """A recorded or simulated flight on a uniform time grid. A new signal is a field here and in `Recording`.
 
-    Its unit must be in `jaxos4.logs.values`. `report.log_figures` says where it is drawn. A signal that
-    fits compare has names in `CHANNEL_NAMES` too.
+    Its unit must be in `jaxos4.logs.values`. `report.log_figures` says where it is drawn. Fits compare
+    states and specific force only (`CHANNEL_NAMES`).
 
     - `time`: sample times [s], uniform.
     - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing. Unless

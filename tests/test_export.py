@@ -11,7 +11,7 @@ from synthetic_results import AIRFRAME, VALUES, held, provenance, vehicle_result
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table
 from jaxos4.errors import InputError
-from jaxos4.export import TARGETS, export_vehicle, read_result
+from jaxos4.export import TARGETS, export_vehicle, found_loop, read_result
 from jaxos4.export.vehicle import CARRIED, rigid_vehicle
 
 
@@ -80,6 +80,11 @@ def test_a_design_flies_the_vehicle_that_was_found(run, write, tmp_path, monkeyp
     assert (found.logged, float(changed.rotor_lag)) == ("commands", 0.1)
     np.testing.assert_allclose(changed.gust, [1.0, 1.0, 1.0])
     refused(run("design", "found.json", "--airframe", "x500", "--out", "r.csv"), "--airframe: found.json has its own")
+
+
+def test_an_estimate_beyond_what_a_motor_can_be_flies_at_the_limit(write):
+    loop = found_loop(write(vehicle_result(VALUES | {"motor_braking": 1.1, "thrust_curve": 1.3})))
+    assert (float(loop.motor_braking), float(loop.thrust_curve)) == (1.0, 1.2)
 
 
 def test_what_a_simulator_lacks_and_what_is_replaced_or_does_not_vary_is_noted(write):

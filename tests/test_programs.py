@@ -11,7 +11,8 @@ import pytest
 from helpers import compiled_programs, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.shooting import for_threads, padded
+from jaxos4.batching import for_threads
+from jaxos4.shooting import padded
 
 PROGRAMS = ["jit(__call__)", "jit(_default)", "jit(_fly)", "jit(_intervals)"]
 """The search, the default bracket, the simulation with all derivatives, the intervals."""
@@ -88,6 +89,13 @@ def test_padding_changes_no_result(channels):
     np.testing.assert_allclose(cost, own_cost, rtol=1e-12)
     np.testing.assert_allclose(residuals[:501], own, rtol=1e-9)
     assert not residuals[501:].any()
+
+
+def test_padding_makes_no_flight_long():
+    """Output error begins a long flight with a part of it."""
+    problem = standard_problem(channels="rates")
+    found, again = (jaxos4.OutputError()(p) for p in (problem, padded(problem)))
+    assert int(found.rollouts) == int(again.rollouts)
 
 
 @pytest.mark.skipif("small_while_loop" not in os.environ["XLA_FLAGS"], reason="XLA_FLAGS are the user's own")

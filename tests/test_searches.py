@@ -195,6 +195,13 @@ def test_a_minimum_beyond_the_reach_is_reported(name):
     assert names(found) == "at_bound"
 
 
+def test_a_colony_searches_as_far_as_it_is_told():
+    problem = squares(quadratic, center=MINIMUM + [1.2, 0.0], half_width=0.2)
+    found = jaxos4.AntColony(reach=8.0)(problem)
+    assert names(found) == "successful"
+    assert (np.abs(found.parameters - MINIMUM) <= 0.05 * found.std).all()
+
+
 @every_solver
 def test_a_held_unknown_needs_neither_a_start_nor_a_bracket(name):
     """A start elsewhere does not move it, and its bracket may be empty."""

@@ -292,8 +292,8 @@ def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     row = ParameterEstimate(1.0, 0.1, 0.1, (0.8, 1.2), "1", "", bracket=(2.0, 3.0))
     table = dict.fromkeys(("alpha3", "alpha6", "alpha8", "thrust_gain", "rotor_delay"), row)
     constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy", "Iz")}
-    found = identified_vehicle(parameters=table, rigid_body=RigidBody(constants), skill=None)
-    found = vehicle_quantities(fitted, found, [])
+    rows = identified_vehicle(parameters=table, rigid_body=RigidBody(constants), skill=None)
+    found = vehicle_quantities(fitted, rows, [])
     wider = [each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations if "wider" in each]
     assert wider == [
         "Ix is 2.5 times the guess; check `mass` and `rotor_positions`, or give a wider `bracket`",
@@ -301,6 +301,10 @@ def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
         "thrust_gain is outside its bracket; check the airframe, or give a wider `bracket`",
         "rotor_delay is outside its bracket; give a wider `bracket`",
     ]
+    place = fitted.problem.model.parameter_names.index("thrust_gain")
+    stronger = eqx.tree_at(lambda e: e.parameters, fitted.estimate, fitted.estimate.parameters.at[place].set(2.0))
+    other = vehicle_quantities(dataclasses.replace(fitted, estimate=stronger), rows, [])
+    assert other["Ix"].reservations[0].startswith("Ix is 5 times the guess")
 
 
 def without_the_strongest_thrust(flight):

@@ -13,10 +13,13 @@ import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.excitation import doublet, multisine
 from jaxos4.flight import ANGLES, RATES
+from jaxos4.identification.data import silent
 from jaxos4.identification.issues_of_values import issues_of_alphas
+from jaxos4.identification.prepare_os4 import prepare_os4
 from jaxos4.identification.results import Constant, ParameterEstimate, RigidBody
 from jaxos4.identification.tables import physical_quantities
 from jaxos4.identification.verdict import CONTRADICTED, IDENTIFIED, RESERVED
+from jaxos4.recording import Recording
 
 
 def drawn(number):
@@ -102,6 +105,21 @@ def test_a_fault_of_the_log_contradicts_alphas_of_no_rigid_body(fault, channels)
     assert set(found.to_dict()["verdicts"]) == {*found.parameters, "rigid body"}
     if fault == "rates halved":
         assert "the attitude turns 2 times as much as the gyro says" in found.verdicts["alpha3"].reasons[0]
+
+
+def test_a_wrong_attitude_is_a_note_if_the_rates_alone_are_fitted():
+    flight = standard_flight(duration=10.0)
+    states = np.asarray(flight.states).copy()
+    states[:, ANGLES] *= 1.3
+    recording = Recording.of(dataclasses.replace(flight, states=states), "flight")
+    judged = {}
+    for channels in ("all", "rates"):
+        data, *_ = prepare_os4(
+            (recording,), jaxos4.PublishedOS4(), jaxos4.OS4Settings(channels=channels), estimator=None, bracket=None,
+            network=None, validate=None, seed=0, progress=silent,
+        )  # fmt: skip
+        judged[channels] = [each.name for each in data.findings], any("attitude" in x for x in data.provenance.notes)
+    assert judged == {"all": (["attitude_scale"], False), "rates": ([], True)}
 
 
 def test_alphas_that_no_rigid_body_has_are_named_without_an_attitude():

@@ -4,7 +4,7 @@ import importlib.util
 from typing import Any, NamedTuple
 
 from experiments.benchmarks.opponents.in_c import COMPILERS, compiler
-from jaxos4.shooting import cores
+from jaxos4.batching import cores
 
 REFERENCE_FIT = "CasADi, single shooting, compiled"
 BEST_FIT = "C, Levenberg-Marquardt"

@@ -91,7 +91,7 @@ class AntColony(AbstractSolver[Colony]):
         along = (points[:, None, :] * basis).sum(axis=-1)
         distances = jnp.abs(along - along[chosen][:, None]).sum(axis=1) / (self.archive - 1)
         steps = self.xi * distances * jax.random.normal(step_key, distances.shape, dtype=float)
-        new = jnp.clip(points[chosen] + (steps[:, :, None] * basis).sum(axis=1), -REACH, REACH)
+        new = jnp.clip(points[chosen] + (steps[:, :, None] * basis).sum(axis=1), -self.reach, self.reach)
         points = jnp.concatenate([points, new])
         costs = jnp.concatenate([state.costs, self._shoot(stage, state.start, new)])
         return Colony(*self._best(points, costs), state.start, state.sweeps + 1)

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric, Scalar
+from ..batching import in_blocks
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
 from ..results import RESULTS
-from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem, in_blocks
+from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem
 from .ibss import IBSS
 from .solver import solve
 

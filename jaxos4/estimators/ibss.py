@@ -64,7 +64,7 @@ class Directions(NamedTuple):
     def at(cls, stage: Stage, unknowns: WindowUnknowns, model: LocalModel, reach: Scalar) -> "Directions":
         """The directions at some unknowns, with limits `reach` half-widths from the center.
 
-        The bracket of the parameters counts as weak prior information, so that every direction has some.
+        Every direction needs some information. Where the cost has no prior, the bracket counts as a weak one.
         """
         limits, count, windows = stage.limits(reach), stage.unknowns.count, len(unknowns)
         of_bracket, of_stride = 1 / jnp.square(stage.off / 2), _DAMPING / jnp.square(stage.unknowns.stride)

@@ -148,11 +148,9 @@ class LevenbergMarquardt(AbstractSolver[State]):
 
     def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
         """The best unknowns. A shot counts as one rollout for itself, and one for each of its tangents."""
-        (windows, _), count = state.best.shape, stage.unknowns.count
-        tangents = count + windows * stage.searched[count:].sum()
         steps = jnp.maximum(state.shots - 1, 0)  # a search that is skipped makes no shot
         done = state.done & jnp.isfinite(state.trial).all()  # without a finite next step, no minimum was found
-        return Found(state.best, state.model, before.spread, steps, state.shots * (1 + tangents), done)
+        return Found(state.best, state.model, before.spread, steps, state.shots * (1 + stage.searched.sum()), done)
 
     def _is_small(self, stage: Stage, step: WindowUnknowns) -> Bool[Array, ""]:
         """Whether a step is so short that it ends the stage."""

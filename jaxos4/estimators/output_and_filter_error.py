@@ -9,12 +9,14 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from .._custom_types import Count, Scalar, integer, setting
+from ..batching import in_blocks
 from ..bracket import GAUSSIAN_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, as_estimate, fit_start
 from ..results import RESULTS
-from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem, in_blocks
+from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem
 from .levenberg_marquardt import LevenbergMarquardt
 from .solver import solve
 
@@ -37,7 +39,9 @@ class OutputError(AbstractEstimator):
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight. `rollouts` counts trials and tangents. Raises `ValueError` for a wrong bracket."""
-        shares = (1.0,) if problem.flight.time.size < self.long else (0.1, 1.0)
+        length = problem.length
+        samples = problem.flight.time.size if length is None or isinstance(length, Tracer) else int(length)
+        shares = (1.0,) if samples < self.long else (0.1, 1.0)
         solver = LevenbergMarquardt(step_tolerance=self.tolerance, max_steps=self.max_steps, shares=shares)
         return solver(problem, bracket)
 

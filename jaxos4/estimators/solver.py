@@ -10,10 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar
+from ..batching import in_blocks
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate, as_estimate
 from ..linalg import covariance_of_shared
-from ..shooting import AbstractProblem, LocalModel, Stage, WindowUnknowns, in_blocks
+from ..shooting import AbstractProblem, LocalModel, Stage, WindowUnknowns
 
 State = TypeVar("State")
 
@@ -23,14 +24,14 @@ class Found(NamedTuple):
 
     - `unknowns`: the best unknowns of each window. `model`: the local model of the cost there.
     - `spread`: the covariance of the unknowns of each window.
-    - `steps`, `rollouts`: of this stage alone, see `Estimate`; in `solve`, the sums over all stages.
+    - `sweeps`, `rollouts`: of this stage alone, see `Estimate`; in `solve`, the sums over all stages.
     - `done`: whether the stage ended by itself.
     """
 
     unknowns: WindowUnknowns
     model: LocalModel
     spread: Float[Array, "windows unknowns unknowns"]
-    steps: Count
+    sweeps: Count
     rollouts: Count
     done: Bool[Array, ""]
 
@@ -130,7 +131,7 @@ def solve(
         found = solver.postprocess(stage, state, before)
         found = found._replace(model=chosen(skip, before_shots(found.model), found.model), done=skip | found.done)
         is_better = (place == 0) | ~from_start | (cost_of(found.model) < cost_of(best.model))
-        total = {"steps": best.steps + found.steps, "rollouts": best.rollouts + found.rollouts}
+        total = {"sweeps": best.sweeps + found.sweeps, "rollouts": best.rollouts + found.rollouts}
         return chosen(is_better, found, best)._replace(**total)
 
     # One loop, so that the search is compiled once for all starts and stages.
@@ -143,7 +144,7 @@ def solve(
         initial_state=jnp.concatenate([problem.initial_guess.known, end.unknowns[:, shared:]], axis=1).ravel(),
         cost=end.model.cost.sum(),
         rollouts=end.rollouts,
-        sweeps=end.steps,
+        sweeps=end.sweeps,
         feasible=end.model.feasible.all(),
         done=end.done,
         reach=solver.reach,

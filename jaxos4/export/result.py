@@ -17,6 +17,7 @@ from ..errors import InputError, named, printable
 from ..flight import RATES, STATE_NAMES
 from ..identification.results import Identification, VehicleIdentification
 from ..models.flight_model import without_recording
+from ..models.terms import STEEPEST
 from ..result_file import ResultSource, vehicle_result
 from .spread import DRAG, ESTIMATE, spread_of
 from .vehicle import CARRIED, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
@@ -217,7 +218,8 @@ def _parts(file: VehicleIdentification) -> tuple[dict[str, float], list[str], li
 
 # What of the vehicle and of its motors flies in closed loop.
 _FOUND = ("inertia", "rotor_inertia", "thrust_coefficient", "drag_coefficient")
-_MOTOR = ("rotor_lag", "rotor_delay", "thrust_curve", "motor_braking")
+# With the largest value that a `ClosedLoop` takes; random errors may put an estimate beyond it.
+_MOTOR = {"rotor_lag": math.inf, "rotor_delay": math.inf, "thrust_curve": STEEPEST, "motor_braking": 1.0}
 
 
 def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:
@@ -232,7 +234,10 @@ def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:
         found.identification.airframe,
         tuple(as_constant(getattr(vehicle, name)) for name in _FOUND),
     )
-    known: dict[str, Any] = {name: found.values[name] for name in _MOTOR if found.values.get(name, 0.0) > 0}
+    values = found.values
+    known: dict[str, Any] = {
+        name: min(values[name], most) for name, most in _MOTOR.items() if values.get(name, 0.0) > 0
+    }
     if not airframe.has_full_scale:
         known = {name: value for name, value in known.items() if name.startswith("rotor_")}
     rates = [gusts[name] for name in (STATE_NAMES[column] for column in RATES) if name in gusts]

@@ -8,8 +8,8 @@ import numpy as np
 from .._custom_types import finite_or_none
 from ..analysis.evaluation import Identifiability, evaluate, identifiability
 from ..estimators import IBSS
-from ..flight import STATE_NAMES, Flight
-from ..logs import Recording, as_recordings
+from ..flight import STATE_NAMES
+from ..logs import Source, as_recording
 from ..models.abstract import AbstractModel
 from .data import Progress, silent
 from .fit import fit_os4
@@ -64,7 +64,7 @@ class FlightInformation(msgspec.Struct, frozen=True, eq=False):
 
 
 def assess(
-    flight: Flight | Recording,
+    flight: Source,
     model: AbstractModel,
     *,
     bracket: Intervals = None,
@@ -77,7 +77,7 @@ def assess(
 
     **Raises:** `InputError`, one line, for arguments and flights that cannot be used.
     """
-    (recording,) = as_recordings(flight)
+    recording = as_recording(flight, airframe=model.airframe)
     where = bracket_of(bracket, model)
     settings = OS4Settings(channels=channels, initial_state=initial_state, window=window)
     problem = os4_problem(recording, model, where, settings)

@@ -92,7 +92,12 @@ def prepare_os4(
             )
         if not kind.shoots:
             problem = problem.restrict(trained.channels).within(trained.bracket)
-    notes, held_out = recording.notes, None
+    findings, notes, held_out = [], recording.notes, None
+    for found in self_checks(recording, model.airframe, checks=KINEMATIC):
+        if found.quantities == ("attitude",) and problem.channels == "rates":  # the attitude is not fitted
+            notes = (*notes, str(found))
+        else:
+            findings.append(found)
     if validate is not None and other is not None:
         other = other.restrict(problem.channels) if other.size > problem.size else other
         if np.isnan(other.recorded()).all():
@@ -110,8 +115,7 @@ def prepare_os4(
         samples=int(problem.flight.time.shape[0]),
         network=msgspec.UNSET if trained is None else network_provenance(network, trained),
     )
-    findings = self_checks(recording, model.airframe, checks=KINEMATIC)
-    data = Data(problem, problem, provenance, held_out=held_out, findings=findings)
+    data = Data(problem, problem, provenance, held_out=held_out, findings=tuple(findings))
     return data, name, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
 
 

@@ -65,7 +65,7 @@ class Optimum(NamedTuple):
 
     @property
     def values(self) -> Float[np.ndarray, " unknowns"]:
-        """The values of all unknowns: the parameters, then the logarithms of the noise."""
+        """The values of all unknowns: the parameters, then those of the noise and the feedthroughs."""
         return np.asarray(self.estimate.parameters)
 
     @property

@@ -23,14 +23,13 @@ def of_stretches(recordings: tuple[int, ...], stretch: Int[Numeric, " samples"])
 
 
 class Grid(NamedTuple):
-    """The sample time [s], and for each sample: its recording, and the first and last sample of its stretch.
+    """The sample time [s], and for each sample: the first and last sample of its stretch.
 
     `elapsed`: the fitted time in the recording before the sample [s]. `voltage`: the battery's over `battery_voltage`.
     `are_parts`: whether the samples are parts of the flight's samples (`Flight.within`), with their mean speeds.
     """
 
     dt: Scalar
-    recording: Int[Numeric, " samples"]
     first: Int[Array, " samples"]
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]
@@ -49,7 +48,7 @@ class Grid(NamedTuple):
         recording, elapsed = of_stretches(recordings, stretch), inputs.dt * jnp.arange(samples)
         if max(recordings) > 0:
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
-        return cls(inputs.dt, recording, first, last, elapsed, voltage, are_parts)
+        return cls(inputs.dt, first, last, elapsed, voltage, are_parts)
 
 
 class Batch(NamedTuple):

@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Parameters, Scalar, as_float, integer, setting
+from ..batching import in_blocks
 from ..bracket import UNIFORM_PRIOR, Bracket
 from ..errors import check_choice, named
 from ..estimate import AbstractEstimator, Calibration, Estimate
@@ -20,7 +21,7 @@ from ..flight import STATE_NAMES
 from ..linalg import invert
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
-from ..shooting import ShootingProblem, Unknowns, in_blocks
+from ..shooting import ShootingProblem, Unknowns
 from .architecture import ARCHITECTURES, LEVELS, ErrorTable, Regressor, Scaling
 from .features import FEATURES, Coordinates, Features
 from .training import calibrate, train, untrained

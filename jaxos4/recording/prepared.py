@@ -20,7 +20,7 @@ from . import windows
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .sensor_errors import force_level, force_noise, smoothed, vibrating_rates
-from .stretches import Stretch, cut, end_of_tumble, nothing_usable
+from .stretches import FULL, Stretch, cut, end_of_tumble, nothing_usable
 from .windows import averaged, concatenate, fair_share, hold_out, whole_windows
 
 HOLDOUT = 0.25
@@ -37,7 +37,6 @@ SHORTEST, SHORTEST_OF_COMMANDS = 0.002, 0.004
 LONGEST = 0.032  # s; the longest sample at which an answer is compared with that of shorter ones
 # A given sample time becomes a multiple of the log's if that changes it by less than this share.
 WHOLE = 0.05
-FULL = 0.999  # share of full speed at which a rotor is at its limit
 OFTEN = 0.01  # a larger share of the time at this limit is noted
 
 

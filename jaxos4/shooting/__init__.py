@@ -1,6 +1,5 @@
 """The likelihoods of a flight: from unknowns to a cost with its gradient and information."""
 
-from ..batching import cores as cores, for_threads as for_threads, in_blocks as in_blocks, on_all_cores as on_all_cores
 from .abstract import (
     AbstractProblem as AbstractProblem,
     InitialGuess as InitialGuess,

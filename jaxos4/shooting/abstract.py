@@ -38,7 +38,8 @@ class Unknowns(eqx.Module):
     - `free`: whether an unknown is searched. The others are fixed at `center`.
     - `precision`: of a Gaussian prior around `center`, as the reciprocal of a variance; 0: no prior.
     - `lowest`, `highest`: the values beyond which no search may go, however wide the bracket.
-    - `stride`: the longest useful step of a search.
+    - `stride`: the scale of steps in an unknown whose information is inexact: Levenberg-Marquardt steps no further, and
+      it and IBSS damp by it. Infinite: the information is exact.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -172,8 +173,8 @@ class InitialGuess(NamedTuple):
     """Where a search starts.
 
     - `starts`: the unknowns of each window, the shared ones first; several starts if the likelihood has several maxima.
-    - `off`: how far off each start may be, as a scale for steps: half-widths of brackets, and two standard deviations
-      of the initial state.
+    - `off`: how far off each start may be, as a scale for steps: half-widths of brackets, and
+      `ShootingProblem.first_state` of the initial state.
     - `known`: the part of each window's initial state that is known, and so not among the unknowns.
     """
 

@@ -155,7 +155,7 @@ class InnovationsProblem(AbstractProblem):
     @property
     @eqx.filter_jit  # one compiled program instead of one for each operation, and traced once
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]  # derived, not stored
-        """The parameters, then the logarithms of the noise levels, in brackets from differences of measurements."""
+        """The parameters, then the noise in brackets from differences of measurements, then the feedthroughs."""
         return with_noise(self)
 
     @property

@@ -19,7 +19,7 @@ from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
-from ..simulation import along, runge_kutta
+from ..simulation import METHODS
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Stage, Stages, Unknowns, WindowUnknowns
 from .layout import each_window, windowed
 from .scans import Length, Rows, predict_window, shoot, shot_with_derivatives, with_tangents
@@ -146,11 +146,7 @@ class ShootingProblem(AbstractProblem):
             # The states of fewer channels, then the specific force.
             rows = rows._replace(measured=rows.measured[: fewer.size] + rows.measured[self.size :])
             window = shot_with_derivatives(fewer, length)
-            each = rows, unknowns[:, :count], own[:, : fewer.size]
-            if self.windows > 1:
-                model = jax.vmap(window)(*each)
-            else:  # see `each_window`
-                model = jax.tree.map(lambda leaf: leaf[None], window(*jax.tree.map(lambda leaf: leaf[0], each)))
+            model = each_window(window, rows, unknowns[:, :count], own[:, : fewer.size])
             both = searched & searched[:, None]
             return model._replace(
                 gradient=jnp.where(searched, jnp.pad(model.gradient, ((0, 0), others)), 0.0),
@@ -215,7 +211,10 @@ class ShootingProblem(AbstractProblem):
         return jnp.concatenate([repeated, self.split(initial_state)[:, : self.free_size]], axis=1)
 
     def first_state(self) -> tuple[InitialStates, InitialStates]:
-        """The known state, or each window's first measurement of each channel, or 0; and the error that it may have."""
+        """The known state, or each window's first measurement of each channel, or 0; and how far off that may be.
+
+        Three standard deviations of a measurement; more for a state that was not measured at the start.
+        """
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
@@ -341,11 +340,7 @@ class ShootingProblem(AbstractProblem):
 
     def advance(self, forcing: Forcing, state: State, parameters) -> tuple[State, tuple[Scalar, ...]]:
         """The state one sample later, down to the same level of the cascade, and the output of noise-free sensors."""
-        if self.method == "euler":
-            following = along(state, self.model.cascade(state, forcing, parameters), self.flight.dt)
-        else:
-            derivative = functools.partial(self.model.cascade, forcing=forcing, parameters=parameters)
-            following = runge_kutta(derivative, state, self.flight.dt)
+        following = METHODS[self.method](self.model, state, forcing, parameters, self.flight.dt)
         return following, self.model.observe(state, forcing, parameters)
 
     @property

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from ..analysis.evaluation import cramer_rao_bound
+from ..batching import on_all_cores
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..estimators import IBSS, Hybrid, make_estimator
@@ -26,7 +27,7 @@ from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import TrainedNetwork
 from ..noise import NOISES, SENSOR_SIGMA
 from ..results import NAMES, result_names
-from ..shooting import ShootingProblem, on_all_cores
+from ..shooting import ShootingProblem
 from ..simulation import simulate
 from .specification import Cell, Scenario, Study
 

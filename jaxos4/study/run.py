@@ -12,9 +12,9 @@ import numpy as np
 import xarray as xr
 
 from .._files import write_file, write_netcdf
+from ..batching import cores
 from ..errors import InputError, TrainingError, in_words
 from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_network
-from ..shooting import cores
 from .cell import blank_problem, key_of, run_cell, setup_of
 from .dataset import RESULTS_FILE, Store, assemble, check_store, open_store
 from .specification import Cell, Scenario, Study

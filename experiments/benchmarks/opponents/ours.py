@@ -13,9 +13,9 @@ import numpy as np
 
 import jaxos4
 from experiments.benchmarks.case import Case
+from jaxos4.batching import cores
 from jaxos4.estimators import make_estimator
 from jaxos4.models.state import unstack
-from jaxos4.shooting import cores
 
 jax.config.update("jax_enable_x64", True)
 

@@ -47,7 +47,8 @@ CHECKS: tuple[Check, ...] = (
 )
 """Each check looks for one fault in one log. A new check is one function, and one line here.
 
-`opposite_yaw` and `different_thrust` need more than the evidence of one log, and are called where a fit is prepared.
+`different_thrust` needs more than the evidence of one log, and `opposite_yaw` the stretches that are used. They are
+called where a fit or an inspection is prepared.
 """
 
 KINEMATIC: tuple[Check, ...] = (wrong_scale, wrong_axes)
