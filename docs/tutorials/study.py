@@ -92,7 +92,7 @@ for name, each in ratio.items():
     print(f"{name:20} RMSE / bound {each.min():.2f} to {each.max():.2f}")
 
 # %% [markdown]
-# The network sees the body rates alone, and their bound is up to six times as large as the
+# The network sees the body rates alone, and their bound is up to eight times as large as the
 # bound of all channels. The hybrid does not suffer from this: the network only chooses where
 # IBSS begins, and IBSS finds the optimum in all channels.
 

@@ -45,7 +45,7 @@ def seconds_of(arguments: str, folder: Path, cache: Path) -> float:
         [sys.executable, *shlex.split(arguments)],
         cwd=folder, env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
-    if ended.returncode > 1:
+    if ended.returncode > ("jaxos4" in arguments):  # whose code 1 is a verdict
         raise SystemExit(f"python {arguments}: {ended.stderr}")
     return time.perf_counter() - begin
 

@@ -147,7 +147,7 @@ class LevenbergMarquardt(AbstractSolver[State]):
         return state.done | (state.shots > self.max_steps)
 
     def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
-        """The best unknowns. A shot counts as one rollout for itself, and one for each of its tangents."""
+        """The best unknowns. A shot counts as one rollout, and one more for each unknown that is searched."""
         steps = jnp.maximum(state.shots - 1, 0)  # a search that is skipped makes no shot
         done = state.done & jnp.isfinite(state.trial).all()  # without a finite next step, no minimum was found
         return Found(state.best, state.model, before.spread, steps, state.shots * (1 + stage.searched.sum()), done)

@@ -27,7 +27,8 @@ class OutputError(AbstractEstimator):
     - `tolerance`: the search ends with a step that moves no unknown by more than this share of its half-width.
     - `max_steps`: for each stage.
     - `long`: in a flight of this many samples or more, the rates are first fitted to its first 10 %. Errors grow with
-      time, so a search on the whole flight from a wide bracket takes many short steps.
+      time, so a search on the whole flight from a wide bracket takes many short steps. Padding counts only if the
+      problem's `length` is traced.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -38,7 +39,7 @@ class OutputError(AbstractEstimator):
     long: int = eqx.field(converter=integer("long", 1, static=True), static=True, default=2000)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. `rollouts` counts trials and tangents. Raises `ValueError` for a wrong bracket."""
+        """Identifies one flight; `rollouts` counts shots and derivatives. Raises `ValueError` for a wrong bracket."""
         length = problem.length
         samples = problem.flight.time.size if length is None or isinstance(length, Tracer) else int(length)
         shares = (1.0,) if samples < self.long else (0.1, 1.0)

@@ -25,8 +25,9 @@ ESTIMATORS: "Registry[type[AbstractEstimator]]" = Registry(
         "ant-colony": "estimators.ant_colony:AntColony",
     },
 )
-"""The estimators by name, as command line, studies and figures offer them. A new estimator is one line here, or an
-entry point of another package in the group `jaxos4.estimators` that gives the class."""
+"""The estimators by name, as command line, studies and figures offer them. A new estimator is one line here
+(and in `__init__.pyi`, if its class is to be public), or an entry point of another package in the group
+`jaxos4.estimators` that gives the class."""
 
 
 def make_estimator(name: str, network: "TrainedNetwork | None" = None) -> "AbstractEstimator":

@@ -218,12 +218,15 @@ def _parts(file: VehicleIdentification) -> tuple[dict[str, float], list[str], li
 
 # What of the vehicle and of its motors flies in closed loop.
 _FOUND = ("inertia", "rotor_inertia", "thrust_coefficient", "drag_coefficient")
-# With the largest value that a `ClosedLoop` takes; random errors may put an estimate beyond it.
-_MOTOR = {"rotor_lag": math.inf, "rotor_delay": math.inf, "thrust_curve": STEEPEST, "motor_braking": 1.0}
+_TIMES = ("rotor_lag", "rotor_delay")
+# With their largest values in a `ClosedLoop`; random errors may put an estimate beyond.
+_SHAPES = {"thrust_curve": STEEPEST, "motor_braking": 1.0}
 
 
 def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:
     """The vehicle of a file of `jaxos4 estimate --out`, with its rotors, damping and gusts, and a controller.
+
+    An estimate beyond what a motor can be is moved to its limit.
 
     `settings`: of a `ClosedLoop`, instead of those that were found. Raises as `read_result` does.
     """
@@ -235,9 +238,8 @@ def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:
         tuple(as_constant(getattr(vehicle, name)) for name in _FOUND),
     )
     values = found.values
-    known: dict[str, Any] = {
-        name: min(values[name], most) for name, most in _MOTOR.items() if values.get(name, 0.0) > 0
-    }
+    known: dict[str, Any] = {name: values[name] for name in _TIMES if values.get(name, 0.0) > 0}
+    known |= {name: min(values[name], most) for name, most in _SHAPES.items() if name in values}
     if not airframe.has_full_scale:
         known = {name: value for name, value in known.items() if name.startswith("rotor_")}
     rates = [gusts[name] for name in (STATE_NAMES[column] for column in RATES) if name in gusts]

@@ -62,7 +62,7 @@ def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress:
     def search(weighted: ShootingProblem, number: int) -> Estimate:
         progress(f"fitting with the noise levels of pass {number}" if number else "compiling and fitting")
         if estimator.shoots and not estimator.needs_network:
-            weighted = padded(weighted)  # flights of other lengths then share the program
+            weighted = padded(weighted)  # flights of other lengths then share programs
         return jax.block_until_ready(estimator(weighted))
 
     estimates = [search(problem, 0)]

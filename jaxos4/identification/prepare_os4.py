@@ -94,8 +94,8 @@ def prepare_os4(
             problem = problem.restrict(trained.channels).within(trained.bracket)
     findings, notes, held_out = [], recording.notes, None
     for found in self_checks(recording, model.airframe, checks=KINEMATIC):
-        if found.quantities == ("attitude",) and problem.channels == "rates":  # the attitude is not fitted
-            notes = (*notes, str(found))
+        if found.quantities == ("attitude",) and problem.channels == "rates":
+            notes = (*notes, f"{found.cause} ({found.size}); it is not fitted")
         else:
             findings.append(found)
     if validate is not None and other is not None:

@@ -215,7 +215,7 @@ def _input_innovations(
 
 
 def _slow_signals(flight: Flight) -> list[Float[np.ndarray, " samples"]]:
-    """To these respond roll and pitch: the upright direction along x and y, and the velocity if it is known."""
+    """The signals that roll and pitch respond to: the upright direction along x and y, and the velocity if known."""
     phi, theta = np.asarray(flight.states)[:, ANGLES[:2]].T
     velocity = () if flight.body_velocity is None else np.asarray(flight.body_velocity).T
     return [-np.sin(theta), np.cos(theta) * np.sin(phi), *velocity]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
+import msgspec
 import numpy as np
 
 from ..airframe import AXES, YAW
@@ -63,13 +64,15 @@ def _too_wide(rows: dict[str, ParameterEstimate], half_widths: dict[str, float])
 def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:
     """Notes on parameters that rest on a bracket, lie outside it, or are at their limit."""
     parameters, guessed = answer.problem.model.parameters, {axis.inverse: axis.inertia for axis in AXES}
-    thrust = float(np.prod(answer.parameters[list(answer.gains)]))  # over the airframe's
+    thrust = float(np.prod(answer.parameters[answer.gains]))  # over the airframe's
     found, of_airframe = [], {each.name for each in parameters if each.scales_torque or callable(each.center)}
     for name, row in rows.items():
+        if name in guessed and row.estimate is not None and thrust > 0:
+            row = msgspec.structs.replace(row, estimate=row.estimate / thrust)  # the inertia at the airframe's thrust
         if name in answer.negative:
             found.append(f"{name} is negative, which is impossible; it is 0 here")
         elif row.is_outside_bracket() and name in guessed and row.estimate and isinstance(row.bracket, tuple):
-            ratio = thrust * sum(row.bracket) / 2 / row.estimate
+            ratio = sum(row.bracket) / 2 / row.estimate
             check = (
                 "measure `drag_coefficient`" if guessed[name] == YAW.inertia else "check `mass` and `rotor_positions`"
             )

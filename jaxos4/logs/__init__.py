@@ -1,6 +1,7 @@
 """Files of recorded flights to `Recording` and `Flight`, and back to CSV.
 
-Each log format is one file and one line in `FORMATS`, or an entry point of another package in `jaxos4.log_formats`.
+A log format is a `LogFormat` in a file here and a line in `FORMATS`, or an entry point of another package in
+`jaxos4.log_formats`.
 """
 
 import contextlib

@@ -33,13 +33,13 @@ class Unknowns(eqx.Module):
 
     - `names`, `units`: of each unknown.
     - `parameter_count`: the number of the model's parameters, which come first.
-    - `prior`: how the cost uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
+    - `prior`: how the cost uses the bracket: `NO_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
     - `center`, `half_width`: of the bracket in which each unknown is searched.
     - `free`: whether an unknown is searched. The others are fixed at `center`.
     - `precision`: of a Gaussian prior around `center`, as the reciprocal of a variance; 0: no prior.
     - `lowest`, `highest`: the values beyond which no search may go, however wide the bracket.
-    - `stride`: the scale of steps in an unknown whose information is inexact: Levenberg-Marquardt steps no further, and
-      it and IBSS damp by it. Infinite: the information is exact.
+    - `stride`: the longest step that can be trusted where the information about an unknown is inexact; infinite
+      elsewhere. Levenberg-Marquardt takes no longer step; it and IBSS also damp by it.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -173,8 +173,8 @@ class InitialGuess(NamedTuple):
     """Where a search starts.
 
     - `starts`: the unknowns of each window, the shared ones first; several starts if the likelihood has several maxima.
-    - `off`: how far off each start may be, as a scale for steps: half-widths of brackets, and
-      `ShootingProblem.first_state` of the initial state.
+    - `off`: how far off each start may be, as a scale for steps: half-widths of brackets; for an
+      initial state, the second value of `ShootingProblem.first_state`.
     - `known`: the part of each window's initial state that is known, and so not among the unknowns.
     """
 

@@ -47,8 +47,8 @@ CHECKS: tuple[Check, ...] = (
 )
 """Each check looks for one fault in one log. A new check is one function, and one line here.
 
-`different_thrust` needs more than the evidence of one log, and `opposite_yaw` the stretches that are used. They are
-called where a fit or an inspection is prepared.
+Two checks are called where a fit or an inspection is prepared: `different_thrust` compares several logs, and
+`opposite_yaw` needs to know which stretches are used.
 """
 
 KINEMATIC: tuple[Check, ...] = (wrong_scale, wrong_axes)
