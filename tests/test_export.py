@@ -83,7 +83,7 @@ def test_a_design_flies_the_vehicle_that_was_found(run, write, tmp_path, monkeyp
 
 
 def test_an_estimate_beyond_what_a_motor_can_be_flies_at_the_limit(write):
-    for braking, curve, flown in ((1.1, 1.3, (1.0, 1.2)), (0.0, 0.0, (0.0, 0.0))):
+    for braking, curve, flown in ((1.1, 1.3, (1.0, 1.2)), (0.0, 0.8, (0.0, 0.8))):
         loop = found_loop(write(vehicle_result(VALUES | {"motor_braking": braking, "thrust_curve": curve})))
         assert (float(loop.motor_braking), float(loop.thrust_curve)) == flown
 
