@@ -219,7 +219,7 @@ def _parts(file: VehicleIdentification) -> tuple[dict[str, float], list[str], li
 # What of the vehicle and of its motors flies in closed loop.
 _FOUND = ("inertia", "rotor_inertia", "thrust_coefficient", "drag_coefficient")
 _TIMES = ("rotor_lag", "rotor_delay")
-# With their largest values in a `ClosedLoop`; random errors may put an estimate beyond.
+# They need a full scale. With their largest values in a `ClosedLoop`; random errors may put an estimate beyond.
 _SHAPES = {"thrust_curve": STEEPEST, "motor_braking": 1.0}
 
 
@@ -239,9 +239,8 @@ def found_loop(path: str | os.PathLike[str], **settings: Any) -> ClosedLoop:
     )
     values = found.values
     known: dict[str, Any] = {name: values[name] for name in _TIMES if values.get(name, 0.0) > 0}
-    known |= {name: min(values[name], most) for name, most in _SHAPES.items() if name in values}
-    if not airframe.has_full_scale:
-        known = {name: value for name, value in known.items() if name.startswith("rotor_")}
+    if airframe.has_full_scale:
+        known |= {name: min(values[name], most) for name, most in _SHAPES.items() if name in values}
     rates = [gusts[name] for name in (STATE_NAMES[column] for column in RATES) if name in gusts]
     if len(rates) == 3:
         known |= {"gust": [each.strength for each in rates], "gust_time": np.mean([x.time_constant for x in rates])}

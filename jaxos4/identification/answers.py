@@ -79,6 +79,11 @@ class Answer:
         """The indices of the parameters that scale all torques."""
         return [i for i, parameter in enumerate(self.problem.model.parameters) if parameter.scales_torque]
 
+    @property
+    def thrust(self) -> float:
+        """All torques at the same motor signal, over the airframe's; 1 if no parameter scales them."""
+        return float(np.prod(self.parameters[self.gains]))
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OS4Answer(Answer):
@@ -200,10 +205,10 @@ def dominated(answer: VehicleAnswer) -> dict[str, str]:
 
 def thrust_excess(answer: Answer) -> float:
     """The share by which thrust exceeds the airframe's at the same rotor speeds; 0 if the logs do not show it."""
-    model, values = answer.problem.model, answer.parameters
+    model = answer.problem.model
     if isinstance(model, FlightModel) and follows_commands(model.terms):
         return 0.0  # a full speed that is wrong makes thrust and drag wrong by the same factor
-    return float(np.prod(values[answer.gains])) - 1
+    return answer.thrust - 1
 
 
 def drag_error(answer: Answer) -> float:

@@ -94,7 +94,7 @@ def prepare_os4(
             problem = problem.restrict(trained.channels).within(trained.bracket)
     findings, notes, held_out = [], recording.notes, None
     for found in self_checks(recording, model.airframe, checks=KINEMATIC):
-        if found.quantities == ("attitude",) and problem.channels == "rates":
+        if found.of_attitude_alone and problem.channels == "rates":
             notes = (*notes, f"{found.cause} ({found.size}); it is not fitted")
         else:
             findings.append(found)

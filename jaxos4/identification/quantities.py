@@ -64,11 +64,11 @@ def _too_wide(rows: dict[str, ParameterEstimate], half_widths: dict[str, float])
 def _notes(answer: Answer, rows: dict[str, ParameterEstimate], shares: dict[str, float]) -> tuple[str, ...]:
     """Notes on parameters that rest on a bracket, lie outside it, or are at their limit."""
     parameters, guessed = answer.problem.model.parameters, {axis.inverse: axis.inertia for axis in AXES}
-    thrust = float(np.prod(answer.parameters[answer.gains]))  # over the airframe's
     found, of_airframe = [], {each.name for each in parameters if each.scales_torque or callable(each.center)}
     for name, row in rows.items():
-        if name in guessed and row.estimate is not None and thrust > 0:
-            row = msgspec.structs.replace(row, estimate=row.estimate / thrust)  # the inertia at the airframe's thrust
+        if name in guessed and row.estimate is not None and answer.thrust > 0:
+            # An inertia is compared at the airframe's thrust.
+            row = msgspec.structs.replace(row, estimate=row.estimate / answer.thrust)
         if name in answer.negative:
             found.append(f"{name} is negative, which is impossible; it is 0 here")
         elif row.is_outside_bracket() and name in guessed and row.estimate and isinstance(row.bracket, tuple):

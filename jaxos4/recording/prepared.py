@@ -182,7 +182,7 @@ def _cleaned(
     notes, judged = [], []
     for found in filter(None, (*findings(evidence), opposite_yaw(opposite))):
         found = msgspec.structs.replace(found, cause=f"{name}: {found.cause}")
-        if {*found.quantities} & {*INERTIAS} or (found.contradicted and found.quantities != ("attitude",)):
+        if {*found.quantities} & {*INERTIAS} or (found.contradicted and not found.of_attitude_alone):
             judged.append(found)
         else:
             notes.append(str(found))

@@ -33,7 +33,7 @@ class Finding(msgspec.Struct, frozen=True):
     - `remedy`: what to do.
     - `quantities`: the quantities that the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
     - `contradicted`: whether the log contradicts these quantities. Otherwise they get a reservation if a
-      moment of inertia is among them, and else a note.
+      moment of inertia is among them, and else a note. A fault `of_attitude_alone` is a note where rates are fitted.
     """
 
     name: str
@@ -42,6 +42,11 @@ class Finding(msgspec.Struct, frozen=True):
     remedy: str
     quantities: tuple[str, ...]
     contradicted: bool = True
+
+    @property
+    def of_attitude_alone(self) -> bool:
+        """Whether it concerns the attitude alone, on which the body rates do not depend."""
+        return self.quantities == ("attitude",)
 
     def __str__(self) -> str:
         return f"{self.cause} ({self.size}); {self.remedy}"
