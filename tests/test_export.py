@@ -194,7 +194,7 @@ def test_an_inertia_that_no_rigid_body_has_is_given_on_demand_and_clamped(run, w
     for given, used in ((3e-5, 3e-5), (1e-4, ix + iy), (1e-9, abs(ix - iy))):
         found = read_result(path, inertia_z=given)
         assert found.vehicle.inertia[2] == pytest.approx(used, rel=1e-6)
-        assert not found.draw(1, seed=0)[0].impossible
+        assert not found.draw(1, seed=0)[0].fault
         (note,) = [note for note in found.notes if note.startswith("Iz: ")]
         assert note.startswith("Iz: given, not estimated")
         assert ("allows" in note) == (given != used)

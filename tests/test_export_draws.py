@@ -201,7 +201,7 @@ def test_vehicles_that_nobody_can_build_are_repeated_and_counted(write):
     result["covariance"][2][2] = ((ix + iy - iz) / iz * VALUES["alpha8"]) ** 2
     found = read_result(write(result))
     vehicles, repeated = zip(*(found.draw(number, seed=0) for number in range(draws)), strict=True)
-    assert all(not vehicle.impossible for vehicle in vehicles)
+    assert all(not vehicle.fault for vehicle in vehicles)
     outside = below + 0.0018  # and Iz below 0 or so small that Ix exceeds Iy + Iz
     assert abs(sum(repeated) - draws * outside / (1 - outside)) < 4 * np.sqrt(draws * outside) / (1 - outside)
     # A centre of mass that is uncertain by half an arm stays inside the arms, and weighs on no rotor too much.
@@ -215,8 +215,8 @@ def test_vehicles_that_nobody_can_build_are_repeated_and_counted(write):
         x = vehicle.rotor_positions[:, 0]
         assert x.min() < 0 < x.max()
     center = found.vehicle._replace(rotor_positions=found.vehicle.rotor_positions + [0.03, 0.0])
-    assert center.impossible == "the centre of mass lies outside the arms"
-    assert "drag of the rotors" in found.vehicle._replace(drag_coefficient=-1e-10).impossible
+    assert center.fault == "the centre of mass lies outside the arms"
+    assert "drag of the rotors" in found.vehicle._replace(drag_coefficient=-1e-10).fault
     result["covariance"][0][0] = 1e20  # alpha3
     with pytest.raises(jaxos4.InputError, match="too uncertain"):
         export_vehicle(read_result(write(result)), "mujoco", samples=1)

@@ -25,7 +25,7 @@ from jaxos4.recording.inspection import ASSUMED_FULL_SCALE, airframe_draft, insp
 from jaxos4.recording.motion import rotor_signs
 from jaxos4.report import print_inspection, write_log_page
 from jaxos4.report.log_figures import amplitude_density, logged
-from jaxos4.report.log_page import fitted
+from jaxos4.report.log_page import fit_note
 from jaxos4.report.timeline import thinned
 
 EVIL = "</script><script>alert(1)</script>"
@@ -215,8 +215,8 @@ def test_commands_without_full_scale_are_refused_on_the_page_as_by_the_fit():
     flight = flown(CRAZYFLIE, 0)
     commands = flight._replace(omega=flight.omega / 4e3, commanded=True)
     unknown = eqx.tree_at(lambda each: each.max_rotor_speed, CRAZYFLIE, np.asarray(np.inf))
-    assert "the rotor speed of full command is not known; set max_rotor_speed" in fitted(commands, unknown)
-    assert "would be fitted" in fitted(flight._replace(commanded=False), unknown)
+    assert "the rotor speed of full command is not known; set max_rotor_speed" in fit_note(commands, unknown)
+    assert "would be fitted" in fit_note(flight._replace(commanded=False), unknown)
 
 
 @given(samples=st.integers(1, 60), most=st.integers(4, 20))

@@ -177,7 +177,7 @@ def test_values_that_repeat_were_not_logged(tmp_path, held, rate, kind):
     assert facts.motors.rate == pytest.approx(rate, rel=0.05 if kind else 0.01)
     assert facts.gyro.rate == pytest.approx(250.0, rel=0.01)
     words = "the motors were logged at 10 Hz (the values of command1 change so often)"
-    assert (words in facts.too_slow) == bool(facts.too_slow) == (rate < 40)
+    assert (words in facts.too_slow_note) == bool(facts.too_slow_note) == (rate < 40)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -188,7 +188,7 @@ def test_commands_that_change_now_and_then_are_no_rate(save, seed):
     content = table_csv(["t", *COMMANDS, "p", "q", "r"], 0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3)))
     facts = read_recording(save(content), full_scale=1.0).facts
     assert facts.motors.rate == pytest.approx(250.0, rel=0.01)
-    assert facts.too_slow == ""
+    assert facts.too_slow_note == ""
 
 
 def slow_ulog(step):
@@ -248,7 +248,7 @@ def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, 
     assert read_log(save(kind(0.1)), CRAZYFLIE)[1][-1].startswith(words)
     fast = read_recording(save(kind(0.02)), CRAZYFLIE).facts
     assert fast.motors == Sampling(MOTORS_OF[kind], pytest.approx(50.0, rel=0.01))
-    assert fast.too_slow == ""
+    assert fast.too_slow_note == ""
 
 
 def rare_ulog():

@@ -14,7 +14,7 @@ from jaxos4.logs import read_recording, write_flight
 from jaxos4.recording import Recording, Stretch, averaged, cut
 from jaxos4.recording.checks import opposite_yaw, self_checks
 from jaxos4.recording.motion import opposite_axes as opposites, refused_note, rotor_signs
-from jaxos4.recording.prepared import at_limit, prepare
+from jaxos4.recording.prepared import prepare, saturation_note
 
 
 def opposite_axes(pieces, airframe):
@@ -98,13 +98,13 @@ def test_clocks_of_motors_and_gyro_are_compared(shift, words):
 def test_rotors_at_their_limit_are_named(shared_flights):
     limits = {"B2_circle_fast_rep2": "rotor 4 is at its limit for 10 %", "B3_figure8_fast_rep1": None}
     for name, words in limits.items():
-        said = at_limit(read_recording(shared_flights / "nanobench" / f"{name}.csv", CRAZYFLIE), CRAZYFLIE)
+        said = saturation_note(read_recording(shared_flights / "nanobench" / f"{name}.csv", CRAZYFLIE), CRAZYFLIE)
         assert said == "" if words is None else words in said
     flight = flown(CRAZYFLIE, 0)
-    assert at_limit(flight, CRAZYFLIE) == ""
+    assert saturation_note(flight, CRAZYFLIE) == ""
     omega = flight.omega.copy()
     omega[::20, 1] = 0.997 * float(CRAZYFLIE.max_rotor_speed)  # noise of a measured speed
-    assert "rotor 2 is at its limit for 5 %" in at_limit(flight._replace(omega=omega), CRAZYFLIE)
+    assert "rotor 2 is at its limit for 5 %" in saturation_note(flight._replace(omega=omega), CRAZYFLIE)
 
 
 def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():

@@ -10,7 +10,7 @@ from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.recording import Recording, read_recording, stretches
 from jaxos4.recording.motion import excitation
-from jaxos4.recording.stretches import Stretch, cut, end_of_tumble, nothing_usable
+from jaxos4.recording.stretches import Stretch, cut, end_of_tumble, unusable_note
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)
@@ -145,7 +145,7 @@ def test_the_accelerometer_tells_ground_from_flight(seed, size, gain, commanded)
         flight = Flight(time, size * command, states, force, commanded=commanded)
         found = [(part.begin, part.end) for part in usable_stretches(flight)]
         assert found == ([(0.0, pytest.approx(time[-1]))] if flying else [])
-        assert flying or "the vehicle never flew" in nothing_usable(stretches(flight))
+        assert flying or "the vehicle never flew" in unusable_note(stretches(flight))
     # A hover with constant thrust, and an accelerometer that repeats one value, prove nothing.
     assert len(usable_stretches(Flight(time, 0.5 * command, states, np.full_like(force, 9.81)))) == 1
     time, command, _ = wandering(seed, change=0.03)

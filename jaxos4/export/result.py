@@ -89,7 +89,7 @@ class Identified(NamedTuple):
             rows = mean + generator.standard_normal((_BLOCK, len(names))) @ self.root.T
             for place in np.flatnonzero((rows[:, positive] >= 0).all(axis=1)).tolist():
                 vehicle = self._made(self.values | dict(zip(names, rows[place].tolist(), strict=True)))
-                if not vehicle.impossible:
+                if not vehicle.fault:
                     return vehicle, before + place
                 impossible += 1
             if impossible >= _MAX_IMPOSSIBLE:
@@ -151,7 +151,7 @@ def read_result(found: ResultSource, *, inertia_z: float | None = None) -> Ident
         if inertia_z is not None:
             own = tuple(note for note in exported.notes if not note.startswith("Iz: "))
             exported = exported._replace(notes=(*own, _given_note(exported, inertia_z)))
-        if why := exported.vehicle.impossible:
+        if why := exported.vehicle.fault:
             guessed = inertia_z is None and not exported.identifies_iz and why.startswith(INERTIAS)
             guess = "; Iz was not identified and is a guess: give `inertia_z`" if guessed else ""
             raise InputError(

@@ -92,7 +92,7 @@ class RigidVehicle(NamedTuple):
         return np.array([self.drag[:2].mean(), self.drag[2]]) / (4 * self.hover_speed)
 
     @property
-    def impossible(self) -> str:
+    def fault(self) -> str:
         """The reason why no vehicle can be like this. Empty if there is none."""
         for name, moment in zip(INERTIAS, self.inertia, strict=True):
             if not moment > 0:

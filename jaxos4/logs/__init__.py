@@ -103,7 +103,7 @@ def read_log(
     **Raises:** `InputError`, one line: the file, the place in it, what is wrong and what to do.
     """
     found = read_recording(log, airframe, full_scale=full_scale, columns=columns)
-    return found.flight, (*found.notes, *([found.facts.too_slow] if found.facts.too_slow else []))
+    return found.flight, (*found.notes, *filter(None, (found.facts.too_slow_note,)))
 
 
 def read_recording(

@@ -52,7 +52,7 @@ class LogFacts(NamedTuple):
     format: "LogFormat | None" = None
 
     @property
-    def too_slow(self) -> str:
+    def too_slow_note(self) -> str:
         """Why the log was written too rarely to identify a vehicle, and what to do; empty if it was not."""
         every = (("the motors were", self.motors), ("the gyro was", self.gyro))
         slow = [f"{what} logged at {s.rate:.2g} Hz ({s.source})" for what, s in every if s and not fast_enough(s.rate)]

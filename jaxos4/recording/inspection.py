@@ -14,7 +14,7 @@ from ..logs import Recording
 from .checks import Evidence, Finding, findings, opposite_yaw
 from .motion import Excitation, excitation, opposite_axes, refused_note, rotor_signs
 from .prepared import finest
-from .stretches import cut, nothing_usable, stretches
+from .stretches import cut, stretches, unusable_note
 from .windows import fair_share
 
 ASSUMED_FULL_SCALE = 1000.0
@@ -77,9 +77,9 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     for stretch in evidence.every:
         excited = {} if stretch.reason else excitation(cut(evidence.recording, stretch), airframe)
         inspected.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
-    nothing = "" if evidence.usable else f"{nothing_usable(evidence.every)}; give the log of a flight"
+    nothing = "" if evidence.usable else f"{unusable_note(evidence.every)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)
-    refusals = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
+    refusals = tuple(filter(None, (nothing, recording.facts.too_slow_note, refused_note(opposite))))
     return Inspection(
         log=recording.name,
         format=recording.facts.format.name if recording.facts.format else "",
@@ -120,7 +120,7 @@ def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     """
     facts, full = recording.facts, ASSUMED_FULL_SCALE if recording.commanded else 1.0
     flown = [cut(recording, each) for each in stretches(recording) if not each.reason]
-    signs, hover = None if facts.too_slow else rotor_signs(flown), _hover(flown)
+    signs, hover = None if facts.too_slow_note else rotor_signs(flown), _hover(flown)
     forward, left, spins = signs or ((), (), None)
     spins = facts.rotor_spins or spins
     text = (

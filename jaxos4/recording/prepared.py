@@ -20,7 +20,7 @@ from . import windows
 from .checks import Evidence, Finding, different_thrust, findings, opposite_yaw
 from .motion import in_body_axes, measures_velocity, opposite_axes, refused_note, velocity_of
 from .sensor_errors import force_level, force_noise, smoothed, vibrating_rates
-from .stretches import FULL, Stretch, cut, end_of_tumble, nothing_usable
+from .stretches import FULL, Stretch, cut, end_of_tumble, unusable_note
 from .windows import averaged, concatenate, fair_share, hold_out, whole_windows
 
 HOLDOUT = 0.25
@@ -172,7 +172,7 @@ def _cleaned(
     name, facts = recording.name, recording.facts
     if np.isnan(recording.states[:, RATES]).all(axis=0).any():
         raise InputError(f"{name}: a vehicle model needs p, q and r; log the gyro.")
-    slow = (facts._replace(gyro=None) if predicted else facts).too_slow
+    slow = (facts._replace(gyro=None) if predicted else facts).too_slow_note
     usable, note = _usable(evidence, begin, end, slow, predicted=predicted)
     if slow:
         raise InputError(f"{name}: {slow}.")
@@ -186,14 +186,14 @@ def _cleaned(
             judged.append(found)
         else:
             notes.append(str(found))
-    if limited := at_limit(evidence.recording, airframe):
+    if limited := saturation_note(evidence.recording, airframe):
         notes.append(limited)
     if begin is None and (recovered := end_of_tumble(evidence.recording, airframe)) is not None:
         notes.append(f"{name}: tumbles at launch until {recovered:.1f} s (`begin` {recovered:.1f} leaves this out)")
     return usable, [*notes, *recording.named_notes, *note], judged
 
 
-def at_limit(recording: Recording, airframe: Airframe) -> str:
+def saturation_note(recording: Recording, airframe: Airframe) -> str:
     """The rotors that are often at full speed, and the remedy; empty if none is. These stretches are not used."""
     shares = (recording.omega >= FULL * float(airframe.max_rotor_speed)).mean(axis=0)
     often = [
@@ -219,7 +219,7 @@ def _usable(
     elif not parts:
         remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
         besides = f" Besides, {slow}." if slow else ""
-        raise InputError(f"{name}: {nothing_usable(evidence.every)}; {remedy}.{besides}")
+        raise InputError(f"{name}: {unusable_note(evidence.every)}; {remedy}.{besides}")
     elif refused:
         longest = sorted(refused, key=lambda stretch: -stretch.length)[:3]
         reasons = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in longest)

@@ -85,7 +85,7 @@ def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> t
     return tuple(found)
 
 
-def nothing_usable(every: Sequence[Stretch]) -> str:
+def unusable_note(every: Sequence[Stretch]) -> str:
     """Why none of these stretches can be used, in words: the longest one, with its reason."""
     longest = max(every, key=lambda stretch: stretch.length)
     no_flight = (ON_GROUND, IDLE, "less than", LOST)

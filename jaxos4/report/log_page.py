@@ -138,7 +138,7 @@ def _signals(recording: Recording, airframe: Airframe | None, found: Inspection)
     if block > 1:
         blocks = f"{plain(1e3 * recording.dt * block)} ms"
         caption += f" Signals are drawn by their least and largest values in blocks of {blocks}."
-    return [signals(drawn, caption, names_part=True), text(fitted(recording, airframe), id="fitted")]
+    return [signals(drawn, caption, names_part=True), text(fit_note(recording, airframe), id="fitted")]
 
 
 def _checks(found: Inspection) -> list[Markup]:
@@ -215,7 +215,7 @@ def verdict(found: Inspection) -> str:
     return f"{seconds:.1f} of {found.end - found.begin:.1f} s can be used, in {parts}; excitation: {axes}."
 
 
-def fitted(recording: Recording, airframe: Airframe | None) -> str:
+def fit_note(recording: Recording, airframe: Airframe | None) -> str:
     """The parts that `jaxos4 estimate` would fit and hold out, in words."""
     if airframe is None:
         return "Give --airframe to see here what would be fitted, and what held out."
