@@ -1,8 +1,8 @@
-"""Errors that the user can fix. The message says in one line what is wrong, where, and what to do."""
+"""Errors that the user can fix, and the words of messages: in one line what is wrong, where, and what to do."""
 
 import contextlib
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 
 class InputError(ValueError):
@@ -33,6 +33,22 @@ def printable(text: str) -> str:
 def shortened(text: str, most: int) -> str:
     """The text, cut to `most` characters with "..." at its end if it is longer."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def quoted(text: str) -> str:
+    """`text` in quotes, on one line, with at most 40 characters."""
+    return repr(shortened(text, 40))
+
+
+def listed(names: Iterable[str], most: int = 20) -> str:
+    """The first names in quotes."""
+    every = [*names]
+    return ", ".join(map(quoted, every[:most])) + ", ..." * (len(every) > most)
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 gap`, or `2 gaps`."""
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def percent(share: float, digits: int = 2) -> str:

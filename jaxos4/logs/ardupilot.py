@@ -8,11 +8,12 @@ import array
 
 import numpy as np
 
+from ..errors import counted
 from ..flight import ANGLE_NAMES, FORCE_NAMES, RATE_NAMES
 from ..rotations import HALF_TURN
 from .messages import Fields, Messages, Rotors, motor_order, records
 from .sampling import Series, logged_rate
-from .table import LogFormat, LogPath, Table, counted, fast_enough, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, fast_enough, read_bytes, refuse
 from .values import DEGREE, RPM
 
 _HEAD, _FMT, _FMT_LENGTH = b"\xa3\x95", 0x80, 89

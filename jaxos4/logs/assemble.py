@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..airframe import Airframe
-from ..errors import printable
+from ..errors import counted, listed, printable
 from ..flight import COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SIGNALS, SPEED_NAMES, STATE_NAMES, last_measured
 from .sampling import UNIFORM, grid_size, held_regularly, logged_rate, resample, unwrap
-from .table import MAX_ROWS, Recording, Sampling, Table, counted, listed, signals_of
+from .table import MAX_ROWS, Recording, Sampling, Table, signals_of
 from .values import COLUMNS, PITCH, without_impossible
 
 

@@ -15,12 +15,13 @@ import struct
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
+from ..errors import counted
 from ..flight import ANGLE_NAMES, COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SPEED_NAMES
 from ..rotations import HALF_TURN, euler_angles
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
 from .sampling import in_order
-from .table import LogFormat, LogPath, Table, counted, items, opened, order_note, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, items, opened, order_note, read_bytes, refuse
 from .values import DEGREE, RPM
 
 _MAGIC = b"H Product:Blackbox"

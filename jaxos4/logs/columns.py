@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import check_plain, read_toml
+from ..errors import listed, quoted
 from ..flight import ANGLE_NAMES, SIGNALS, SPEED_NAMES
 from ..rotations import euler_angles
-from .table import LogPath, Table, listed, quoted, refuse
+from .table import LogPath, Table, refuse
 from .values import COLUMNS, PWM, PWM_ZERO, ColumnLimits
 
 ColumnsGiven = LogPath | Mapping[str, Any] | None

@@ -10,10 +10,11 @@ import zlib
 import numpy as np
 
 from ..airframe import STANDARD_GRAVITY
+from ..errors import counted, quoted
 from ..flight import ANGLE_NAMES, COMMAND_NAMES, FORCE_NAMES, RATE_NAMES, SPEED_NAMES
 from .messages import Fields, Messages, Rotors, records
 from .sampling import Series
-from .table import LogFormat, LogPath, Table, counted, quoted, read_bytes, refuse
+from .table import LogFormat, LogPath, Table, read_bytes, refuse
 from .values import DEGREE, RPM
 
 _MAGIC = b"\xbc"

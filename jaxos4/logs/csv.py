@@ -11,9 +11,10 @@ import numpy as np
 
 from .._files import write_atomically
 from ..airframe import Airframe
+from ..errors import counted, quoted
 from ..flight import COMMAND_NAMES, SPEED_NAMES, Flight
 from .columns import ColumnMap, column_map, mapped_rows
-from .table import MAX_ROWS, LogFormat, LogPath, Recording, Table, counted, opened, quoted, refuse
+from .table import MAX_ROWS, LogFormat, LogPath, Recording, Table, opened, refuse
 from .values import COLUMNS
 
 LINES_AT_ONCE = 10_000  # for the memory; it changes no number

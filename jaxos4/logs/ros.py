@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from .._files import reading
-from ..errors import shortened
+from ..errors import listed, quoted, shortened
 from ..flight import ANGLE_NAMES, COMMAND_NAMES, RATE_NAMES, SPEED_NAMES
 from ..rotations import euler_angles
 from .columns import QUATERNION, ColumnMap, column_map, presets
 from .compression import check_part, check_sizes
 from .messages import Fields, Messages, Rotors
 from .sampling import Series
-from .table import MAX_ROWS, LogFormat, LogPath, Table, listed, opened, quoted, refuse
+from .table import MAX_ROWS, LogFormat, LogPath, Table, opened, refuse
 
 _ROS1, _MCAP, _SQLITE, _FOLDER = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"rosbag2_bagfile_information:"
 _TYPE = re.compile(r"\w+(/\w+)+", re.ASCII)  # rosbags makes program code from it

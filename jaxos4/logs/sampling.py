@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .table import counted
+from ..errors import counted
 
 UNIFORM = 0.01  # of a step: rows this close to a grid keep their values
 REACH = 1.5  # times the step: measured samples further apart have a gap between them

@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import IO, Any, NamedTuple, NoReturn
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._files import at_once
-from ..errors import InputError, printable, shortened
+from ..errors import InputError, printable
 from ..flight import SIGNALS, Flight, with_force
 
 LogPath = str | os.PathLike[str]
@@ -277,19 +277,3 @@ def refuse(
     """Raise an `InputError` of one line: the place, `what` is wrong and what to do, without its full stop."""
     places = [f"row {row}"] * (row is not None) + [f"{kind} {column}"] * (column is not None)
     raise InputError(": ".join(filter(None, (printable(os.fspath(path)), ", ".join(places), what))) + ".")
-
-
-def quoted(text: str) -> str:
-    """`text` in quotes, on one line, with at most 40 characters."""
-    return repr(shortened(text, 40))
-
-
-def listed(names: Iterable[str], most: int = 20) -> str:
-    """The first names in quotes."""
-    every = [*names]
-    return ", ".join(map(quoted, every[:most])) + ", ..." * (len(every) > most)
-
-
-def counted(number: int, noun: str) -> str:
-    """`1 gap`, or `2 gaps`."""
-    return f"{number} {noun}{'s' * (number != 1)}"

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import INERTIAS, Airframe
-from ..errors import InputError, named
+from ..errors import InputError, counted, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..logs import Recording
-from ..logs.table import counted
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from . import windows

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from ..airframe import INERTIAS
 from ..comparison import ComparedQuantity, Comparison
+from ..errors import counted
 from ..identification.verdict import ADVICE, RESERVED, STATUSES, headline
-from ..logs.table import counted
 from .page import Section, folded, picture, table, text, write_page
 from .panels import BOUND_DASHES, EVERYWHERE, FAINT, INK, Band, Figure, Line, Panel, Scale, Style, across, style
 from .text import DASH, Listing, plain, say, span, with_unit

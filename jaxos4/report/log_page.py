@@ -11,10 +11,9 @@ from rich.console import Console
 
 from .._files import check_writable
 from ..airframe import MOTIONS, Airframe
-from ..errors import InputError, printable
+from ..errors import InputError, counted, printable
 from ..flight import RATES, SIGNALS, UNITS, Flight
 from ..logs import Recording, Source, as_recording, read_recording
-from ..logs.table import counted
 from ..recording.checks import Evidence
 from ..recording.inspection import Inspection, inspect_log
 from ..recording.prepared import prepare

@@ -7,7 +7,7 @@ import xarray as xr
 from markupsafe import Markup
 
 from .._files import check_writable, write_file
-from ..logs.table import counted
+from ..errors import counted
 from . import study_tables
 from .page import Section, folded, picture, table, text, write_page
 from .panels import Figure, styles

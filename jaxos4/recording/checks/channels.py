@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from ...airframe import AXES, INERTIAS
-from ...errors import percent
+from ...errors import counted, percent
 from ...flight import RATES, UNITS
-from ...logs.table import counted
 from .evidence import HELD, Evidence, Finding
 
 # Clipped thrust seems too weak, and moments of inertia are proportional to it.
