@@ -1,4 +1,4 @@
-"""A bracket: for each parameter the interval in which an estimator searches."""
+"""A bracket: for each parameter the interval in which it is expected."""
 
 import equinox as eqx
 import numpy as np

@@ -8,6 +8,7 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -22,6 +23,7 @@ from jaxos4.report.panels import style
 from jaxos4.results import NINETY_FIVE
 
 BLUE, ORANGE, INK, GREY = "#0072b2", "#d55e00", "#1b1e23", "#b9bec6"
+_ON_PAPER = {"savefig.facecolor": "white", "text.parse_math": True}  # pages may be dark; powers of ten are formulas
 PICTURES = ("estimate", "halving", "sweeps", "floors", "real", "page")
 ROOMS = {
     "cli": "reads the arguments, calls the library, prints",
@@ -92,7 +94,7 @@ def estimate_picture(model, problem, bracket, estimate) -> Figure:
 
 
 def halving_picture(problem, estimate) -> Figure:
-    """A bracket of alpha3, halved six times on the sign of the slope; the other parameters stay at the estimate."""
+    """A search interval of alpha3, halved six times by the slope's sign; the other parameters stay at the estimate."""
     rates = problem.restrict("rates")
     cost = eqx.filter_jit(jax.value_and_grad(lambda value: rates.cost(estimate.parameters.at[2].set(value))))
     low, high = 75.0, 180.0
@@ -119,7 +121,7 @@ def halving_picture(problem, estimate) -> Figure:
 
 
 def sweep_widths(problem: jaxos4.ShootingProblem) -> np.ndarray:
-    """Half-widths of the brackets as each sweep of IBSS opens them: of each parameter, sweep by sweep."""
+    """Half-widths of the search intervals as each sweep of IBSS opens them: of each parameter, sweep by sweep."""
     solver, count, widths = jaxos4.IBSS(), problem.unknowns.count, []
     stages = problem.stages(solver.shares)
     found = before_search(problem)
@@ -128,9 +130,9 @@ def sweep_widths(problem: jaxos4.ShootingProblem) -> np.ndarray:
         stage = stage._replace(local_model=jax.jit(stage.local_model))
         state = solver.init(stage, found)
         while not solver.terminate(stage, state):
-            opened = (state.brackets.highest - state.brackets.lowest)[0] / 2
+            opened = (state.intervals.highest - state.intervals.lowest)[0] / 2
             along = jnp.where(stage.searched[:count, None], state.directions.basis[0, :count], 0.0)
-            if opened.any():  # the first shot of a stage needs no bracket
+            if opened.any():  # the first shot of a stage needs no interval
                 widths.append(np.asarray(jnp.abs(along * opened).sum(axis=1)))
             state = solver.step(stage, state)
         found = solver.postprocess(stage, state, found)._replace(done=jnp.zeros((), dtype=bool))
@@ -138,7 +140,7 @@ def sweep_widths(problem: jaxos4.ShootingProblem) -> np.ndarray:
 
 
 def sweeps_picture(model, problem, bracket, estimate) -> Figure:
-    """Half-widths of the brackets sweep by sweep, in standard deviations of the final estimate."""
+    """Half-widths of the bracket, then of the search intervals by sweep, in standard deviations of the estimate."""
     opened = sweep_widths(problem.within(bracket))
     widths = np.concatenate([np.asarray(bracket.half_width)[None], opened]) / np.asarray(estimate.std)
     figure = Figure(figsize=(7.0, 3.8), layout="constrained")
@@ -149,7 +151,7 @@ def sweeps_picture(model, problem, bracket, estimate) -> Figure:
     axes.set_yscale("log")
     axes.set_xticks(range(len(widths)), ["given", *map(str, range(1, len(widths)))])
     axes.set_xlabel("sweep")
-    axes.set_ylabel("half-width of the bracket\n[standard deviations of the estimate]")
+    axes.set_ylabel("half-width of the interval\n[standard deviations of the estimate]")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
@@ -264,5 +266,5 @@ def main(
         }
     for name, draw_picture in drawings.items():
         if name in chosen:
-            with drawing():
+            with drawing(), mpl.rc_context(_ON_PAPER):
                 write_file(out / f"{name}.svg", rendered(draw_picture(), "svg"))

@@ -29,10 +29,10 @@ _UNEXPLAINED = 5.0
 class Hybrid(AbstractEstimator):
     """IBSS near the answer of a network.
 
-    The network's answer, the *seed*, and its covariance open the first brackets. The search then compares all of the
-    problem's channels; states that the network does not see start at their first measurements. If the search shows that
-    the seed was wrong, or if the network had no answer, IBSS searches the whole bracket too. The better answer is
-    returned.
+    The network's answer, the *seed*, and its covariance open the first search intervals. The search then compares all
+    of the problem's channels; states that the network does not see start at their first measurements. If the search
+    shows that the seed was wrong, or if the network had no answer, IBSS searches the whole bracket too. The better
+    answer is returned.
 
     The estimate's `seed` is the bracket of the network's 99.9 % intervals for all parameters at once. `rollouts` are
     those of network and search together.

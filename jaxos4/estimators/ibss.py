@@ -1,4 +1,4 @@
-"""Iterative Bi-Section Shooting (IBSS): brackets are narrowed by the slope of the cost.
+"""Iterative Bi-Section Shooting (IBSS): search intervals are narrowed by the slope of the cost.
 
 The paper gives the idea only; the steps in this file are our choice.
 
@@ -26,10 +26,10 @@ PerDirection = Float[Array, "windows n"]
 
 _COARSE = 0.5  # a stage other than the last ends once the minimum is this close
 _OPENING = 4.0  # the longest step of a stage's first sweep, in standard deviations of the stage's start
-_NARROW = 0.05  # half-width of a stage's first brackets, relative to that longest step
-_SAFETY = 2.0  # half-width of later brackets, relative to the error of the last prediction
-_MIN_WIDTH = 0.01  # smallest half-width of later brackets, as a share of the longest predicted step, the largest one
-_WIDENING, _MAX_WIDENING = 4.0, 256.0  # growth of a bracket each time its last shot was at an end, and in total
+_NARROW = 0.05  # half-width of a stage's first intervals, relative to that longest step
+_SAFETY = 2.0  # half-width of later intervals, relative to the error of the last prediction
+_MIN_WIDTH = 0.01  # smallest half-width of later intervals, as a share of the longest predicted step, the largest one
+_WIDENING, _MAX_WIDENING = 4.0, 256.0  # growth of an interval each time its last shot was at an end, and in total
 _KEPT_RISE = 1.0  # a sweep that raises the cost by more is undone
 _RETREAT, _ADVANCE = 0.25, 1.4  # growth of the longest step after a sweep that was undone, and after any other
 # Unknowns with a stride have inexact slopes. A search with such unknowns also ends after a sweep that lowered the cost
@@ -94,11 +94,11 @@ class Directions(NamedTuple):
 
 
 class SearchIntervals(NamedTuple):
-    """The bracket along each direction, as steps from where the sweep began.
+    """The part of each direction that is searched for the minimum, as steps from where the sweep began.
 
     - `predicted`: the predicted step to the minimum.
-    - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: the ends of the part that no
-      slope has excluded. If every slope points beyond the bracket, both are at that end.
+    - `lowest`, `highest`: the ends of the interval as it was opened. `lower`, `upper`: the ends of the part that no
+      slope has excluded. If every slope points beyond the interval, both are at that end.
     - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope at `last`, and how fast it
       changes.
     """
@@ -128,9 +128,9 @@ class SearchIntervals(NamedTuple):
         return cls(predicted, lowest, highest, lowest, highest, middle, middle, zero, jnp.ones_like(lowest))
 
     def narrowed(self, slope: PerDirection) -> "SearchIntervals":
-        """The brackets after a shot at their trials: **the sign of the slope decides**, the secant proposes.
+        """The intervals after a shot at their trials: **the sign of the slope decides**, the secant proposes.
 
-        The next trial is where a line through the last two slopes is zero. If this point lies outside of the bracket,
+        The next trial is where a line through the last two slopes is zero. If this point lies outside of the interval,
         the next trial is the nearest end, or the middle if a shot has moved that end.
         """
         lower = jnp.where(slope <= 0, self.trial, self.lower)
@@ -144,8 +144,8 @@ class SearchIntervals(NamedTuple):
         return self._replace(lower=lower, upper=upper, trial=following, last=self.trial, slope=slope, rate=rate)
 
 
-# The shots of a sweep: the brackets after them, unknowns and local model of the last one, their number, and whether the
-# minimum is near.
+# The shots of a sweep: the intervals after them, unknowns and local model of the last one, their number, and whether
+# the minimum is near.
 Sweep = tuple[SearchIntervals, WindowUnknowns, LocalModel, Count, Flag]
 
 
@@ -154,9 +154,9 @@ class State(NamedTuple):
 
     - `unknowns`, `model`: the current point, and the local model of the cost there. Before the first shot, `model` is
       that of `before_shots`.
-    - `directions`, `brackets`: of the next sweep.
+    - `directions`, `intervals`: of the next sweep.
     - `spread`: the covariance of the unknowns before the stage.
-    - `growth`: the factor by which each direction's bracket is widened.
+    - `growth`: the factor by which each direction's interval is widened.
     - `trust`: a sweep may go at most this share of the longest predicted step; 1: no limit.
     - `sweeps`, `shots`: their number in this stage. The first shot is at the start, before any sweep.
     - `done`: whether the stage ended by itself.
@@ -165,7 +165,7 @@ class State(NamedTuple):
     unknowns: WindowUnknowns
     model: LocalModel
     directions: Directions
-    brackets: SearchIntervals
+    intervals: SearchIntervals
     spread: Float[Array, "windows unknowns unknowns"]
     growth: PerDirection
     trust: Scalar
@@ -179,14 +179,14 @@ class IBSS(AbstractSolver[State]):
 
     A *shot* simulates the flight at trial unknowns, and gives the cost with its gradient and information. **The sign of
     the cost's slope along a direction decides** which side of the trial holds the minimum, and so which part of the
-    bracket is dropped. The quadratic model and the secant through the last slopes **propose** where to shoot. The size
-    of the slopes decides when to stop, and the cost whether a point is kept. A *sweep* is one iteration. A *stage*
-    repeats sweeps on some of the data until the minimum is near; the last stage fits all data. The directions of a
-    sweep are the columns of L^-T, with L L^T the Fisher information at the current estimate. The cost is nearly
+    search interval is dropped. The quadratic model and the secant through the last slopes **propose** where to shoot.
+    The size of the slopes decides when to stop, and the cost whether a point is kept. A *sweep* is one iteration. A
+    *stage* repeats sweeps on some of the data until the minimum is near; the last stage fits all data. The directions
+    of a sweep are the columns of L^-T, with L L^T the Fisher information at the current estimate. The cost is nearly
     separable along them, so a sweep bisects all directions in parallel. Parameters are bisected on the sum of all
     windows' slopes, initial states on the slope of their window.
 
-    - `halvings`: the shots of a sweep that narrow the brackets. One more shot is at the trials that these found.
+    - `halvings`: the shots of a sweep that narrow the intervals. One more shot is at the trials that these found.
     - `max_sweeps`: the most sweeps of a stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
       direction. The `misfit` of the residuals scales them, so noise-free data are fitted to rounding errors.
@@ -202,14 +202,14 @@ class IBSS(AbstractSolver[State]):
     shares: tuple[float, ...] = eqx.field(static=True, default=(0.1, 0.3, 1.0))
 
     def init(self, stage: Stage, before: Found) -> State:
-        """The start, with closed brackets: the first step of the loop is a shot there, so a shot is compiled once."""
+        """The start, with closed intervals: the first step of the loop is a shot there, so a shot is compiled once."""
         unknowns, closed = before.unknowns, jnp.zeros_like(before.unknowns)
         directions = Directions.none(unknowns)
         return State(
             unknowns=unknowns,
             model=before_shots(before.model),
             directions=directions,
-            brackets=SearchIntervals.around(directions, closed, closed),
+            intervals=SearchIntervals.around(directions, closed, closed),
             spread=before.spread,
             growth=jnp.ones_like(unknowns),
             trust=jnp.ones((), dtype=float),
@@ -222,20 +222,20 @@ class IBSS(AbstractSolver[State]):
         """The shot at the start, or one sweep, see docs/method/ibss.md.
 
         A sweep bisects, keeps its last point if the cost is lower, looks for directions and slopes there, and opens new
-        brackets around the steps that they predict.
+        intervals around the steps that they predict.
         """
         is_start = state.shots == 0
-        # One shot is enough if all brackets are closed.
-        most = jnp.where((state.brackets.highest > state.brackets.lowest).any(), self.halvings + 1, 1)
-        brackets, unknowns, model, shots, _ = jax.lax.while_loop(
+        # One shot is enough if all intervals are closed.
+        most = jnp.where((state.intervals.highest > state.intervals.lowest).any(), self.halvings + 1, 1)
+        intervals, unknowns, model, shots, _ = jax.lax.while_loop(
             lambda carry: (carry[3] < most) & ~carry[4],
             functools.partial(self._shoot, stage, state),
-            (state.brackets, state.unknowns, state.model, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)),
+            (state.intervals, state.unknowns, state.model, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)),
         )
         kept, stalled = self._judge(stage, state, unknowns, model)
         unknowns, model = chosen(kept, (unknowns, model), (state.unknowns, state.model))
         directions = Directions.at(stage, unknowns, model, self.reach)
-        share, growth = self._next_widths(stage, state, brackets)
+        share, growth = self._next_widths(stage, state, intervals)
         trust = jnp.where(kept, jnp.minimum(state.trust * _ADVANCE, 1.0), state.trust * _RETREAT)
         later = jnp.maximum(share * directions.longest, stage.smallest_step) * growth
         restricted = jnp.where(trust < 1, trust * directions.longest, jnp.inf)
@@ -247,7 +247,7 @@ class IBSS(AbstractSolver[State]):
             unknowns=unknowns,
             model=model,
             directions=directions,
-            brackets=SearchIntervals.around(directions, half_width, furthest),
+            intervals=SearchIntervals.around(directions, half_width, furthest),
             spread=state.spread,
             growth=growth,
             trust=trust,
@@ -270,16 +270,16 @@ class IBSS(AbstractSolver[State]):
         return Found(state.unknowns, state.model, spread, state.sweeps, rollouts, state.done)
 
     def _shoot(self, stage: Stage, state: State, before: Sweep) -> Sweep:
-        """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes."""
-        brackets, _, _, shots, _ = before
-        step = jnp.einsum("wud,wd->wu", state.directions.basis, brackets.trial)
+        """Shoot at the trials of all intervals at once, and drop the side that the sign of each slope excludes."""
+        intervals, _, _, shots, _ = before
+        step = jnp.einsum("wud,wd->wu", state.directions.basis, intervals.trial)
         unknowns = jnp.clip(state.unknowns + step, *stage.limits(self.reach))
         model = stage.local_model(unknowns)
         slope = state.directions.slopes(model.gradient, stage.unknowns.count)
         near = model.feasible.all() & self._is_near(stage, model, slope)
         # A slope that is not finite is replaced by the trial: with unit information, the minimum is then at step 0.
-        brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
-        return brackets, unknowns, model, shots + 1, near
+        intervals = intervals.narrowed(jnp.where(jnp.isfinite(slope), slope, intervals.trial))
+        return intervals, unknowns, model, shots + 1, near
 
     def _judge(self, stage: Stage, state: State, unknowns: WindowUnknowns, model: LocalModel) -> tuple[Flag, Flag]:
         """Whether the new point is kept, and whether the search has stalled. A clearly worse point is not kept."""
@@ -299,12 +299,13 @@ class IBSS(AbstractSolver[State]):
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
         return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
-    def _next_widths(self, stage: Stage, state: State, brackets: SearchIntervals) -> tuple[Scalar, PerDirection]:
-        """The half-width of the next brackets as a share of the longest step, from its error; and `State.growth`."""
-        steps = brackets.last
-        error = jnp.abs(steps - brackets.predicted).max()
+    def _next_widths(self, stage: Stage, state: State, intervals: SearchIntervals) -> tuple[Scalar, PerDirection]:
+        """The half-width of the next intervals as a share of the longest step, from its error; and `State.growth`."""
+        steps = intervals.last
+        error = jnp.abs(steps - intervals.predicted).max()
         longest = jnp.maximum(jnp.abs(steps).max(), stage.smallest_step)
-        at_end, was_open = (steps == brackets.lowest) | (steps == brackets.highest), brackets.highest > brackets.lowest
+        at_end = (steps == intervals.lowest) | (steps == intervals.highest)
+        was_open = intervals.highest > intervals.lowest
         growth = jnp.where(at_end, jnp.minimum(_WIDENING * state.growth, _MAX_WIDENING), 1.0)
         return jnp.clip(_SAFETY * error / longest, _MIN_WIDTH, 1.0), jnp.where(was_open, growth, state.growth)
 
