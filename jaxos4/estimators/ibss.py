@@ -149,7 +149,7 @@ class SearchIntervals(NamedTuple):
 Sweep = tuple[SearchIntervals, WindowUnknowns, LocalModel, Count, Flag]
 
 
-class State(NamedTuple):
+class SearchState(NamedTuple):
     """The search of a stage before a sweep.
 
     - `unknowns`, `model`: the current point, and the local model of the cost there. Before the first shot, `model` is
@@ -174,7 +174,7 @@ class State(NamedTuple):
     done: Flag
 
 
-class IBSS(AbstractSolver[State]):
+class IBSS(AbstractSolver[SearchState]):
     """Iterative Bi-Section Shooting.
 
     A *shot* simulates the flight at trial unknowns, and gives the cost with its gradient and information. **The sign of
@@ -201,11 +201,11 @@ class IBSS(AbstractSolver[State]):
     reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
     shares: tuple[float, ...] = eqx.field(static=True, default=(0.1, 0.3, 1.0))
 
-    def init(self, stage: Stage, before: Found) -> State:
+    def init(self, stage: Stage, before: Found) -> SearchState:
         """The start, with closed intervals: the first step of the loop is a shot there, so a shot is compiled once."""
         unknowns, closed = before.unknowns, jnp.zeros_like(before.unknowns)
         directions = Directions.none(unknowns)
-        return State(
+        return SearchState(
             unknowns=unknowns,
             model=before_shots(before.model),
             directions=directions,
@@ -218,7 +218,7 @@ class IBSS(AbstractSolver[State]):
             done=jnp.zeros((), dtype=bool),
         )
 
-    def step(self, stage: Stage, state: State) -> State:
+    def step(self, stage: Stage, state: SearchState) -> SearchState:
         """The shot at the start, or one sweep, see docs/method/ibss.md.
 
         A sweep bisects, keeps its last point if the cost is lower, looks for directions and slopes there, and opens new
@@ -243,7 +243,7 @@ class IBSS(AbstractSolver[State]):
         half_width = jnp.where(is_start, _NARROW * opening, later)
         furthest = jnp.where(is_start, opening, restricted)
         near = self._is_near(stage, model, directions.predicted)
-        return State(
+        return SearchState(
             unknowns=unknowns,
             model=model,
             directions=directions,
@@ -256,11 +256,11 @@ class IBSS(AbstractSolver[State]):
             done=near | stalled | (is_start & ~kept),
         )
 
-    def terminate(self, stage: Stage, state: State) -> Flag:
+    def terminate(self, stage: Stage, state: SearchState) -> Flag:
         """Whether the minimum is near, or the search cannot go on."""
         return state.done | (state.sweeps >= self.max_sweeps)
 
-    def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
+    def postprocess(self, stage: Stage, state: SearchState, before: Found) -> Found:
         """The last point that was kept."""
         misfit = jnp.maximum(stage.misfit(state.model.cost.sum()), 1.0)
         covariance = jnp.square(misfit) * gram(state.directions.basis)
@@ -269,7 +269,7 @@ class IBSS(AbstractSolver[State]):
         rollouts = state.shots * stage.searched.sum()
         return Found(state.unknowns, state.model, spread, state.sweeps, rollouts, state.done)
 
-    def _shoot(self, stage: Stage, state: State, before: Sweep) -> Sweep:
+    def _shoot(self, stage: Stage, state: SearchState, before: Sweep) -> Sweep:
         """Shoot at the trials of all intervals at once, and drop the side that the sign of each slope excludes."""
         intervals, _, _, shots, _ = before
         step = jnp.einsum("wud,wd->wu", state.directions.basis, intervals.trial)
@@ -281,7 +281,9 @@ class IBSS(AbstractSolver[State]):
         intervals = intervals.narrowed(jnp.where(jnp.isfinite(slope), slope, intervals.trial))
         return intervals, unknowns, model, shots + 1, near
 
-    def _judge(self, stage: Stage, state: State, unknowns: WindowUnknowns, model: LocalModel) -> tuple[Flag, Flag]:
+    def _judge(
+        self, stage: Stage, state: SearchState, unknowns: WindowUnknowns, model: LocalModel
+    ) -> tuple[Flag, Flag]:
         """Whether the new point is kept, and whether the search has stalled. A clearly worse point is not kept."""
         before, gain = state.model, state.model.cost.sum() - model.cost.sum()
         feasible, was_feasible = model.feasible.all(), before.feasible.all()
@@ -299,8 +301,8 @@ class IBSS(AbstractSolver[State]):
         fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
         return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
-    def _next_widths(self, stage: Stage, state: State, intervals: SearchIntervals) -> tuple[Scalar, PerDirection]:
-        """The half-width of the next intervals as a share of the longest step, from its error; and `State.growth`."""
+    def _next_widths(self, stage: Stage, state: SearchState, intervals: SearchIntervals) -> tuple[Scalar, PerDirection]:
+        """The half-width of the next intervals as a share of the longest step, from its error; and their `growth`."""
         steps = intervals.last
         error = jnp.abs(steps - intervals.predicted).max()
         longest = jnp.maximum(jnp.abs(steps).max(), stage.smallest_step)

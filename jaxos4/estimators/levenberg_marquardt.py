@@ -35,7 +35,7 @@ _NEAR = 1.0  # a minimum is near if less is left to gain
 _SLOW = 0.05  # convergence is slow if a step leaves more than this part of what was left
 
 
-class State(NamedTuple):
+class SearchState(NamedTuple):
     """The search of a stage before a shot.
 
     - `best`, `model`: the best unknowns so far, and the local model there. If a last step ends the stage, `best`
@@ -60,7 +60,7 @@ class State(NamedTuple):
     done: Bool[Array, ""]
 
 
-class LevenbergMarquardt(AbstractSolver[State]):
+class LevenbergMarquardt(AbstractSolver[SearchState]):
     """The solver of output error and filter error.
 
     Gauss-Newton steps are damped more after a step that failed, and less after one that succeeded, unless the step
@@ -94,13 +94,13 @@ class LevenbergMarquardt(AbstractSolver[State]):
     shares: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
 
-    def init(self, stage: Stage, before: Found) -> State:
+    def init(self, stage: Stage, before: Found) -> SearchState:
         """The first trial is the start, and its shot counts as better than none."""
         damping = jnp.full((), _FACTOR * self.damping, dtype=float)
         left, none, no = jnp.full((), jnp.inf, dtype=float), jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        return State(before.unknowns, before.model, before.unknowns, damping, no, no, left, none, no)
+        return SearchState(before.unknowns, before.model, before.unknowns, damping, no, no, left, none, no)
 
-    def step(self, stage: Stage, state: State) -> State:
+    def step(self, stage: Stage, state: SearchState) -> SearchState:
         """Shoot at the trial, keep the better, and propose the next trial."""
         found, before, count = stage.local_model(state.trial), state.model, stage.unknowns.count
         better = (state.shots == 0) | (cost_of(found) < cost_of(before))
@@ -140,13 +140,13 @@ class LevenbergMarquardt(AbstractSolver[State]):
         room = jnp.maximum(lower, -stage.stride), jnp.minimum(upper, stage.stride)
         trial = jnp.clip(best + limited(step, basis, room, count), *limits)
         done, is_steep = last | ~jnp.isfinite(trial).all(), (steeper != 0).any()
-        return State(end, model, trial, damping, ~better, is_steep, left, state.shots + 1, done)
+        return SearchState(end, model, trial, damping, ~better, is_steep, left, state.shots + 1, done)
 
-    def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
+    def terminate(self, stage: Stage, state: SearchState) -> Bool[Array, ""]:
         """Whether the stage ended by itself, has no next step, or had too many."""
         return state.done | (state.shots > self.max_steps)
 
-    def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
+    def postprocess(self, stage: Stage, state: SearchState, before: Found) -> Found:
         """The best unknowns. A shot counts as one rollout, and one more for each unknown that is searched."""
         steps = jnp.maximum(state.shots - 1, 0)  # a search that is skipped makes no shot
         done = state.done & jnp.isfinite(state.trial).all()  # without a finite next step, no minimum was found

@@ -16,7 +16,7 @@ from ..estimate import AbstractEstimator, Estimate, as_estimate
 from ..linalg import covariance_of_shared
 from ..shooting import AbstractProblem, LocalModel, Stage, WindowUnknowns
 
-State = TypeVar("State")
+SearchState = TypeVar("SearchState")
 
 
 class Found(NamedTuple):
@@ -36,7 +36,7 @@ class Found(NamedTuple):
     done: Bool[Array, ""]
 
 
-class AbstractSolver(AbstractEstimator, Generic[State]):
+class AbstractSolver(AbstractEstimator, Generic[SearchState]):
     """An algorithm that minimises the cost of a likelihood. It uses only the members of `AbstractProblem`.
 
     - `is_local`: whether the answer depends on the start, so that the search is repeated from all starts of a problem.
@@ -51,19 +51,19 @@ class AbstractSolver(AbstractEstimator, Generic[State]):
     reach: eqx.AbstractVar[Scalar]
 
     @abc.abstractmethod
-    def init(self, stage: Stage, before: Found) -> State:
+    def init(self, stage: Stage, before: Found) -> SearchState:
         """The first state of a stage's search, at `before.unknowns` with the covariance `before.spread`."""
 
     @abc.abstractmethod
-    def step(self, stage: Stage, state: State) -> State:
+    def step(self, stage: Stage, state: SearchState) -> SearchState:
         """One iteration."""
 
     @abc.abstractmethod
-    def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
+    def terminate(self, stage: Stage, state: SearchState) -> Bool[Array, ""]:
         """Whether the stage has ended."""
 
     @abc.abstractmethod
-    def postprocess(self, stage: Stage, state: State, before: Found) -> Found:
+    def postprocess(self, stage: Stage, state: SearchState, before: Found) -> Found:
         """The findings of the stage, from its last state."""
 
     @eqx.filter_jit
