@@ -5,15 +5,15 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import as_float
 from ..airframe import MOTIONS
 from ..analysis.prediction import Filtered
+from ..bracket import Bracket
 from ..errors import InputError, named, printable, shortened
 from ..flight import ANGLES, FORCE_NAMES, Flight
 from ..identification import Identification
@@ -75,7 +75,8 @@ def vehicle_of(found: ResultSource) -> Vehicle:
         model = FlightModel(file.airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
         known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
         known |= {row: each.value for row, each in file.held.items()}
-        center, half_width = (np.asarray(each).tolist() for each in _bracket(model))
+        bracket = Bracket.default(model)
+        center, half_width = (np.asarray(each).tolist() for each in (bracket.center, bracket.half_width))
         names, listed = model.parameter_names, [*file.parameters, *file.held]
         if missing := [name for name in names if name not in map(without_recording, listed)]:
             raise InputError(f"has no {', '.join(missing)}; run `jaxos4 estimate` again.")
@@ -102,12 +103,6 @@ def vehicle_of(found: ResultSource) -> Vehicle:
             file.result,
             (*file.warnings, *notes),
         )
-
-
-@eqx.filter_jit
-def _bracket(model: FlightModel) -> tuple[Parameters, Parameters]:
-    """The centre and the half-width of the default bracket."""
-    return model.alpha, model.half_width
 
 
 # Inputs that no prediction can replace.
