@@ -38,7 +38,7 @@ from .ulog import ULOG
 from .values import without_impossible
 
 FORMATS: tuple[LogFormat, ...] = (ULOG, ROS, ARDUPILOT, CRAZYFLIE, BLACKBOX, NEUROBEM, CSV)
-"""The formats in the order in which they are tried. A new format is one line here, before the last.
+"""The formats in the order in which they are tried. A file that none recognises is a flight CSV.
 
 Only formats of other packages are asked about files that are a zip or tar.
 """
@@ -140,10 +140,10 @@ def read_flight(path: LogPath, airframe: Airframe | None = None) -> Flight:
 
 
 def log_format(path: LogPath) -> LogFormat:
-    """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
+    """The format of a log: the first of `FORMATS` that recognises it, or `CSV`.
 
-    Formats of other packages are asked before the last; one that fails is a `UserWarning`. A pipe can be read only
-    once, so it always counts as the last.
+    Formats of other packages are asked last; one that fails is a `UserWarning`. A pipe can be read only once, so it is
+    always a `CSV`.
     Raises `InputError` if the file cannot be opened, or is evidently of another kind.
     """
     inside = os.path.join(path, "metadata.yaml")  # of a folder: a bag of ROS 2
@@ -151,7 +151,7 @@ def log_format(path: LogPath) -> LogFormat:
     with opened(source, "rb") as file:
         begin = file.read(_BEGIN) if file.seekable() else b""
     # An archive may begin with a log that it holds without compression.
-    formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS[:-1]
+    formats = () if re.match(_ARCHIVE, begin, re.DOTALL) else FORMATS
     kind = next((each for each in formats if each.recognises(begin)), None) or _of_others(begin)
     if kind is not None:
         return kind
@@ -163,7 +163,7 @@ def log_format(path: LogPath) -> LogFormat:
         what, remedy = unread[0]
         labels = ", ".join((*(each.label for each in FORMATS), *_OTHERS))
         refuse(path, f"is {what}; {remedy}. Logs that are read: {labels}")
-    return FORMATS[-1]
+    return CSV
 
 
 def _of_others(begin: bytes) -> LogFormat | None:

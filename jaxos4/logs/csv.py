@@ -41,7 +41,7 @@ NEUROBEM = LogFormat(
 CSV = LogFormat(
     "CSV",
     "flight CSV",
-    lambda begin: True,
+    lambda begin: False,  # a file that no other format recognises
     lambda path: (read_table(path, COLUMNS), ()),
     read_mapped,
     of_vehicles=False,
