@@ -66,8 +66,9 @@ class AbstractOS4(AbstractModel):
         if t is None:
             return State(rates, attitude)
         x, y = self.horizontal_thrust(orientation)
-        az = orientation.cos_theta * orientation.cos_phi * forcing.thrust - self.airframe.gravity  # Eq. (9)
-        return State(rates, attitude, Translation(t.vx, x * forcing.thrust, t.vy, y * forcing.thrust, t.vz, az))
+        thrust = forcing.specific_thrust
+        az = orientation.cos_theta * orientation.cos_phi * thrust - self.airframe.gravity  # Eq. (9)
+        return State(rates, attitude, Translation(t.vx, x * thrust, t.vy, y * thrust, t.vz, az))
 
 
 class PublishedOS4(AbstractOS4):

@@ -73,12 +73,13 @@ class State(NamedTuple):
 
 
 class Forcing(NamedTuple):
-    """The action of the rotors: torques [N m], specific thrust U_c/m [m/s^2], residual rotor speed Omega_r [rad/s].
+    """The rotors' mean action over a sample: torques [N m], specific thrust U_c/m [m/s^2], residual speed [rad/s].
 
     Only a `FlightModel` has the other fields:
 
     - `spin_up`: Omega_r' [rad/s^2].
-    - `specific_thrust`: U_c/m around the time of the sample [m/s^2], as an accelerometer measures it.
+    - `sensed_specific_thrust`: U_c/m at the time of the sample, or averaged around it like the log, as an accelerometer
+      senses it [m/s^2].
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
     - `velocity`: along the body's axes, see `Flight.body_velocity` [m/s].
     - `early`: the forcing weighted by the time that remains in the sample, for its effect on a mean over the sample.
@@ -88,10 +89,10 @@ class Forcing(NamedTuple):
     roll: Samples
     pitch: Samples
     yaw: Samples
-    thrust: Samples
+    specific_thrust: Samples
     residual_speed: Samples
     spin_up: Samples | None = None
-    specific_thrust: Samples | None = None
+    sensed_specific_thrust: Samples | None = None
     recording: tuple[Samples, ...] = ()
     velocity: Vector | None = None
     early: "Forcing | None" = None
