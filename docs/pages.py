@@ -20,6 +20,10 @@ PAGES = {
     "security.md": ".github/SECURITY.md",
     "experiments.md": "experiments/README.md",
 }
+COMMANDS = "reference/commands.md"
+# The pages that are made, by their source, to which links lead: then they work in the repository and on the site.
+MADE = {source: page for page, source in PAGES.items()} | {"jaxos4/cli/options.py": COMMANDS}
+MADE |= {f"docs/tutorials/{path.name}": f"tutorials/{path.stem}.md" for path in (ROOT / "docs/tutorials").glob("*.py")}
 PLACES = {}
 EQUATION = LatexToMathML(annotation=True)
 OBJECT = re.compile(r"^::: jaxos4\.((?:\w+\.)*)(\w+)$", flags=re.MULTILINE)
@@ -28,14 +32,10 @@ COMMAND = re.compile(r"(jaxos4|python3?|pip|bash|source|export|\.venv/\S+)\b| +\
 
 
 def on_files(files, config):
-    """Adds the pages, with links that lead to pages of the site."""
+    """Adds the pages that are made."""
     for page, source in PAGES.items():
-        text = (ROOT / source).read_text(encoding="utf-8")
-        for place, path in {"": "docs/", **PAGES}.items():
-            link = posixpath.relpath(path, posixpath.dirname(source)) + "/" * path.endswith("/")
-            text = text.replace(f"]({link}", f"]({place}")
-        files.append(File.generated(config, page, content=text))
-    files.append(File.generated(config, "reference/commands.md", content=commands()))
+        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+    files.append(File.generated(config, COMMANDS, content=commands()))
     return files
 
 
@@ -47,7 +47,16 @@ def on_pre_page(page, config, files):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Typesets equations, and marks what wraps on a narrow screen: commands, and lines wider than a page."""
+    """Leads links to sources to their pages, typesets equations, and marks commands and wide lines."""
+    here = page.file.src_uri
+    source = PAGES.get(here, f"docs/{here}")
+
+    def led(link):
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(source), link[1]))
+        target = MADE.get(path, path.removeprefix("docs/"))
+        if target in (path, here):  # no page, or the script that a tutorial offers
+            return link[0]
+        return f"]({posixpath.relpath(target, posixpath.dirname(here))}"
 
     def marked(block):
         language, lines = block[1], block[2].splitlines()
@@ -60,6 +69,7 @@ def on_page_markdown(markdown, page, config, files):
             language = " { .text .wide }"
         return f"```{language}\n{block[2]}```"
 
+    markdown = re.sub(r"\]\((?![a-z]+:)([^)#\s]+)", led, markdown)
     return re.sub(r"^```(.*)\n((?:(?!```).*\n)*)```$", marked, markdown, flags=re.MULTILINE)
 
 

@@ -61,11 +61,12 @@ def test_the_picture_of_the_floors_is_up_to_date():
     assert drawn == floors_picture(ROOT / "pyproject.toml")
 
 
-PROSE = [*ROOT.glob("*.md"), *ROOT.glob(".github/*.md"), *ROOT.glob("experiments/*.md")]
+PROSE = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.py")]
+PROSE += [page for folder in (".", ".github", "experiments") for page in (ROOT / folder).glob("*.md")]
 
 
 @pytest.mark.parametrize("page", PROSE, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_the_links_of_pages_outside_of_the_site_lead_somewhere(page):
+def test_links_lead_to_files_of_the_repository(page):
     links = re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8"))
     assert [link for link in links if not link.startswith("https:") and not (page.parent / link).exists()] == []
 

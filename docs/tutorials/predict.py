@@ -18,7 +18,7 @@ import jaxos4
 # ## Two flights
 #
 # Both are simulated: 20 s in gusts of 2 rad/s², with [the vehicle of the first
-# tutorial](own_drone.md). Their references differ. `jaxos4 simulate --closed-loop --airframe
+# tutorial](own_drone.py). Their references differ. `jaxos4 simulate --closed-loop --airframe
 # vehicle.toml` takes the same file of the vehicle.
 
 # %%
