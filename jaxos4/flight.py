@@ -114,8 +114,8 @@ class Flight(eqx.Module):
     states and specific force only (`CHANNEL_NAMES`).
 
     - `time`: sample times [s], uniform.
-    - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing. Unless
-      they are `held`, measured speeds are those at `time[k]`.
+    - `omega`: rotor speeds [rad/s]; row k acts from `time[k]` to `time[k+1]`, the last row drives nothing. Unless they
+      are `held`, measured speeds are those at `time[k]`.
     - `states`: in the order of `STATE_NAMES` (Eq. (14)) and the units of `STATE_UNITS`. NaN: not measured.
     - `specific_force`: the signal of an accelerometer along the body's axes [m/s^2]. `None` or NaN: not measured.
     - `result`: how a simulation ended. Rows after a failure are NaN.
@@ -124,7 +124,7 @@ class Flight(eqx.Module):
       (`jaxos4.join`), and their time counts samples. `None`: the flight is one stretch.
     - `commanded`: whether `omega` holds commands, which the rotors follow with a lag, and not measured speeds.
     - `voltage`: the battery's voltage [V], an input of some models; no NaN. `None`: not logged.
-    - `held`: see `omega`.
+    - `held`: whether rows of `omega` act over their sample (zero-order hold), and are not speeds at an instant.
     - `within`: the root mean square of each rotor's speed in equal parts of the sample, from `time[k]` - dt/2 to
       `time[k]` + dt/2 [rad/s]. `None`: unknown.
     - `averaging_time`: how long measurements are averaged around `time[k]` [s]; 0: they are those at this instant.

@@ -52,12 +52,12 @@ class Traces(Arrays, frozen=True, eq=False):
 
 def os4_traces(found: Evaluation) -> Traces:
     """The traces of a flight that was simulated at an answer."""
-    flight, channels = found.problem.flight, found.problem.size
+    flight, size = found.problem.flight, found.problem.size
     time, omega = np.asarray(flight.time, float), np.asarray(flight.omega, float)
     states, none = np.asarray(flight.states, float), np.zeros((time.size, 0))
     log = np.zeros(time.size, int)
-    measured = states[:, CASCADE_ORDER[:channels]]
-    predicted = found.predicted[:, :channels]
+    measured = states[:, CASCADE_ORDER[:size]]
+    predicted = found.predicted[:, :size]
     return Traces(time, log, omega, measured, predicted, none, position_of(states), time[:0], log[:0]).thinned()
 
 

@@ -84,11 +84,11 @@ class Envelope(eqx.Module):
 
 def _sizes(omega: Numeric, states: Numeric, dt: Scalar | float) -> dict[str, Numeric]:
     """The quantities at each sample that the limits of an envelope restrict, by the name of the limit."""
-    held, moved = omega[..., :-1, :], states - states[..., :1, :]  # the last row of rotor speeds drives nothing
+    driving, moved = omega[..., :-1, :], states - states[..., :1, :]  # the last row of rotor speeds drives nothing
     return {
-        "slowest": held,
-        "fastest": held,
-        "slew": (held[..., 1:, :] - held[..., :-1, :]) / dt,
+        "slowest": driving,
+        "fastest": driving,
+        "slew": (driving[..., 1:, :] - driving[..., :-1, :]) / dt,
         "angle": states[..., ANGLES],
         "rate": states[..., RATES],
         "velocity": _norm(states[..., VELOCITY]),

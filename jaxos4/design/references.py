@@ -73,11 +73,11 @@ def _response(
     references[tones : 2 * tones, :, 3] = _SMALL[3] * np.real(turns).T
     in_gusts = np.arange(LANES) > 2 * tones  # the one before is in still air, and has no reference
     flights = fly_batch(batch_of(fleet.loop, in_gusts), jnp.asarray(references), as_float(fleet.dt), key)
-    states, (whole, channels) = np.asarray(flights.states), map(np.asarray, fleet.informations(flights))
-    excess = channels - channels[2 * tones]
+    states, (whole, by_channel) = np.asarray(flights.states), map(np.asarray, fleet.informations(flights))
+    excess = by_channel - by_channel[2 * tones]
     each = np.stack([*np.moveaxis(excess[:tones, :3], 1, 0), excess[tones : 2 * tones].sum(axis=1)])
     # In still air nothing is learned about the noise.
-    beyond = whole.shape[-1] - channels.shape[-1]
+    beyond = whole.shape[-1] - by_channel.shape[-1]
     each = fleet.about_inertias(np.pad(each, ((0, 0), (0, 0), (0, beyond), (0, beyond))))
     base = fleet.with_prior(whole[in_gusts].mean(axis=0))
     scale = np.sqrt(np.diagonal(base))

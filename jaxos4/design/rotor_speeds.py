@@ -229,8 +229,8 @@ def fly_finely(
     finer: int = _FINER,
 ) -> Float[Array, "vehicles times 12"]:
     """The states of all vehicles from rest, with `finer` steps in a sample."""
-    held = jnp.concatenate([jnp.repeat(omega[:-1], finer, axis=0), omega[-1:]])
-    return jax.vmap(lambda a: simulate(model, a, held, dt=dt / finer).states)(vehicles)
+    repeated = jnp.concatenate([jnp.repeat(omega[:-1], finer, axis=0), omega[-1:]])
+    return jax.vmap(lambda a: simulate(model, a, repeated, dt=dt / finer).states)(vehicles)
 
 
 def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, bandwidth: float) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]
 Series = Float[np.ndarray, "samples 4"]
-"""Rotor speeds [rad/s], held from sample to sample; or references as `fly_closed_loop` takes them."""
+"""Rotor speeds [rad/s], each for one sample (a zero-order hold); or references as `fly_closed_loop` takes them."""
 # Inputs, and the largest share of each limit that a vehicle uses.
 Flown = tuple[Series, dict[str, float]]
 Progress = Callable[[str], None]

@@ -113,11 +113,11 @@ def _pass(
     # A known initial state has no tangent of its own.
     moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])
     begin = jnp.concatenate([start, prior.center, start[: problem.free_size]]), jnp.concatenate([moving, constants])
-    channels, variances = jnp.arange(size), jnp.square(problem.sigma[CASCADE_ORDER[:size]])
+    places, variances = jnp.arange(size), jnp.square(problem.sigma[CASCADE_ORDER[:size]])
 
     def step(carry: tuple[_Joint, Array], row: Rows) -> tuple[tuple[_Joint, Array], Parameters]:
         before, nominal = carry  # the state on the trajectory around which the model is linearised
-        measurements = channels, jnp.stack(row.measured), variances
+        measurements = places, jnp.stack(row.measured), variances
         (estimate, root), _ = jax.lax.scan(_update, before, measurements)
         states, parameters, constant = estimate[:size], estimate[size : size + count], estimate[size:]
         point = jnp.where(first, states, nominal), jnp.where(first, parameters, about[0])

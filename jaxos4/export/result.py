@@ -193,7 +193,7 @@ def _parts(file: VehicleIdentification) -> tuple[dict[str, float], list[str], li
     if abs(curve - 1) < _SIGNIFICANT * error:
         del found["thrust_curve"]
     values = {name: value for name, (value, _) in found.items()}
-    values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values
+    values = {name: row.value for name, row in file.held.items() if name != "rotor_reaction"} | values
     for axis in AXES:
         if axis.inverse not in found:
             notes.append(f"{axis.inertia}: not identified; a guess, from the airframe or from the bracket")

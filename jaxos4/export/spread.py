@@ -40,8 +40,8 @@ def spread_of(
     """
     inverses = [axis.inverse for axis in AXES]
     known = [name for name in estimated if without_recording(name) in CARRIED]
-    held = [name for name in file.held if without_recording(name) in CARRIED and name in values and name not in known]
-    others = [name for name in (*known, *held) if name not in inverses]
+    fixed = [name for name in file.held if without_recording(name) in CARRIED and name in values and name not in known]
+    others = [name for name in (*known, *fixed) if name not in inverses]
     mean = dict(zip(INERTIAS, vehicle.inertia.tolist(), strict=True)) | {name: values[name] for name in others}
     constants, excess = _guessed_constants(file.airframe, values)
     names = [*mean, *constants]
@@ -55,7 +55,7 @@ def spread_of(
     for place, (name, (quantity, size, guess)) in enumerate(_sizes(file, mean, others).items()):
         spared = name == YAW.inertia and DRAG in constants
         share, refused = _reservations(file, quantity, spared=spared)
-        missing = inverses[place] not in known if name in INERTIAS else name in held
+        missing = inverses[place] not in known if name in INERTIAS else name in fixed
         variance = covariance[place, place] + (share * size) ** 2
         if missing or share:
             widened[name] = _MISSING if missing else _RESERVED

@@ -87,10 +87,10 @@ def vehicle_of(found: ResultSource) -> Vehicle:
         guessed = [name for name, own in zip(names, rows, strict=True) if not own]
         notes = [f"not identified, and predicted with the centre of the bracket: {', '.join(guessed)}"] * bool(guessed)
         width = dict(zip(names, half_width, strict=True))
-        channels = (*"pqr", *(FORCE_NAMES[axis] for axis in model.force_axes))
-        if lacking := [each for each in channels if each not in file.disturbances]:
+        predicted = (*"pqr", *(FORCE_NAMES[axis] for axis in model.force_axes))
+        if lacking := [each for each in predicted if each not in file.disturbances]:
             raise InputError(f"does not say the disturbance of {lacking[0]}; run `jaxos4 estimate` again.")
-        levels = [file.disturbances[each] for each in channels]
+        levels = [file.disturbances[each] for each in predicted]
         table = np.array([(each.strength, each.time_constant, each.sensor, each.smoothing or 0.0) for each in levels])
         return Vehicle(
             name,

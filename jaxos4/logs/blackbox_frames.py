@@ -157,12 +157,12 @@ class Numbers:
         """
         lead = self.byte()
         if encoding == _TAG8_4:
-            values, bits, held = [], 0, 0
+            values, bits, unread = [], 0, 0
             for width in ((0, 4, 8, 16)[lead >> shift & 3] for shift in (0, 2, 4, 6)):
-                while held < width:
-                    bits, held = bits << 8 | self.byte(), held + 8
-                held -= width
-                values.append(_extended(bits >> held, width) if width else 0)
+                while unread < width:
+                    bits, unread = bits << 8 | self.byte(), unread + 8
+                unread -= width
+                values.append(_extended(bits >> unread, width) if width else 0)
             return values
         size = lead >> 6
         if size == 0:

@@ -51,15 +51,15 @@ class ColumnMap(NamedTuple):
     needed: frozenset[str] = frozenset()
     recorded: bool = False
 
-    def chosen(self, path: LogPath, held: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
+    def chosen(self, path: LogPath, find: Callable[[str], str | None], names: Sequence[str]) -> dict[str, str]:
         """By column, its place in a log.
 
-        - `held`: takes a source; returns its name in the log, or `None` if the log does not hold it.
+        - `find`: takes a source; returns its name in the log, or `None` if it is not there.
         - `names`: all columns or topics of the log, for the `InputError` about a column that is needed.
         """
         found = {}
         for column, source in self.sources.items():
-            place = next(filter(None, map(held, source.names)), None)
+            place = next(filter(None, map(find, source.names)), None)
             if place is not None:
                 found[column] = place
             elif column in self.needed:

@@ -113,7 +113,7 @@ def _damage(path: LogPath) -> contextlib.AbstractContextManager[None]:
 def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table, tuple[str, ...]]:
     topics = sorted({each.topic for each in reader.connections})
 
-    def held(source: str) -> str | None:
+    def find(source: str) -> str | None:
         """The source with the whole name of its topic: the only topic that ends like the source's."""
         name, _, field = source.partition(".")
         found = [name] if name in topics else [topic for topic in topics if topic.endswith(name)]
@@ -122,14 +122,14 @@ def _read(path: LogPath, reader: Any, columns: ColumnMap | None) -> tuple[Table,
     notes: list[str] = []
     if columns is None:
         for columns in map(column_map, presets()):
-            found = columns.chosen(path, held, topics).keys()
+            found = columns.chosen(path, find, topics).keys()
             if found >= {*RATE_NAMES} and found & {"omega1", "command1"}:
                 break
         else:
             what = f"is for none of its presets ({', '.join(presets())}). Its topics are {listed(topics) or 'none'}"
             refuse(path, f"{what}: say in a column map which hold rates and motors, and give that map as `columns`")
         notes.append(f"columns are those of the preset {columns.name}")
-    chosen = columns.chosen(path, held, topics)
+    chosen = columns.chosen(path, find, topics)
     found = _timed(_messages(path, reader, {*chosen.values()}), notes, recorded=columns.recorded)
     return _table(Messages(path, found, _REMEDY, notes, prefixed=False), columns, chosen)
 

@@ -90,7 +90,7 @@ def speeds_within(t: Times, omega: Speeds, *, held: bool) -> Callable[[Rows, flo
     return at
 
 
-def averages(t: Times, omega: Speeds, channels: Columns, *, held: bool) -> Callable[[float], Resampled]:
+def averages(t: Times, omega: Speeds, columns: Columns, *, held: bool) -> Callable[[float], Resampled]:
     """A function that averages uniformly sampled rows to samples of a given length [s], from the first time on.
 
     Each measurement becomes the mean over a sample around its time, or NaN if less than about half of it was measured.
@@ -98,9 +98,9 @@ def averages(t: Times, omega: Speeds, channels: Columns, *, held: bool) -> Calla
     speed becomes the root mean square over the sample that follows. `omega`: [rad/s], `held` from row to row or not.
     """
     own = (t[-1] - t[0]) / (t.size - 1)
-    measured = np.isfinite(channels)
+    measured = np.isfinite(columns)
     some, gaps = measured.any(axis=0), ~measured.all(axis=0)
-    total = integral(Series(t - own / 2, np.where(measured, channels, 0.0)[:, some]))
+    total = integral(Series(t - own / 2, np.where(measured, columns, 0.0)[:, some]))
     share = integral(Series(t - own / 2, measured[:, some & gaps].astype(float)))
     speeds = root_mean_square(Series(t, omega), linear=not held)
 
@@ -108,9 +108,9 @@ def averages(t: Times, omega: Speeds, channels: Columns, *, held: bool) -> Calla
         samples = max(math.floor((t[-1] - t[0] + own) / dt + UNIFORM), 1)
         edges = np.minimum(t[0] - own / 2 + dt * np.arange(samples + 1), t[-1] + own / 2)
         grid = t[0] - own / 2 + dt * (np.arange(samples) + 0.5)
-        covered = np.repeat(np.diff(np.maximum(edges, t[0] - own / 2))[:, None], channels.shape[1], axis=1)
+        covered = np.repeat(np.diff(np.maximum(edges, t[0] - own / 2))[:, None], columns.shape[1], axis=1)
         covered[:, some & gaps] = np.diff(share(edges), axis=0)
-        means = np.full((grid.size, channels.shape[1]), np.nan)
+        means = np.full((grid.size, columns.shape[1]), np.nan)
         means[:, some] = np.diff(total(edges), axis=0)
         # Below one half, because the samples at the ends have half of their rows.
         means /= np.where(covered > 0.45 * dt, covered, np.nan)
@@ -162,16 +162,16 @@ def grid_size(t: Times, dt: float) -> float:
     return math.floor((t[-1] - t[0]) / dt + UNIFORM) + 1.0
 
 
-def resample(t: Times, omega: Speeds, channels: Columns, dt: float, *, held: bool) -> tuple[Resampled, str]:
+def resample(t: Times, omega: Speeds, columns: Columns, dt: float, *, held: bool) -> tuple[Resampled, str]:
     """Bring rows at uneven times [s] to the grid t_0, t_0 + dt, ..., with a note if that changes any.
 
-    `omega` is `held` until the next row, or interpolated (`root_mean_square`); `channels` are interpolated (`at_rows`).
+    `omega` is `held` until the next row, or interpolated (`root_mean_square`); `columns` are interpolated (`at_rows`).
     A gap is NaN, except within 1 % of dt of a sample. Rows within 1 % of a step of a uniform grid keep their values.
     """
     own, grid = (t[-1] - t[0]) / (t.size - 1), np.linspace(t[0], t[-1], t.size)
     off = np.abs(t - grid).max()
     if off <= UNIFORM * own:
-        return (t if off <= max(_ROUNDING * own, 4 * np.spacing(np.abs(t).max())) else grid, omega, channels), ""
+        return (t if off <= max(_ROUNDING * own, 4 * np.spacing(np.abs(t).max())) else grid, omega, columns), ""
     grid, step = t[0] + dt * np.arange(int(grid_size(t, dt))), np.diff(t)
     gap = step > REACH * dt
     jitter = np.std(step[~gap])
@@ -189,7 +189,7 @@ def resample(t: Times, omega: Speeds, channels: Columns, dt: float, *, held: boo
             "and count as not measured"
         )
     speeds = root_mean_square(Series(t, omega), linear=not held)(grid)
-    return (grid, speeds, at_rows(grid, Series(t, channels), step=dt)), note
+    return (grid, speeds, at_rows(grid, Series(t, columns), step=dt)), note
 
 
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:

@@ -208,8 +208,8 @@ def _stuck(x: Samples) -> Places:
     top = x >= x.max() - 1e-4 * near
     if near <= 0 or top.sum() < EQUAL:
         return none
-    held = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]])))
-    usual = float(np.quantile(held, 0.9))  # samples for which a value is held
+    lengths = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]])))
+    usual = float(np.quantile(lengths, 0.9))  # samples for which a value repeats
     at_top = sum(math.ceil((end - begin) / usual) for begin, end in runs(top))
     levels, counts = np.unique(x, return_counts=True)
     if 2 * np.sort(counts)[-LEVELS:].sum() > x.size:

@@ -101,7 +101,7 @@ class Forcing(NamedTuple):
 # The positions of the leaves of a `State` in the paper's order, Eq. (14).
 CASCADE_ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])
 
-# The number of leaves that each choice of channels needs.
+# The choices of `channels`, which of the states are compared, and the number of leaves that each needs.
 CHANNELS = {"rates": 3, "attitude": 6, "all": 12}
 
 

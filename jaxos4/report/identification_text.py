@@ -141,7 +141,7 @@ def _held(found: VehicleIdentification) -> Lines:
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
         reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
-    yield from (f"fixed, {reason}: {', '.join(held)}." for reason, held in reasons.items())
+    yield from (f"fixed, {reason}: {', '.join(rows)}." for reason, rows in reasons.items())
 
 
 def _fit(found: OS4Identification) -> Lines:

@@ -228,6 +228,6 @@ def fit_note(recording: Recording, airframe: Airframe | None) -> str:
     used = f"{ready.seconds[0]:.1f} s would be fitted, in samples of {1e3 * float(ready.fitted.dt):.3g} ms"
     if ready.tested is None:
         return f"{used}, and nothing held out."
-    held = spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
-    parts = ", ".join(f"{begin:.1f} to {end:.1f}" for begin, end in held[:8]) + ", ..." * (len(held) > 8)
+    held_out = spans(ready.time, np.isfinite(np.asarray(ready.tested.states)[:, RATES[0]]))
+    parts = ", ".join(f"{begin:.1f} to {end:.1f}" for begin, end in held_out[:8]) + ", ..." * (len(held_out) > 8)
     return f"{used}; {ready.seconds[1]:.1f} s would be held out and predicted: {parts} s."

@@ -90,13 +90,13 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
         return caption, ("estimator", *headings), rows, [source]
 
     ratio = "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do"
-    held = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
+    shares = f"Intervals of {100 * level:g} % that contain the truth [%], with 95 % Wilson intervals"
     means = "Intervals that contain the truth [%] by the level that they claim, averaged over the parameters"
     covered = metrics.coverage(data).sel(level=level)
     return {
         "error": _error_table(data),
         "efficiency": table("efficiency", "efficiency", metrics.efficiency(data), parameters, ratio),
-        "coverage": table("coverage", "coverage", 100 * covered, parameters, held),
+        "coverage": table("coverage", "coverage", 100 * covered, parameters, shares),
         "levels": table("mean_coverage", "coverage", 100 * metrics.mean_coverage(data), levels, means),
         "results": _result_table(data),
     } | ({"estimates": _estimate_table(data)} if data.sizes["flight"] == 1 else {})
@@ -187,9 +187,9 @@ def ended(data: xr.Dataset) -> list[str]:
         for j, estimator in enumerate(names(data, "estimator")):
             at = {"scale": i, "estimator": j}
             result = known.get(int(data["result"].isel(at | {"flight": 0})), "unknown result")
-            counted, hold = (int(share[name].isel(at).sum()) for name in ("count", "coverage"))
-            held = f", {hold} of {counted} intervals contain the truth" if counted else ""
-            lines.append(f"{estimator} at {scale}: {result}{held}.")
+            counted, right = (int(share[name].isel(at).sum()) for name in ("count", "coverage"))
+            coverage = f", {right} of {counted} intervals contain the truth" if counted else ""
+            lines.append(f"{estimator} at {scale}: {result}{coverage}.")
     return lines
 
 

@@ -173,10 +173,10 @@ class ShootingProblem(AbstractProblem):
 
     def recorded(self) -> Float[np.ndarray, "samples columns"]:
         """`measured` as NumPy, without a compiled program."""
-        channels = self.flight.recorded[:, self.columns]
+        measured = self.flight.recorded[:, self.columns]
         if self.initial_state is not None:
-            channels[0] = np.nan
-        return channels
+            measured[0] = np.nan
+        return measured
 
     def rows(self, parameters: Parameters | None = None) -> Rows:
         """The data of all windows for a scan, with the forcing at `parameters`, by default `model.alpha`."""

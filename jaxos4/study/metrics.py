@@ -111,7 +111,7 @@ def mean_coverage(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def hit_rate(dataset: xr.Dataset) -> xr.Dataset:
-    """The share of flights whose seed bracket held the truth, with a 95 % Wilson interval; NaN without seeds."""
+    """The share of flights whose seed bracket contained the truth, with a 95 % Wilson interval; NaN without seeds."""
     hit = dataset["hit"]
     return _share("hit_rate", hit == 1, (hit >= 0) & was_run(dataset))
 
