@@ -20,7 +20,7 @@ from jaxos4.models.state import unstack
 jax.config.update("jax_enable_x64", True)
 
 HYBRID_STEPS, HELD_OUT = 2000, 5000  # steps of training for the hybrid; held-out flights of all networks
-BLOCK = 32  # shots at a time
+BLOCK = 16  # shots at a time, as many as the package computes together
 LANES = 1024  # of the step whose operations XLA counts
 
 
