@@ -65,19 +65,22 @@ class Regression(NamedTuple):
         """The noise of the rates [rad/s]."""
         return self.problem.sigma[RATES]
 
-    def rows(self) -> tuple[RegressionRows, Callable[[RegressionRows], Float[Array, "samples 3"]]]:
-        """Regressors, then the output: a row of unit noise for p, q and r at every sample, 0 if it was not measured.
+    def rows(self) -> RegressionRows:
+        """Regressors, then the output: a row of unit noise for p, q and r at every sample, 0 if it was not measured."""
+        return self._rows(jnp.nan_to_num(self.rates))
 
-        The function turns a derivative with respect to the rows into one with respect to the measured rates.
-        """
-        rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
+    def rows_and_pullback(self) -> tuple[RegressionRows, Callable[[RegressionRows], Float[Array, "samples 3"]]]:
+        """The rows, and a function that turns a derivative with respect to them into one with respect to the rates."""
+        rows, back = jax.vjp(self._rows, jnp.nan_to_num(self.rates))
         return rows, lambda slope: back(slope)[0]
 
     def _rows(self, rates: Float[Array, "samples 3"]) -> RegressionRows:
         """The rows with other values of the measured rates; the same samples are missing."""
         measured, (filled, known) = ~jnp.isnan(self.rates), self._fill(rates)
-        increments = self._increments(filled)
-        usable = ~jnp.isnan(self._increments(jnp.where(known, filled, jnp.nan))).any(axis=-1)
+        # An increment that depends on an unknown rate is NaN. Both in one call, so that the model is traced once.
+        marked = jnp.where(known, jax.lax.stop_gradient(filled), jnp.nan)
+        increments, of_known = self._increments(jnp.stack([filled, marked]))
+        usable = ~jnp.isnan(of_known).any(axis=-1)
         if self.problem.flight.stretch is not None:
             usable &= (jnp.diff(self.problem.flight.stretch, append=-1) == 0)[:, None]
         increments = jnp.where(usable[..., None], increments, 0.0)
@@ -117,7 +120,7 @@ class Regression(NamedTuple):
         share = (samples - last) / jnp.maximum(following - last, 1)
         return jnp.where(known, before + share * (after - before), 0.0), known
 
-    def _increments(self, rates: Float[Array, "samples 3"]) -> Float[Array, "samples 3 columns"]:
+    def _increments(self, rates: Float[Array, "series samples 3"]) -> Float[Array, "series samples 3 columns"]:
         """The step of each integral from t_k to t_{k+1}: of the regressors, and of minus the center's acceleration.
 
         The input of row k acts from t_k to t_{k+1}. Forward Euler uses the rates at t_k; any other method uses the mean
@@ -127,18 +130,17 @@ class Regression(NamedTuple):
         center, half_width = self.center, self.half_width
 
         def acceleration(steps, rates, forcing):
-            return jnp.stack(model.angular_acceleration(Rates(*rates), forcing, center + half_width * steps)) * dt
+            found = jnp.stack(model.angular_acceleration(Rates(*rates), forcing, center + half_width * steps)) * dt
+            return found, found
 
         def at(rates, forcing):
-            zero = jnp.zeros_like(center)
-            regressors = jax.jacfwd(acceleration)(zero, rates, forcing)
-            return jnp.concatenate([regressors, -acceleration(zero, rates, forcing)[:, None]], axis=-1) / sigma[:, None]
+            regressors, offset = jax.jacfwd(acceleration, has_aux=True)(jnp.zeros_like(center), rates, forcing)
+            return jnp.concatenate([regressors, -offset[:, None]], axis=-1) / sigma[:, None]
 
         forcing = jax.tree.map(lambda leaf: leaf[:-1], self.problem.forcing(center))
-        increments = jax.vmap(at)(rates[:-1], forcing)
-        if self.problem.method != "euler":
-            increments = (increments + jax.vmap(at)(rates[1:], forcing)) / 2
-        return jnp.concatenate([increments, jnp.zeros_like(increments[:1])])
+        ends = rates[None, :, :-1] if self.problem.method == "euler" else jnp.stack([rates[:, :-1], rates[:, 1:]])
+        of_series = jax.vmap(jax.vmap(jax.vmap(at), in_axes=(0, None)), in_axes=(0, None))
+        return jnp.pad(of_series(ends, forcing).mean(axis=0), ((0, 0), (0, 1), (0, 0), (0, 0)))
 
     def covariance(
         self,
@@ -274,7 +276,7 @@ class EquationError(AbstractEstimator):
     def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
         data = Regression.of(problem, self)
-        rows, back = data.rows()
+        rows, back = data.rows_and_pullback()
         steps, inverse = solve(*normal_equations(rows))
         return data.answer(steps, data.covariance(rows, back, steps, inverse))
 
@@ -282,7 +284,7 @@ class EquationError(AbstractEstimator):
     def solution(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Parameters:
         """The least-squares solution alone. Parameters in which the equations are not linear stay at their center."""
         data = Regression.of(problem.within(bracket), self)
-        return data.center + data.half_width * solve(*normal_equations(data.rows()[0]))[0]
+        return data.center + data.half_width * solve(*normal_equations(data.rows()))[0]
 
 
 class RecursiveLeastSquares(AbstractEstimator):
@@ -315,7 +317,7 @@ class RecursiveLeastSquares(AbstractEstimator):
     def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
         count, data = problem.unknowns.count, Regression.of(problem, self)
-        rows, back = data.rows()
+        rows, back = data.rows_and_pullback()
 
         def update(carry, row):
             added, (information, moment, _) = normal_equations(row), carry

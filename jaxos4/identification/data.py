@@ -124,11 +124,6 @@ class Data(Generic[L]):
         """Whether samples hold the controller's answers as commands: feedthroughs then explain most innovations."""
         return self.follows_commands and bool(getattr(self.likelihood, "answers_within", False))
 
-    @property
-    def capacity(self) -> int:
-        """The number of samples of a padded flight: checks at all sample times share their programs."""
-        return self.likelihood.flight.time.shape[0]
-
 
 def class_name(instance: object, kinds: Mapping[str, type]) -> str:
     """The name of an object's class in a table of classes, or else the class's own name."""

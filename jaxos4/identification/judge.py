@@ -28,7 +28,7 @@ from ..models.flight_model import without_recording
 from ..models.state import CASCADE_ORDER
 from ..recording.motion import OVER_NOISE, WEAK
 from ..results import result_names
-from ..shooting import ShootingProblem, padded, with_capacity
+from ..shooting import ShootingProblem, padded
 from ..shooting.gains import LogNoise
 from .answers import (
     UNIT,
@@ -186,7 +186,7 @@ def judge_vehicle(
         of_yaw = {YAW.coupling, YAW.inverse} & table.keys()
         table |= {name: msgspec.structs.replace(table[name], note=said) for name in of_yaw}
         still = (*still, *({YAW.motion} - {*still}))
-    response = frequency_response(with_capacity(answer.problem, data.capacity), as_float(answer.parameters))
+    response = frequency_response(padded(answer.problem), as_float(answer.parameters))
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(answer, predicted)
     found = msgspec.structs.replace(
@@ -242,8 +242,7 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
     every = predicted_by(answer.parameters, answer.optimum.noise, horizons)
     predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
     own, fixed = skill(predicted), [name in answer.fixed for name in names]
-    padded_problem, fitted = with_capacity(answer.problem, data.capacity), as_float(answer.parameters)
-    regressed = np.asarray(_regressed(padded_problem, fitted, np.asarray(fixed)))
+    regressed = np.asarray(_regressed(padded(answer.problem), as_float(answer.parameters), np.asarray(fixed)))
     compared = skill(predicted_by(regressed, None))
     tables = (own.skill, own.std, own.rmse, own.persistence, compared.skill)
     rates = {
@@ -270,7 +269,7 @@ def _disturbances(
     its prediction from the sample before. The model is evaluated at the measured rates.
     """
     samples = problem.flight.time.shape[0]
-    problem = with_capacity(problem, max(samples, data.capacity))
+    problem = padded(problem)
     flight, rates = problem.flight, np.asarray(problem.flight.states)[:, RATES]
     modelled = np.pad(modelled_acceleration(problem, as_float(parameters)), ((0, 1), (0, 0)))
     of_rates = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
