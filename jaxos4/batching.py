@@ -92,6 +92,30 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
     return with_batch(one, of_batch, arrays)()
 
 
+def where_needed(needed: Bool[Array, ""], function: Callable[..., R], otherwise: R, *arguments: Any) -> R:
+    """`function(*arguments)` if `needed`, else `otherwise`. A batch computes the function if any lane needs it.
+
+    The function must not close over arrays that differ between lanes. A batch of `jax.lax.cond` always computes both.
+    """
+
+    def one(needed: Bool[Array, ""], otherwise: R, *arguments: Any) -> R:
+        return jax.lax.cond(needed, function, lambda *_: otherwise, *arguments)
+
+    def of_batch(lanes: int, many: Any, shared: Any) -> R:
+        def each_lane(lane: Callable) -> R:
+            return jax.vmap(lambda own: lane(*eqx.combine(own, shared)), axis_size=lanes)(many)
+
+        def chosen(needed: Bool[Array, ""], otherwise: R, *arguments: Any) -> R:
+            return jax.tree.map(functools.partial(jnp.where, needed), function(*arguments), otherwise)
+
+        any_needed = eqx.combine(many, shared)[0].any()
+        return jax.lax.cond(
+            any_needed, lambda: each_lane(chosen), lambda: each_lane(lambda _, otherwise, *__: otherwise)
+        )
+
+    return with_batch(one, of_batch)(needed, otherwise, *arguments)
+
+
 def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) -> Any:
     """`function()` if any lane needs it, else zeros.
 

@@ -11,7 +11,7 @@ import pytest
 from helpers import compiled_programs, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.batching import for_threads
+from jaxos4.batching import for_threads, where_needed
 from jaxos4.shooting import padded
 
 PROGRAMS = ["jit(__call__)", "jit(_default)", "jit(_fly)", "jit(_intervals)"]
@@ -89,6 +89,28 @@ def test_padding_changes_no_result(channels):
     np.testing.assert_allclose(cost, own_cost, rtol=1e-12)
     np.testing.assert_allclose(residuals[:501], own, rtol=1e-9)
     assert not residuals[501:].any()
+
+
+def test_a_batch_computes_a_branch_where_a_lane_needs_it():
+    """The function is called for a batch in which one lane needs it, and for no other."""
+    calls = []
+
+    def half(x):
+        jax.debug.callback(lambda: calls.append(1))
+        return x / 2
+
+    @jax.jit
+    @jax.vmap
+    def halved_above(x, limit):
+        return where_needed(x > limit, half, x, x)
+
+    x = jnp.arange(4.0)
+    np.testing.assert_array_equal(halved_above(x, jnp.full(4, 5.0)), x)
+    jax.effects_barrier()
+    assert not calls
+    np.testing.assert_array_equal(halved_above(x, jnp.full(4, 2.0)), [0, 1, 2, 1.5])
+    jax.effects_barrier()
+    assert calls
 
 
 def test_padding_makes_no_flight_long():

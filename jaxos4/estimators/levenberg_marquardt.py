@@ -8,6 +8,7 @@ References: Marquardt 1963, SIAM J. Appl. Math. 11(2); compare Dennis, Gay and W
 Softw. 7(3).
 """
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar, integer, setting
+from ..batching import where_needed
 from ..estimate import REACH
 from ..linalg import joint_factor, limited, movable, slopes_along
 from ..shooting import LocalModel, Stage, WindowUnknowns
@@ -114,7 +116,10 @@ class LevenbergMarquardt(AbstractSolver[SearchState]):
         lower, upper = (limit - best for limit in limits)
         moves = movable(best, model.gradient, limits, count) & stage.searched
         slope = jnp.where(moves, model.gradient, 0.0)
-        minimum = self._minimum(stage, moves, slope, model.information, damping)
+        # Without `stage`, whose local model closes over the data of each lane.
+        minimise = functools.partial(self._minimum, count)
+        local = stage.off, stage.stride, moves, slope, damping
+        minimum = minimise(*local, model.information)
         plain = limited(*minimum, (lower, upper), count)
         left = self._left(stage, plain, model, damping)
         # The last step is the plain one, without secant or stride. No shot confirms it, so a success must come before.
@@ -131,12 +136,8 @@ class LevenbergMarquardt(AbstractSolver[SearchState]):
         steeper = jnp.where((near | ~better | state.is_steep) & is_more, steeper, 0.0)
         flatter = jnp.where(near & ~is_more, jax.vmap(_flatter)(moved, change, predicted), 0.0)
         missing = steeper + flatter
-
-        def corrected() -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
-            return self._minimum(stage, moves, slope, model.information + missing, damping)
-
-        # Unless batched, a second factorisation is made only where a secant applies.
-        step, basis = jax.lax.cond((missing != 0).any(), corrected, lambda: minimum)
+        # A second factorisation is made only where a secant applies.
+        step, basis = where_needed((missing != 0).any(), minimise, minimum, *local, model.information + missing)
         room = jnp.maximum(lower, -stage.stride), jnp.minimum(upper, stage.stride)
         trial = jnp.clip(best + limited(step, basis, room, count), *limits)
         done, is_steep = last | ~jnp.isfinite(trial).all(), (steeper != 0).any()
@@ -168,39 +169,41 @@ class LevenbergMarquardt(AbstractSolver[SearchState]):
 
         An undamped step lowers a quadratic by half of this, so searches end later than the tolerance says.
         """
-        unit, least = self._unit(stage, model.information), self._least(stage)
+        unit, least = self._unit(stage.unknowns.count, stage.off, model.information), _least(stage.stride)
         eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
         promised = -model.gradient * step
         return jnp.maximum(promised.sum(), (eased * promised).sum())
 
     def _minimum(
         self,
-        stage: Stage,
+        count: int,
+        off: WindowUnknowns,
+        stride: WindowUnknowns,
         moves: Bool[Array, "windows n"],
         slope: WindowUnknowns,
-        information: Float[Array, "windows n n"],
         damping: Scalar,
+        information: Float[Array, "windows n n"],
     ) -> tuple[WindowUnknowns, Float[Array, "windows n n"]]:
         """The damped step to the minimum of a local model along the unknowns that move, and its basis.
 
-        `slope`: the gradient, 0 for unknowns that do not move.
+        `count`, `off`, `stride`: of the stage. `slope`: the gradient, 0 for unknowns that do not move.
         """
-        count = stage.unknowns.count
         information = jnp.where(moves[:, :, None] & moves[:, None, :], information, 0.0)
-        added = damping * self._unit(stage, information) + self._least(stage)
+        added = damping * self._unit(count, off, information) + _least(stride)
         basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
         return -(basis * slopes_along(basis, slope, count)[:, None, :]).sum(axis=-1), basis
 
-    def _least(self, stage: Stage) -> WindowUnknowns:
-        """The information that always damps each unknown."""
-        return _STRIDE_INFORMATION / jnp.square(stage.stride)
-
-    def _unit(self, stage: Stage, information: Float[Array, "windows n n"]) -> WindowUnknowns:
+    def _unit(self, count: int, off: WindowUnknowns, information: Float[Array, "windows n n"]) -> WindowUnknowns:
         """The information that a damping of 1 adds. For a parameter it is divided among the windows, which share it."""
         if self.is_relative:
             diagonal = jnp.diagonal(information, axis1=1, axis2=2)
             return jnp.where(diagonal > 0, diagonal, 1.0)
-        return 1 / jnp.square(stage.off).at[:, : stage.unknowns.count].multiply(stage.off.shape[0])
+        return 1 / jnp.square(off).at[:, :count].multiply(off.shape[0])
+
+
+def _least(stride: WindowUnknowns) -> WindowUnknowns:
+    """The information that always damps each unknown."""
+    return _STRIDE_INFORMATION / jnp.square(stride)
 
 
 def _steeper(
