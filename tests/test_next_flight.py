@@ -1,10 +1,13 @@
 """What to fly next: from the half-width now to the 10 % that a verdict needs, or the remedy of another cause."""
 
+import json
+
 import msgspec
 import pytest
 from pages import page_of, printed, says, words
 from synthetic_identification import identified_flight, identified_vehicle
 
+import jaxos4
 from jaxos4.identification.next_flight import next_flight, spreads_of
 from jaxos4.identification.results import Constant, RigidBody
 from jaxos4.identification.verdict import RESERVATION, RESERVED, Issue, Quantity, Verdict, verdicts_of
@@ -44,14 +47,16 @@ def test_time_is_that_of_all_flights_that_count():
     says(next_flight(both, {"Ix": 0.099}), "next: nothing is missing.")
 
 
-def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once():
+def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once(tmp_path):
     calm = Issue("unidentifiable", "gusts are larger", "fly more yaw, or in calmer air", {"Iz": None})
     slow = Issue(RESERVATION, "the log is slow", "log faster", {"Ix": None})
     found = vehicle({"Ix": 0.05, "Iz": 0.05}, [calm, slow])
-    unseen = Verdict("not identified", "", ("it is unseen; fly more yaw",))
+    unseen = Verdict("not identified", "", ("it is unseen; fly more yaw",), ("fly more yaw",))
     verdicts = found.verdicts | {"predictions": unseen, "drag": msgspec.structs.replace(unseen, status=RESERVED)}
     found = msgspec.structs.replace(found, verdicts=verdicts)
-    says(said(found), "next: log faster (Ix); fly more yaw, or in calmer air (Iz, predictions).")
+    (tmp_path / "found.json").write_text(json.dumps(found.to_dict()))
+    for each in (found, jaxos4.read_result(tmp_path / "found.json")):
+        says(said(each), "next: log faster (Ix); fly more yaw, or in calmer air (Iz, predictions).")
 
 
 def test_terminal_and_page_end_with_it(tmp_path):

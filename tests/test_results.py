@@ -333,7 +333,7 @@ def test_what_a_verdict_refuses_is_shown_and_does_not_count(tmp_path):
 
 
 CAREFUL = Verdict("identified with a reservation", "", ("it is known to 16 % only; fly more roll, or longer",))
-UNSEEN = Verdict("not identified", "", ("the disturbance is larger; fly more yaw",))
+UNSEEN = Verdict("not identified", "", ("the disturbance is larger; fly more yaw",), ("fly more yaw",))
 
 
 def test_a_comparison_is_not_more_confident_than_its_results(tmp_path, run):

@@ -24,7 +24,16 @@ from jaxos4.identification.prepare_vehicle import prepare_vehicle
 from jaxos4.identification.quantities import prediction_horizons, vehicle_quantities
 from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill, RigidBody
 from jaxos4.identification.search import search
-from jaxos4.identification.verdict import RESERVATION, Issue, Move, Quantity, reason_lines, result_of, verdicts_of
+from jaxos4.identification.verdict import (
+    RESERVATION,
+    Issue,
+    Move,
+    Quantity,
+    Reason,
+    reason_lines,
+    result_of,
+    verdicts_of,
+)
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import Recording
 from jaxos4.recording.prepared import prepare
@@ -103,7 +112,7 @@ def test_reservations_add_up_beside_an_impossible_parameter(moves, results, stat
 def test_a_quantity_that_is_hardly_known_is_not_identified(monkeypatch):
     statuses = [verdict_of("Ix", Quantity(spread=spread), []).status for spread in (0.1, 0.3, 0.5)]
     assert statuses == [IDENTIFIED, RESERVED, MISSING]
-    missing = verdict_of("Iz", Quantity(missing="it hardly yaws"), [])
+    missing = verdict_of("Iz", Quantity(missing=Reason("it hardly yaws")), [])
     assert (missing.status, missing.reasons) == (MISSING, ("it hardly yaws",))
     monkeypatch.setattr(verdict, "TOO_UNCERTAIN", 0.05)
     assert verdict_of("Ix", Quantity(spread=0.1), []).status == MISSING
@@ -166,7 +175,7 @@ def test_a_reservation_that_moves_a_quantity_by_more_than_itself_contradicts_it(
 
 
 def test_a_quantity_is_not_identified_without_those_that_it_requires():
-    unknown = Quantity(missing="it hardly rolls")
+    unknown = Quantity(missing=Reason("it hardly rolls"))
     found = verdicts_of({"Ix": unknown, "damping": Quantity(requires=("Ix",))}, [])
     assert found["damping"].status == MISSING
     assert found["damping"].reasons == ("it cannot be trusted without Ix",)
@@ -178,13 +187,13 @@ def test_predictions_reach_as_far_as_their_skill_is_clear():
     poor = RateSkill([0.5, 0.03, 0.4], [0.1, 0.21, 0.1], *[[None] * 3] * 3)
     found = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, clear, poor, clear), ["yaw"])
     assert found.value == "better than constant rates up to roll 0.5 s, pitch 0.1 s ahead"
-    assert found.reservations == ("yaw cannot be checked; fly more yaw",)
+    assert found.reservations == (Reason("yaw cannot be checked; fly more yaw", "fly more yaw"),)
     never = RateSkill([0.05, -0.1, -0.2], [0.1, 0.1, 0.1], *[[None] * 3] * 3)
     one = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, never, clear, clear), ["yaw"])
     assert one.value == "better than constant rates up to pitch 0.5 s ahead; no better for roll"
     none = prediction_horizons(PredictionSkill([0.1, 0.25, 0.5], 100, never, never, clear), ["yaw"])
-    said = "roll and pitch cannot be predicted better than by constant rates; fly more roll and pitch"
-    assert none == Quantity(missing=said)
+    cause = "roll and pitch cannot be predicted better than by constant rates"
+    assert none == Quantity(missing=Reason.of(cause, "fly more roll and pitch"))
 
 
 def test_the_result_is_that_of_what_was_asked():
@@ -294,8 +303,8 @@ def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
     constants = {name: Constant(1.0, 0.1, "kg m^2", "") for name in ("Ix", "Iy", "Iz")}
     rows = identified_vehicle(parameters=table, rigid_body=RigidBody(constants), skill=None)
     found = vehicle_quantities(fitted, rows, [])
-    wider = [each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations if "wider" in each]
-    assert wider == [
+    reservations = (each for name in ("Ix", "Iz", "thrust", "motors") for each in found[name].reservations)
+    assert [each.words for each in reservations if "wider" in each.remedy] == [
         "Ix is 2.5 times the guess; check `mass` and `rotor_positions`, or give a wider `bracket`",
         "Iz is 2.5 times the guess; measure `drag_coefficient`, or give a wider `bracket`",
         "thrust_gain is outside its bracket; check the airframe, or give a wider `bracket`",
@@ -306,7 +315,8 @@ def test_only_an_airframe_that_has_a_constant_is_blamed_for_it(fitted):
         values = np.asarray(fitted.estimate.parameters).copy()
         values[place] = thrust
         other = eqx.tree_at(lambda e: e.parameters, fitted.estimate, values)
-        first, *_ = (*vehicle_quantities(dataclasses.replace(fitted, estimate=other), rows, [])["Ix"].reservations, "")
+        reservations = vehicle_quantities(dataclasses.replace(fitted, estimate=other), rows, [])["Ix"].reservations
+        first = reservations[0].words if reservations else ""
         assert first.startswith(said) if said else "guess" not in first
 
 

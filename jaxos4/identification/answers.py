@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -147,15 +148,16 @@ def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {
     def row(i: int, name: str) -> ParameterEstimate:
         value, half, known = float(values[i]), float(width[i]), bool(identifiable[i])
         least = 0.0 if name in answer.negative else -np.inf
-        return ParameterEstimate(
+        found = ParameterEstimate(
             estimate=value if known else None,
             std=finite_or_none(std[i]),
             bound=finite_or_none(answer.bound[i]),
             ci95=(max(value - half, least), value + half) if known else None,
             unit=unknowns.units[i],
-            note=_note(answer, i, half) if known else missing.get(name, "not identifiable from this flight"),
+            note="" if known else missing.get(name, "not identifiable from this flight"),
             bracket=(float(lower[i]), float(upper[i])) if np.isfinite([lower[i], upper[i]]).all() else None,
         )
+        return msgspec.structs.replace(found, note="; ".join(notes_of(answer, name, found))) if known else found
 
     return {unknowns.names[i]: row(i, unknowns.names[i]) for i in answer.free}
 
@@ -165,12 +167,13 @@ def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
     return estimate.std, estimate.half_width(0.95)
 
 
-def _note(answer: Answer, i: int, half_width: float) -> str:
-    value, seed = float(answer.parameters[i]), answer.estimate.seed
-    bracket, name = answer.problem.unknowns.bracket, answer.problem.unknowns.names[i]
+def notes_of(answer: Answer, name: str, row: ParameterEstimate) -> list[str]:
+    """The warnings about a parameter that has an estimate."""
+    i, seed, bracket = answer.problem.unknowns.names.index(name), answer.estimate.seed, answer.problem.unknowns.bracket
+    value = float(answer.parameters[i])
     if name in answer.negative:
-        return NEGATIVE_NOTE
-    notes = ["below noise"] if abs(value) < half_width else []
+        return [NEGATIVE_NOTE]
+    notes = ["below noise"] if row.is_below_noise else []
     if not np.asarray(bracket.lower)[i] <= value <= np.asarray(bracket.upper)[i]:
         notes.append("outside its bracket")
     if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
@@ -178,7 +181,7 @@ def _note(answer: Answer, i: int, half_width: float) -> str:
     factor = answer.profiled.get(name, 1.0)
     if factor >= NOTED:
         notes.append(f"interval {factor:.1f} times as long, by the profile of the likelihood")
-    return "; ".join(notes)
+    return notes
 
 
 def dominated(answer: VehicleAnswer) -> dict[str, str]:

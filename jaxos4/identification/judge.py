@@ -88,7 +88,7 @@ def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name:
     )
     # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
     issues = issues_of_os4(data, found, found.fit if estimator.shoots else {})
-    verdicts = verdicts_of(os4_quantities(found), issues)
+    verdicts = verdicts_of(os4_quantities(answer, found), issues)
     # Only the alphas were requested. An alpha that the flight does not show is no fault of the answer.
     wrong = [name for name in found.parameters if verdicts[name].status == CONTRADICTED]
     result = result_of(verdicts, issues, search, wrong if search == "successful" else found.parameters)

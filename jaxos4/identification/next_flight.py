@@ -1,12 +1,12 @@
 """Advice for the next flight: which motion to fly and how long, or the remedy, for each poorly known quantity."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from ..airframe import AXES, INERTIAS
 from ..errors import percent
 from .results import Identification
-from .verdict import IDENTIFIED, MISSING, ONLY_KNOWN_TO, RESERVED, UNCERTAIN, pooled_status
+from .verdict import IDENTIFIED, MISSING, RESERVED, UNCERTAIN, pooled_status
 
 _ROUND = 5.0  # s; flights are not planned more precisely
 _MOST = 300.0  # s, about one battery: beyond it a stronger motion is the better advice
@@ -27,9 +27,8 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
     motions, known, flown, advised = [], [], set(), {}
     for axis in AXES:
         spread, fitted = spreads.get(axis.inertia, 0.0), counted.get(axis.inertia, [])
-        whys = [why for each in fitted for why in each.verdicts[axis.inertia].reasons if why.startswith(ONLY_KNOWN_TO)]
-        helps = not whys or any("fly" in why for why in whys)  # no flight measures a drag coefficient
-        if fitted and helps and UNCERTAIN < spread < math.inf:
+        helps = {each.verdicts[axis.inertia].flying_helps for each in fitted}
+        if fitted and (True in helps or False not in helps) and UNCERTAIN < spread < math.inf:
             every = (each.provenance.fitted_seconds for each in fitted)
             motions.append(_more(axis.motion, spread, sum(x for x in every if isinstance(x, float))))
             flown.add(f"fly more {axis.motion}")
@@ -37,7 +36,8 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
     if motions:
         advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * UNCERTAIN:.0f} %"]
     for name, own in counted.items():
-        for remedy in dict.fromkeys(each for each in _remedies(name, own) if each.split(",")[0] not in flown):
+        remedies = dict.fromkeys(remedy for each in own for remedy in _remedies(name, each))
+        for remedy in (each for each in remedies if each.split(",")[0] not in flown):
             # A remedy that begins another one adds nothing to it.
             same = next((each for each in advised if each.startswith(remedy)), remedy)
             advised.setdefault(same, []).append(name)
@@ -72,16 +72,10 @@ def _more(motion: str, spread: float, seconds: float) -> str:
     return f"{motion} as long as before but {lacking**0.5:.2g} times as strong"
 
 
-def _remedies(name: str, results: Sequence[Identification]) -> Iterator[str]:
-    """The remedies of the causes that keep a quantity of these results from being identified."""
-    for found in results:
-        verdict = found.verdicts[name]
-        issues = [each for each in found.issues if each.status_allowed(name) != IDENTIFIED]
-        # A verdict holds only the reasons for its status.
-        yield from (each.remedy for each in issues if any(each.cause in said for said in verdict.reasons))
-        for said in verdict.reasons:
-            cause, _, remedy = said.rpartition("; ")
-            if cause and not cause.startswith(ONLY_KNOWN_TO) and not any(each.cause in said for each in issues):
-                yield remedy
-            elif verdict.status == MISSING and not found.is_vehicle and not issues:
-                yield "fly what `jaxos4 design` proposes"
+def _remedies(name: str, found: Identification) -> tuple[str, ...]:
+    """What keeps a quantity of this result from being identified, as remedies."""
+    verdict = found.verdicts[name]
+    if verdict.status == MISSING and not found.is_vehicle:
+        if all(each.status_allowed(name) == IDENTIFIED for each in found.issues):
+            return ("fly what `jaxos4 design` proposes",)
+    return verdict.remedies

@@ -50,6 +50,11 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     noise_limit: float | None | msgspec.UnsetType = msgspec.UNSET
     bracket: tuple[float, float] | None | msgspec.UnsetType = msgspec.UNSET
 
+    @property
+    def is_below_noise(self) -> bool:
+        """Whether the estimate cannot be distinguished from 0."""
+        return self.ci95 is not None and self.ci95[0] < 0 < self.ci95[1]
+
     def is_outside_bracket(self, times: float = 1.0) -> bool:
         """Whether the estimate lies outside the bracket, or one that is this many times as wide, if there are both."""
         wider = self.wider_bracket(times)

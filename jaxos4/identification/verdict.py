@@ -38,7 +38,6 @@ MAX_SHARE, MAX_DEVIATIONS = 0.05, 1.0
 # Relative half-widths of a 95 % interval above which a moment of inertia has a reservation, or is not identified. With
 # intervals of 10 % and less, 1 answer in 160 is off by more than 12 %.
 UNCERTAIN, TOO_UNCERTAIN = 0.1, 0.4
-ONLY_KNOWN_TO = "it is known to"  # begins the reason of a long interval
 MAX_PRIOR = 0.25  # share of the information about a parameter that its bracket may give without a reservation
 UNUSUAL = 2.0  # times the width of a prior's bracket; 5 % of usual values are outside
 SIGNIFICANT = 3.0  # standard deviations that exceed chance
@@ -123,11 +122,15 @@ class Verdict(msgspec.Struct, frozen=True):
       that consist of parameters, whose table shows them.
     - `reasons`: the reservations, or the causes with their remedies; without a remedy if the size of the move is known,
       because `next_flight` gives it. Empty if the quantity is `identified`.
+    - `remedies`: what to do about these reasons, except flying more because the interval is too long.
+    - `flying_helps`: whether a longer or stronger flight shortens the interval; `None` if it is not too long.
     """
 
     status: str
     value: str = ""
     reasons: tuple[str, ...] = ()
+    remedies: tuple[str, ...] = ()
+    flying_helps: bool | None = None
 
     @property
     def trusted(self) -> bool:
@@ -135,21 +138,34 @@ class Verdict(msgspec.Struct, frozen=True):
         return self.status in _TRUSTED
 
 
+class Reason(NamedTuple):
+    """Why a quantity is not simply identified, in words, and what to do about it; empty if nothing can be done."""
+
+    words: str
+    remedy: str = ""
+
+    @classmethod
+    def of(cls, cause: str, remedy: str) -> "Reason":
+        """A reason whose words are the cause, then the remedy."""
+        return cls(f"{cause}; {remedy}", remedy)
+
+
 class Quantity(NamedTuple):
     """A quantity before it is judged.
 
     - `value`: see `Verdict`. `spread`: relative half-width of the 95 % interval; 0 if the quantity can be 0.
-    - `missing`: why there is no estimate, and what to do; empty if there is one.
+    - `missing`: why there is no estimate; `None` if there is one.
     - `reservations`: caveats that are not issues.
-    - `remedy`: what to do if the interval is too long.
+    - `remedy`: what to do if the interval is too long. `flying_helps`: whether a longer or stronger flight shortens it.
     - `requires`: the quantities that must be trusted too.
     """
 
     value: str = ""
     spread: float = 0.0
-    missing: str = ""
-    reservations: tuple[str, ...] = ()
+    missing: Reason | None = None
+    reservations: tuple[Reason, ...] = ()
     remedy: str = "fly more, or longer"
+    flying_helps: bool = True
     requires: tuple[str, ...] = ()
 
 
@@ -157,19 +173,26 @@ def verdicts_of(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> 
     """The verdict for each quantity. `issues`: all issues of the identification."""
     verdicts = {}
     for name, quantity in quantities.items():
-        causes: dict[str, list[str]] = {status: [] for status in STATUSES}
+        causes: dict[str, list[Reason]] = {status: [] for status in STATUSES}
         for issue, status in zip(issues, _statuses_allowed(issues, name), strict=True):
-            causes[status].append(_reason(issue, name))
+            causes[status].append(Reason(_in_words(issue, name), issue.remedy))
         causes[RESERVED] += quantity.reservations
-        if quantity.missing and not causes[MISSING]:
+        if quantity.missing is not None and not causes[MISSING]:
             causes[MISSING].append(quantity.missing)
-        known = f"{ONLY_KNOWN_TO} {100 * quantity.spread:.0f} % only; {quantity.remedy}"
+        known = Reason(f"it is known to {100 * quantity.spread:.0f} % only; {quantity.remedy}")
         if quantity.spread > TOO_UNCERTAIN:
             causes[MISSING].append(known)
         elif quantity.spread > UNCERTAIN:
             causes[RESERVED].append(known)
         status = next((each for each in reversed(STATUSES[1:]) if causes[each]), IDENTIFIED)
-        verdicts[name] = Verdict(status, quantity.value, tuple(causes[status]) if status != IDENTIFIED else ())
+        counted = causes[status] if status != IDENTIFIED else []
+        verdicts[name] = Verdict(
+            status,
+            quantity.value,
+            reasons=tuple(each.words for each in counted),
+            remedies=tuple(dict.fromkeys(each.remedy for each in counted if each.remedy)),
+            flying_helps=quantity.flying_helps if known in counted else None,
+        )
     for name, quantity in quantities.items():
         lacking = [each for each in quantity.requires if each in verdicts and not verdicts[each].trusted]
         if lacking and verdicts[name].trusted:
@@ -214,7 +237,7 @@ def _statuses_allowed(issues: Sequence[Issue], name: str) -> list[str]:
     return [CONTRADICTED if i in sized else status for i, status in enumerate(alone)]
 
 
-def _reason(issue: Issue, name: str) -> str:
+def _in_words(issue: Issue, name: str) -> str:
     """The issue in words, and how far it moves this quantity, or else the inertias."""
     if (move := issue.moves.get(name)) is not None:
         return f"{issue.cause} (this would move it by {percent(move.share)})"

@@ -126,7 +126,7 @@ def _parameters(found: Identification) -> Lines:
     limits = [
         f"{plain(1 / row.noise_limit, 2)} ({name})"
         for name, row in found.parameters.items()
-        if "below noise" in row.note and row.noise_limit and row.noise_limit < 1
+        if row.is_below_noise and row.noise_limit and row.noise_limit < 1
     ]
     if limits:
         yield (

@@ -37,7 +37,9 @@ VERSIONS = {"airframe": "os4", "version": "0", "jax": "0", "device": "cpu", "pre
 
 VERDICTS = {
     "Ix": Verdict("identified", "1.73e-05 +- 2.9e-07 kg m^2 (95 %), if arms and mass are right"),
-    "Iz": Verdict("not identified", "", ("the flights say less about alpha8 than its bracket; fly more yaw",)),
+    "Iz": Verdict(
+        "not identified", "", ("the flights say less about alpha8 than its bracket; fly more yaw",), ("fly more yaw",)
+    ),
 }
 WRONG = {"Ix": Verdict("contradicted", "", ("Ix is negative; check the arms",))}
 SAMPLE_TIMES = tuple(
