@@ -5,10 +5,13 @@ import json
 import msgspec
 import pytest
 from pages import page_of, printed, says, words
-from synthetic_identification import identified_flight, identified_vehicle
+from synthetic_identification import UNKNOWN, identified_flight, identified_vehicle
 
 import jaxos4
+from jaxos4.identification.answers import OS4Answer
+from jaxos4.identification.issues_of_values import MEASURE
 from jaxos4.identification.next_flight import next_flight, spreads_of
+from jaxos4.identification.quantities import os4_quantities
 from jaxos4.identification.results import Constant, RigidBody
 from jaxos4.identification.verdict import RESERVATION, RESERVED, Issue, Quantity, Verdict, verdicts_of
 
@@ -59,6 +62,14 @@ def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once(t
         says(said(each), "next: log faster (Ix); fly more yaw, or in calmer air (Iz, predictions).")
 
 
+def test_nobody_is_told_to_fly_for_an_inertia_that_lacks_a_drag_coefficient():
+    """The issue alone refuses Iz: an interval of 30 % would be a reservation only."""
+    drag = Issue("unidentifiable", "the thrust is another", MEASURE, {"Iz": None})
+    found = vehicle({"Iz": 0.3}, [drag])
+    verdicts = verdicts_of({"Iz": Quantity(spread=0.3, remedy=MEASURE, flying_helps=False)}, [drag])
+    assert said(msgspec.structs.replace(found, verdicts=verdicts)) == f"next: {MEASURE} (Iz)."
+
+
 def test_terminal_and_page_end_with_it(tmp_path):
     found = vehicle()
     line = said(found)
@@ -68,5 +79,10 @@ def test_terminal_and_page_end_with_it(tmp_path):
 
 
 def test_an_os4_that_does_not_show_a_parameter_is_told_to_design_a_flight():
-    unseen = {"alpha6": Verdict("not identified", "", ("not identifiable: not excited",))}
-    says(said(identified_flight(verdicts=unseen)), "next: fly what `jaxos4 design` proposes (alpha6).")
+    """Even if all quantities have a reservation too."""
+    coloured = Issue(RESERVATION, "the noise is coloured", "use another model", {"alpha6": None, "rigid body": None})
+    found = identified_flight(parameters={"alpha6": UNKNOWN}, rigid_body=RigidBody(), issues=(coloured,))
+    nothing = object.__new__(OS4Answer)  # is not read for parameters without an estimate
+    verdicts = verdicts_of(os4_quantities(nothing, found), found.issues)
+    advice = said(msgspec.structs.replace(found, verdicts=verdicts))
+    assert advice == "next: fly what `jaxos4 design` proposes (alpha6, rigid body)."

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from ..airframe import AXES, INERTIAS
 from ..errors import percent
 from .results import Identification
-from .verdict import IDENTIFIED, MISSING, RESERVED, UNCERTAIN, pooled_status
+from .verdict import IDENTIFIED, RESERVED, UNCERTAIN, pooled_status
 
 _ROUND = 5.0  # s; flights are not planned more precisely
 _MOST = 300.0  # s, about one battery: beyond it a stronger motion is the better advice
@@ -27,8 +27,8 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
     motions, known, flown, advised = [], [], set(), {}
     for axis in AXES:
         spread, fitted = spreads.get(axis.inertia, 0.0), counted.get(axis.inertia, [])
-        helps = {each.verdicts[axis.inertia].flying_helps for each in fitted}
-        if fitted and (True in helps or False not in helps) and UNCERTAIN < spread < math.inf:
+        helps = any(each.verdicts[axis.inertia].flying_helps for each in fitted)
+        if helps and UNCERTAIN < spread < math.inf:
             every = (each.provenance.fitted_seconds for each in fitted)
             motions.append(_more(axis.motion, spread, sum(x for x in every if isinstance(x, float))))
             flown.add(f"fly more {axis.motion}")
@@ -36,7 +36,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
     if motions:
         advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * UNCERTAIN:.0f} %"]
     for name, own in counted.items():
-        remedies = dict.fromkeys(remedy for each in own for remedy in _remedies(name, each))
+        remedies = dict.fromkeys(remedy for each in own for remedy in each.verdicts[name].remedies)
         for remedy in (each for each in remedies if each.split(",")[0] not in flown):
             # A remedy that begins another one adds nothing to it.
             same = next((each for each in advised if each.startswith(remedy)), remedy)
@@ -70,12 +70,3 @@ def _more(motion: str, spread: float, seconds: float) -> str:
     if seconds * lacking <= _MOST:
         return f"{_ROUND * math.ceil(seconds * lacking / _ROUND):.0f} s more {motion}"
     return f"{motion} as long as before but {lacking**0.5:.2g} times as strong"
-
-
-def _remedies(name: str, found: Identification) -> tuple[str, ...]:
-    """What keeps a quantity of this result from being identified, as remedies."""
-    verdict = found.verdicts[name]
-    if verdict.status == MISSING and not found.is_vehicle:
-        if all(each.status_allowed(name) == IDENTIFIED for each in found.issues):
-            return ("fly what `jaxos4 design` proposes",)
-    return verdict.remedies

@@ -121,11 +121,11 @@ def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> 
 
 def os4_quantities(answer: Answer, found: OS4Identification) -> dict[str, Quantity]:
     """The alphas of an OS4, and its rigid body. `found`: the parameters and the rigid body of the answer."""
-    quantities = {}
+    quantities, remedy = {}, "fly what `jaxos4 design` proposes"
     for name, row in found.parameters.items():
         if row.estimate is None:
-            quantities[name] = Quantity(missing=Reason(row.note))
+            quantities[name] = Quantity(missing=Reason(row.note, remedy))
         else:
             quantities[name] = Quantity(reservations=tuple(map(Reason, notes_of(answer, name, row))))
-    unknown = None if found.rigid_body.constants else Reason("the alphas are not known well enough")
+    unknown = None if found.rigid_body.constants else Reason("the alphas are not known well enough", remedy)
     return quantities | {RIGID_BODY: Quantity(missing=unknown)}

@@ -123,14 +123,14 @@ class Verdict(msgspec.Struct, frozen=True):
     - `reasons`: the reservations, or the causes with their remedies; without a remedy if the size of the move is known,
       because `next_flight` gives it. Empty if the quantity is `identified`.
     - `remedies`: what to do about these reasons, except flying more because the interval is too long.
-    - `flying_helps`: whether a longer or stronger flight shortens the interval; `None` if it is not too long.
+    - `flying_helps`: whether a longer or stronger flight shortens the interval.
     """
 
     status: str
     value: str = ""
     reasons: tuple[str, ...] = ()
     remedies: tuple[str, ...] = ()
-    flying_helps: bool | None = None
+    flying_helps: bool = True
 
     @property
     def trusted(self) -> bool:
@@ -156,7 +156,7 @@ class Quantity(NamedTuple):
     - `value`: see `Verdict`. `spread`: relative half-width of the 95 % interval; 0 if the quantity can be 0.
     - `missing`: why there is no estimate; `None` if there is one.
     - `reservations`: caveats that are not issues.
-    - `remedy`: what to do if the interval is too long. `flying_helps`: whether a longer or stronger flight shortens it.
+    - `remedy`: what to do if the interval is too long. `flying_helps`: see `Verdict`.
     - `requires`: the quantities that must be trusted too.
     """
 
@@ -191,7 +191,7 @@ def verdicts_of(quantities: Mapping[str, Quantity], issues: Sequence[Issue]) -> 
             quantity.value,
             reasons=tuple(each.words for each in counted),
             remedies=tuple(dict.fromkeys(each.remedy for each in counted if each.remedy)),
-            flying_helps=quantity.flying_helps if known in counted else None,
+            flying_helps=quantity.flying_helps,
         )
     for name, quantity in quantities.items():
         lacking = [each for each in quantity.requires if each in verdicts and not verdicts[each].trusted]
