@@ -37,9 +37,10 @@ from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_B
 MIN_SECONDS = 10.0
 VIBRATION = 0.4  # if innovations correlate more, filter error is biased by more than its intervals say
 MAX_SAMPLE = 0.008  # s; longer samples would hide the motion along with the vibration
-# A parameter whose interval is widened by a larger factor makes a reservation. In 107 simulated logs, each of a single
-# vehicle, no factor exceeds 2; a log of two vehicles has 9, and some real logs have 3 to 6.
-DISAGREE = 4.0
+# Factors by which an interval is widened. By chance, one of few parts is widened about twice; a larger factor makes a
+# warning. In 107 simulated logs, each of a single vehicle, no factor exceeds 2; a log of two vehicles has 9, and some
+# real logs have 3 to 6. From the second factor on, an issue about what depends on the parameter replaces the warning.
+WIDENED, DISAGREE = 2.0, 4.0
 NO_SKILL = 2.0  # standard errors; an inertia is not identified if the skill at the shortest horizon is so far below 0
 _NOT_LOWEST = (
     "the likelihood has several maxima, and the search did not find the highest",
@@ -164,6 +165,13 @@ def few_parts(seconds: float) -> Iterator[Issue]:
         severity = "unidentifiable" if 2 * seconds < MIN_SECONDS else RESERVATION
         cause = f"only {seconds:.1f} s were fitted, too few to compare parts of the flight: intervals may be too narrow"
         yield Issue(severity, cause, f"fly for {2 * MIN_SECONDS:g} s or longer", ALL_INERTIAS)
+
+
+def much_widened(found: VehicleIdentification) -> dict[str, float]:
+    """The factors by which intervals were widened more than by chance, of the parameters that make no issue."""
+    # A file of version 0.6 has neither verdicts nor the issues of `parts_disagree`.
+    most = DISAGREE if found.verdicts else np.inf
+    return {name: factor for name, factor in found.widened.items() if WIDENED < factor <= most}
 
 
 def parts_disagree(model: AbstractModel, widened: Mapping[str, float], logs: int = 1) -> Iterator[Issue]:

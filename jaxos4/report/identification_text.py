@@ -8,6 +8,7 @@ from rich.console import Console
 
 from ..estimators import ESTIMATORS
 from ..identification import FlightInformation
+from ..identification.issues import much_widened
 from ..identification.next_flight import next_flight, spreads_of
 from ..identification.results import COLOURED, Constant, Identification, OS4Identification, VehicleIdentification
 from ..identification.tables import PhysicalQuantity, physical_quantities, possible
@@ -23,7 +24,6 @@ from ..identification.verdict import (
 )
 from .text import DASH, Listing, plain, say
 
-_WIDENED = 2.0  # times: chance makes intervals of few parts about twice as long
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
 
@@ -81,8 +81,7 @@ def quantity_rows(quantities: Sequence[PhysicalQuantity]) -> list[tuple[str, ...
 
 def warning_lines(found: Identification) -> list[str]:
     """The reasons of the verdicts, and a warning of intervals that had to be widened much; for terminal and page."""
-    widened = found.widened if isinstance(found, VehicleIdentification) else {}
-    wide = {name: factor for name, factor in widened.items() if factor > _WIDENED}
+    wide = much_widened(found) if isinstance(found, VehicleIdentification) else {}
     factors = dict.fromkeys(f"{pick(wide.values(), default=1.0):.1f}" for pick in (min, max))
     flights, other = (
         ("flights", "flights are not of one vehicle") if len(found.logs) > 1 else ("flight", "vehicle changed")
