@@ -148,7 +148,7 @@ KINDS = {
 class Named(Data, VehicleAnswer):
     """Data with a name, and their answer."""
 
-    hides_answers = False
+    hides_answers, optimum = False, Optimum._make(len(Optimum._fields) * [None])
 
     def __init__(self, name):
         self.__dict__.update(name=name, hides_answers=name in "dD")
@@ -180,6 +180,28 @@ def test_kinds_of_samples_are_fitted_in_order_until_one_has_white_innovations(
     found, rows = fit.fit_sample_times([*map(Named, names)], SOLVER, choose=True, progress=lambda _: None)
     assert ("".join(fitted), "".join(each.name for each in found)) == (order, kept)
     assert [row.correlation for row in rows] == [names[name] for name in kept]
+
+
+@pytest.mark.parametrize("estimator", [fit.DEFAULT, jaxos4.FilterError(tolerance=0.1, max_steps=7)])
+def test_filter_error_searches_once_at_each_sample_time_with_its_own_settings(monkeypatch, estimator):
+    searches = []
+
+    def search(solver, data, **options):
+        searches.append((data.name, solver))
+        return data
+
+    def searched(several, solver, longest, progress):
+        return (search(solver, data) for data in reversed(several))
+
+    monkeypatch.setattr(fit, "search", search)
+    monkeypatch.setattr(fit, "search_sample_times", searched)
+    monkeypatch.setattr(fit, "corrected", lambda data: data)
+    monkeypatch.setattr(fit, "sample_time_of", lambda data: table((A, 0.0))[0])
+    monkeypatch.setattr(fit, "at_lowest", lambda answer, solver, progress: answer)
+    several = [*map(Named, "bB")]
+    answer, rows = fit.fit_vehicle(several, estimator, choose=True, seed=0, progress=lambda _: None)
+    assert searches == [(name, SOLVER if estimator == fit.DEFAULT else estimator) for name in "Bb"]
+    assert (answer, len(rows)) == (several[0], 2)
 
 
 def test_a_sample_time_that_knows_the_inertias_badly_is_not_chosen():

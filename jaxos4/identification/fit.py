@@ -116,19 +116,22 @@ def fit_vehicle(
 ) -> tuple[VehicleAnswer, tuple[SampleTime, ...]]:
     """The parameters and the disturbances at the chosen sample time.
 
-    `FilterError` searches at the sample times. Any other estimator then searches at the chosen one.
+    `FilterError` searches at the sample times, with the user's settings if it was given as an object. Any other
+    estimator then searches at the chosen one.
 
     **Arguments:** `several`: the data, the shortest sample time first. `choose`: whether to choose a sample time;
     otherwise the first is used. `seed`: random seed for training a network.
 
     **Returns:** the answer, and a row for each sample time that belongs to it.
     """
-    solver, is_default = FilterError(tolerance=TOLERANCE), estimator == DEFAULT
+    default = FilterError(tolerance=TOLERANCE)
+    estimator = default if estimator == DEFAULT else estimator
+    solver = estimator if isinstance(estimator, FilterError) else default
     answers, rows = [], []
-    if is_default or len(several) > 1:
+    if solver is estimator or len(several) > 1:
         answers, rows = fit_sample_times(several, solver, choose=choose, progress=progress)
     place = chosen_place(rows) if choose and rows else 0
-    if is_default:
+    if solver is estimator:
         answer = answers[place]
     else:
         data = answers[place].optimum.data if answers else several[0]
