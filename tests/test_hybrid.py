@@ -4,16 +4,20 @@ import json
 
 import equinox as eqx
 import jax
+import msgspec
 import numpy as np
 import pytest
-from helpers import DT, same
+from helpers import DT, same, standard_flight
 from hypothesis import given, settings
 from lanes import LANES
 from recorded_logs import ACCIDENTS, damaged
-from small_network import BRACKET, CMAC, OMEGA, PUBLISHED, SMALL, flights, identify, names, problem_of, trained
+from small_network import BRACKET, CMAC, OMEGA, PUBLISHED, SHORT, SMALL, flights, identify, names, problem_of, trained
 from strange import in_one_line
 
 import jaxos4
+from jaxos4.identification import fit
+from jaxos4.identification.prepare_os4 import prepare_os4
+from jaxos4.recording import Recording
 
 
 @pytest.mark.slow
@@ -47,6 +51,21 @@ def test_the_hybrid_finds_what_ibss_finds(seed):
     if seed == "mismatch":
         assert set(names(identify(network, states, noise))) == {"network_mismatch"}
         assert (hybrid.rollouts >= alone.rollouts).all()
+
+
+@pytest.mark.parametrize(("name", "channels"), [("network", "rates"), ("hybrid", "all")])
+def test_a_network_is_trained_for_the_flight_and_a_search_keeps_all_channels(monkeypatch, name, channels):
+    stages, network = [], trained(free=True, **SHORT)
+    monkeypatch.setattr(fit, "network_for", lambda problem, bracket, *rest, **options: network)
+    recording, nothing = Recording.of(standard_flight(duration=3.0), "flight.csv"), {"bracket": None, "validate": None}
+    data, *known = prepare_os4((recording,), PUBLISHED(), jaxos4.OS4Settings(), estimator=name, network=None, **nothing)
+    assert [*known, data.provenance.network] == [name, name, msgspec.UNSET]
+    data, estimator = fit.with_network(data, name, seed=0, progress=stages.append)
+    assert (data.problem.channels, data.provenance.channels) == (channels, channels)
+    assert data.likelihood is data.problem
+    assert (estimator if name == "network" else estimator.network) is network
+    assert data.provenance.network["settings"]["steps"] == SHORT["steps"]
+    assert stages == ["training a network for this flight"]
 
 
 @pytest.mark.slow

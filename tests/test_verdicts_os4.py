@@ -13,7 +13,6 @@ import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.excitation import doublet, multisine
 from jaxos4.flight import ANGLES, RATES
-from jaxos4.identification.data import silent
 from jaxos4.identification.issues_of_values import issues_of_alphas
 from jaxos4.identification.prepare_os4 import prepare_os4
 from jaxos4.identification.results import Constant, ParameterEstimate, RigidBody
@@ -114,10 +113,9 @@ def test_a_wrong_attitude_is_a_note_if_the_rates_alone_are_fitted():
     recording = Recording.of(dataclasses.replace(flight, states=states), "flight")
     judged = {}
     for channels in ("all", "rates"):
-        data, *_ = prepare_os4(
-            (recording,), jaxos4.PublishedOS4(), jaxos4.OS4Settings(channels=channels), estimator=None, bracket=None,
-            network=None, validate=None, seed=0, progress=silent,
-        )  # fmt: skip
+        settings = jaxos4.OS4Settings(channels=channels)
+        nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
+        data, *_ = prepare_os4((recording,), jaxos4.PublishedOS4(), settings, **nothing)
         judged[channels] = [each.name for each in data.findings], any("attitude" in x for x in data.provenance.notes)
     assert judged == {"all": (["attitude_scale"], False), "rates": ([], True)}
 

@@ -27,7 +27,7 @@ from ..analysis.evaluation import evaluate, robust_covariance
 from ..errors import InputError, TrainingError
 from ..estimate import REACH, AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
-from ..networks.estimator import GivenNetwork, most_agile_windows, vehicle_network_for
+from ..networks.estimator import GivenNetwork, most_agile_windows, network_for, network_provenance, vehicle_network_for
 from ..results import has_answer, result_names
 from ..shooting import InnovationsProblem, ShootingProblem, padded
 from .answers import OS4Answer, VehicleAnswer, dominated, vehicle_constants
@@ -49,6 +49,21 @@ AGREE = 2.0  # most standard deviations between two answers that agree
 DISCRETE = 0.03  # relative error of discretisation
 WIDER = 1.5  # intervals wider than at twice the sample time by this factor would agree with anything
 NEAR_LIMIT = 0.95  # share of the way to its limit; an unknown beyond it starts no other search
+
+
+def with_network(
+    data: Data[ShootingProblem], estimator: str | AbstractEstimator, *, seed: int, progress: Progress
+) -> tuple[Data[ShootingProblem], AbstractEstimator]:
+    """The data of an OS4 and their estimator, with a network trained for them if a name was given."""
+    if not isinstance(estimator, str):
+        return data, estimator
+    progress("training a network for this flight")
+    problem, name, shoots = data.problem, str(data.provenance.flight), ESTIMATORS[estimator].shoots
+    trained = network_for(problem, problem.unknowns.bracket, name, shoots=shoots, seed=seed)
+    problem = problem if shoots else problem.within(trained.bracket)
+    provenance = msgspec.structs.replace(data.provenance, network=network_provenance(None, trained))
+    own = dataclasses.replace(data, likelihood=problem, problem=problem, provenance=provenance)
+    return own, make_estimator(estimator, trained)
 
 
 def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> OS4Answer:

@@ -20,7 +20,7 @@ from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..networks import TrainedNetwork
 from .data import class_name, silent
-from .fit import DEFAULT, fit_os4, fit_vehicle, vehicle_estimator
+from .fit import DEFAULT, fit_os4, fit_vehicle, vehicle_estimator, with_network
 from .judge import judge_os4, judge_vehicle
 from .prepare_os4 import Intervals, OS4Settings, prepare_os4
 from .prepare_vehicle import VehicleSettings, prepare_vehicle
@@ -115,19 +115,13 @@ def identify(
         answer, sample_times = fit_vehicle(several, estimator, choose=choose, seed=seed, progress=progress)
         found = judge_vehicle(answer, sample_times, name, progress=progress)
     else:
+        wanted = _settings(OS4Settings, settings)
         data, name, estimator = prepare_os4(
-            recordings,
-            subject,
-            _settings(OS4Settings, settings),
-            estimator=estimator,
-            bracket=bracket,
-            network=network,
-            validate=other,
-            seed=seed,
-            progress=progress,
+            recordings, subject, wanted, estimator=estimator, bracket=bracket, network=network, validate=other
         )
-        answer = fit_os4(estimator, data.likelihood, progress=progress)
-        found = judge_os4(data, answer, estimator, name)
+        data, solver = with_network(data, estimator, seed=seed, progress=progress)
+        answer = fit_os4(solver, data.likelihood, progress=progress)
+        found = judge_os4(data, answer, solver, name)
     return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)
 
 

@@ -21,12 +21,12 @@ from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
-from ..networks.estimator import GivenNetwork, network_for, network_provenance, seen_channels
+from ..networks.estimator import GivenNetwork, network_provenance, seen_channels
 from ..networks.file import load_network
 from ..noise import SENSOR_SIGMA
 from ..recording.checks import KINEMATIC, self_checks
 from ..shooting import ShootingProblem, Unknowns
-from .data import Data, HeldOut, Progress, Provenance, class_name, name_and_class
+from .data import Data, HeldOut, Provenance, class_name, name_and_class
 
 Intervals = Bracket | Mapping[str, Any] | None
 """A bracket, or `[lower, upper]` by parameter name; the model's default for all others."""
@@ -58,10 +58,11 @@ def prepare_os4(
     bracket: Intervals,
     network: GivenNetwork,
     validate: Recording | None,
-    seed: int,
-    progress: Progress,
-) -> tuple[Data[ShootingProblem], str, AbstractEstimator]:
-    """The data of one flight, and the name and object of its estimator. Arguments as in `identify`."""
+) -> tuple[Data[ShootingProblem], str, str | AbstractEstimator]:
+    """The data of one flight, and the name and object of its estimator. Arguments as in `identify`.
+
+    An estimator whose network is not trained yet is no object, but the name; see `with_network`.
+    """
     recording, *others = recordings
     if others:
         raise InputError(
@@ -82,9 +83,9 @@ def prepare_os4(
         problem = problem.restrict(kind.looks_at)
         if np.isnan(np.asarray(problem.flight.states)[:, CASCADE_ORDER[: problem.size]]).all(axis=0).any():
             raise InputError(f"{recording.name}: {name} needs p, q and r; use `estimator` output-error.")
-    if kind.needs_network and trained is None:
-        progress("training a network for this flight")
-        trained = network_for(problem, where, recording.name, shoots=kind.shoots, seed=seed)
+    untrained = kind.needs_network and trained is None
+    if untrained and not kind.shoots:
+        problem = problem.restrict(seen_channels(problem))
     if trained is not None:
         if mismatch := trained.mismatch(problem):
             raise InputError(
@@ -116,7 +117,9 @@ def prepare_os4(
         network=msgspec.UNSET if trained is None else network_provenance(network, trained),
     )
     data = Data(problem, problem, provenance, held_out=held_out, findings=tuple(findings))
-    return data, name, estimator if isinstance(estimator, AbstractEstimator) else make_estimator(name, trained)
+    if isinstance(estimator, str) and not untrained:
+        estimator = make_estimator(name, trained)
+    return data, name, estimator
 
 
 def _given_network(
