@@ -126,8 +126,8 @@ def compare_results(results: Sequence[ResultSource], *, level: float = 0.05) -> 
         judged = {row.judged for each in different for row in each.answers if row is not None}
         statuses |= {name: max(statuses[name], RESERVED, key=STATUSES.index) for name in judged & statuses.keys()}
         which = ", ".join(each.name for each in different)
-        advice = f"next: first find out why the results differ in {which}; {advice.removeprefix('next: ')}"
-    return found._replace(statuses=statuses, next_flight=advice)
+        advice = f"first find out why the results differ in {which}; {advice}"
+    return found._replace(statuses=statuses, next_flight=f"next: {advice}")
 
 
 def _reference(name: str, every: Sequence[Identification]) -> float:

@@ -34,10 +34,10 @@ def said(*results):
     ("half", "advice"),
     [
         # 32 s (1.6^2 - 1) = 50 s; the root of 6.4^2 - 1 is 6.3
-        ({"Ix": 0.16}, "next: fly 50 s more roll (known now: Ix 16 %; needed: 10 %)."),
-        ({"Iz": 0.64}, "next: fly yaw as long as before but 6.3 times as strong (known now: Iz 64 %; needed: 10 %)."),
+        ({"Ix": 0.16}, "fly 50 s more roll (known now: Ix 16 %; needed: 10 %)."),
+        ({"Iz": 0.64}, "fly yaw as long as before but 6.3 times as strong (known now: Iz 64 %; needed: 10 %)."),
         (HALF, "50 s more roll, yaw as long as before but 6.3 times as strong (known now: Ix 16 %, Iz 64 %; needed"),
-        ({"Iy": 0.05}, "next: nothing is missing; repeat the flight and compare"),
+        ({"Iy": 0.05}, "nothing is missing; repeat the flight and compare"),
     ],
 )
 def test_half_widths_shrink_with_the_root_of_the_time_and_with_the_amplitude(half, advice):
@@ -47,7 +47,7 @@ def test_half_widths_shrink_with_the_root_of_the_time_and_with_the_amplitude(hal
 def test_time_is_that_of_all_flights_that_count():
     both = [vehicle({"Ix": 0.16}, seconds=10.0), vehicle({"Ix": 0.16}, seconds=22.0)]
     says(next_flight(both, {"Ix": 0.16}), "fly 50 s more roll (known")
-    says(next_flight(both, {"Ix": 0.099}), "next: nothing is missing.")
+    says(next_flight(both, {"Ix": 0.099}), "nothing is missing.")
 
 
 def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once(tmp_path):
@@ -59,7 +59,7 @@ def test_another_cause_has_its_remedy_and_one_that_begins_another_is_said_once(t
     found = msgspec.structs.replace(found, verdicts=verdicts)
     (tmp_path / "found.json").write_text(json.dumps(found.to_dict()))
     for each in (found, jaxos4.read_result(tmp_path / "found.json")):
-        says(said(each), "next: log faster (Ix); fly more yaw, or in calmer air (Iz, predictions).")
+        says(said(each), "log faster (Ix); fly more yaw, or in calmer air (Iz, predictions).")
 
 
 def test_nobody_is_told_to_fly_for_an_inertia_that_lacks_a_drag_coefficient():
@@ -67,7 +67,7 @@ def test_nobody_is_told_to_fly_for_an_inertia_that_lacks_a_drag_coefficient():
     drag = Issue("unidentifiable", "the thrust is another", MEASURE, {"Iz": None})
     found = vehicle({"Iz": 0.3}, [drag])
     verdicts = verdicts_of({"Iz": Quantity(spread=0.3, remedy=MEASURE, flying_helps=False)}, [drag])
-    assert said(msgspec.structs.replace(found, verdicts=verdicts)) == f"next: {MEASURE} (Iz)."
+    assert said(msgspec.structs.replace(found, verdicts=verdicts)) == f"{MEASURE} (Iz)."
 
 
 def test_terminal_and_page_end_with_it(tmp_path):
@@ -85,4 +85,4 @@ def test_an_os4_that_does_not_show_a_parameter_is_told_to_design_a_flight():
     nothing = object.__new__(OS4Answer)  # is not read for parameters without an estimate
     verdicts = verdicts_of(os4_quantities(nothing, found), found.issues)
     advice = said(msgspec.structs.replace(found, verdicts=verdicts))
-    assert advice == "next: fly what `jaxos4 design` proposes (alpha6, rigid body)."
+    assert advice == "fly what `jaxos4 design` proposes (alpha6, rigid body)."

@@ -42,7 +42,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
             same = next((each for each in advised if each.startswith(remedy)), remedy)
             advised.setdefault(same, []).append(name)
     said = "; ".join(f"{advice} ({', '.join(names)})" for advice, names in advised.items())
-    return f"next: {said or (_REPEAT if len(results) == 1 else 'nothing is missing')}."
+    return f"{said or (_REPEAT if len(results) == 1 else 'nothing is missing')}."
 
 
 def pooled_statuses(results: Sequence[Identification]) -> dict[str, str]:

@@ -245,7 +245,7 @@ def _summary(found: Identification) -> str:
 
 def next_lines(found: Identification) -> list[str]:
     """Advice on the next flight, if anything was judged."""
-    return [next_flight([found], spreads_of(found))] if found.verdicts and found.has_answer else []
+    return [f"next: {next_flight([found], spreads_of(found))}"] if found.verdicts and found.has_answer else []
 
 
 def share(value: float | None) -> str:
