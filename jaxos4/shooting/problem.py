@@ -233,7 +233,8 @@ class ShootingProblem(AbstractProblem):
         `initial_state` defaults to `first_state`.
         """
         start = self.first_state()[0] if initial_state is None else initial_state
-        cost, feasible = self.shots(parameters, start)
+        # A batch prepares its data in blocks too: measurements of many flights do not fit the cache.
+        cost, feasible = in_blocks(ShootingProblem.shots, self, parameters, start)
         return jnp.where(feasible, cost, jnp.inf)
 
     @eqx.filter_jit
