@@ -21,7 +21,7 @@ PAGES = {
     "experiments.md": "experiments/README.md",
 }
 COMMANDS = "reference/commands.md"
-# The pages that are made, by their source, to which links lead: then they work in the repository and on the site.
+# Pages by their source. A link to the source works in the repository; on the site it leads to the page.
 MADE = {source: page for page, source in PAGES.items()} | {"jaxos4/cli/options.py": COMMANDS}
 MADE |= {f"docs/tutorials/{path.name}": f"tutorials/{path.stem}.md" for path in (ROOT / "docs/tutorials").glob("*.py")}
 PLACES = {}
@@ -47,7 +47,7 @@ def on_pre_page(page, config, files):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Leads links to sources to their pages, typesets equations, and marks commands and wide lines."""
+    """Turns links to sources into links to their pages, typesets equations, and marks commands and wide lines."""
     here = page.file.src_uri
     source = PAGES.get(here, f"docs/{here}")
 

@@ -95,7 +95,8 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
 def where_needed(needed: Bool[Array, ""], function: Callable[..., R], otherwise: R, *arguments: Any) -> R:
     """`function(*arguments)` if `needed`, else `otherwise`. A batch computes the function if any lane needs it.
 
-    The function must not close over arrays that differ between lanes. A batch of `jax.lax.cond` always computes both.
+    The function must not close over arrays that differ between lanes. A batch of `jax.lax.cond` always computes
+    both branches, and a batch of batches always computes the function.
     """
 
     def one(needed: Bool[Array, ""], otherwise: R, *arguments: Any) -> R:

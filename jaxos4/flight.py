@@ -124,7 +124,7 @@ class Flight(eqx.Module):
       (`jaxos4.join`), and their time counts samples. `None`: the flight is one stretch.
     - `commanded`: whether `omega` holds commands, which the rotors follow with a lag, and not measured speeds.
     - `voltage`: the battery's voltage [V], an input of some models; no NaN. `None`: not logged.
-    - `held`: whether rows of `omega` act over their sample (zero-order hold), and are not speeds at an instant.
+    - `held`: whether a row of `omega` acts over its whole sample (zero-order hold), and is not the speed at an instant.
     - `within`: the root mean square of each rotor's speed in equal parts of the sample, from `time[k]` - dt/2 to
       `time[k]` + dt/2 [rad/s]. `None`: unknown.
     - `averaging_time`: how long measurements are averaged around `time[k]` [s]; 0: they are those at this instant.

@@ -18,16 +18,16 @@ PerWindow = Float[Array, "windows n"]
 
 
 class JointFactor(NamedTuple):
-    """A factor A of the information A A^T of each window, and its `basis` A^-T: directions of unit information."""
+    """A factor L of the information L L^T of each window, and its `basis` L^-T: directions of unit information."""
 
     factor: Float[Array, "windows n n"]
     basis: Float[Array, "windows n n"]
 
 
 def joint_factor(information: Float[Array, "windows n n"], count: int) -> JointFactor:
-    """A factor of the joint information of each window: A A^T is the inverse of its covariance among all windows.
+    """A factor of the joint information of each window: L L^T is the inverse of its covariance among all windows.
 
-    The last `count` columns of A are for the shared unknowns. Each window's own unknowns are eliminated first, and the
+    The last `count` columns of L are for the shared unknowns. Each window's own unknowns are eliminated first, and the
     Schur complements summed: no subtraction loses digits in single precision.
     """
     windows, size, _ = information.shape

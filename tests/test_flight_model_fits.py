@@ -34,7 +34,7 @@ def test_the_filter_is_the_recursion(counts):
     torques = squares @ np.asarray(FULL.mixer).T
     for value, expected in (
         (found.sensed_specific_thrust, b / m * (here**2).sum(axis=1)),
-        (found.specific_thrust, b / m * squares.sum(axis=1)),
+        (found.mean_specific_thrust, b / m * squares.sum(axis=1)),
         (found.spin_up, (following - here) @ spins / dt),
         (found.residual_speed, (here + following) @ spins / 2),
         *zip((found.roll, found.pitch, found.yaw), torques.T[:3], strict=True),
@@ -51,8 +51,8 @@ def test_a_lag_below_the_shortest_is_the_shortest():
         found = forcing_of(model, inputs, model.alpha.at[8].set(lag))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found) if leaf is not None)
         # The difference is the straight line over the sample in which the command changes.
-        thrust = np.asarray(plain.specific_thrust)
-        assert np.abs(found.specific_thrust - thrust)[5:].max() < 0.1 * np.ptp(thrust)
+        thrust = np.asarray(plain.mean_specific_thrust)
+        assert np.abs(found.mean_specific_thrust - thrust)[5:].max() < 0.1 * np.ptp(thrust)
 
 
 @jax.jit

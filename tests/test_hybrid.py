@@ -60,7 +60,7 @@ def test_a_network_is_trained_for_the_flight_and_a_search_keeps_all_channels(mon
     recording, nothing = Recording.of(standard_flight(duration=3.0), "flight.csv"), {"bracket": None, "validate": None}
     data, *known = prepare_os4((recording,), PUBLISHED(), jaxos4.OS4Settings(), estimator=name, network=None, **nothing)
     assert [*known, data.provenance.network] == [name, name, msgspec.UNSET]
-    data, estimator = fit.with_network(data, name, seed=0, progress=stages.append)
+    data, estimator = fit.os4_estimator(data, name, data.problem.unknowns.bracket, seed=0, progress=stages.append)
     assert (data.problem.channels, data.provenance.channels) == (channels, channels)
     assert data.likelihood is data.problem
     assert (estimator if name == "network" else estimator.network) is network

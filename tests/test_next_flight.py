@@ -8,7 +8,6 @@ from pages import page_of, printed, says, words
 from synthetic_identification import UNKNOWN, identified_flight, identified_vehicle
 
 import jaxos4
-from jaxos4.identification.answers import OS4Answer
 from jaxos4.identification.issues_of_values import MEASURE
 from jaxos4.identification.next_flight import next_flight, spreads_of
 from jaxos4.identification.quantities import os4_quantities
@@ -82,7 +81,6 @@ def test_an_os4_that_does_not_show_a_parameter_is_told_to_design_a_flight():
     """Even if all quantities have a reservation too."""
     coloured = Issue(RESERVATION, "the noise is coloured", "use another model", {"alpha6": None, "rigid body": None})
     found = identified_flight(parameters={"alpha6": UNKNOWN}, rigid_body=RigidBody(), issues=(coloured,))
-    nothing = object.__new__(OS4Answer)  # is not read for parameters without an estimate
-    verdicts = verdicts_of(os4_quantities(nothing, found), found.issues)
+    verdicts = verdicts_of(os4_quantities(found, {}), found.issues)
     advice = said(msgspec.structs.replace(found, verdicts=verdicts))
     assert advice == "fly what `jaxos4 design` proposes (alpha6, rigid body)."

@@ -11,7 +11,9 @@ import pytest
 from helpers import compiled_programs, noisy_states, standard_flight, standard_problem
 
 import jaxos4
+from jaxos4.analysis.frequency_response import frequency_response
 from jaxos4.batching import for_threads, where_needed
+from jaxos4.identification.judge import in_one_window
 from jaxos4.shooting import padded
 
 PROGRAMS = ["jit(__call__)", "jit(_default)", "jit(_fly)", "jit(_intervals)"]
@@ -39,6 +41,21 @@ def test_an_identification_is_four_programs_and_the_next_one_none():
     with compiled_programs() as second:
         jaxos4.identify(flights[1], other)
     assert second == []
+
+
+def test_checks_of_flights_of_other_lengths_share_their_programs():
+    model = jaxos4.PublishedOS4()
+    problems = (
+        jaxos4.ShootingProblem(model, recorded(samples, model), sigma=jaxos4.SENSOR_SIGMA, windows=4)
+        for samples in (501, 420)
+    )
+    programs = []
+    for problem in problems:
+        with compiled_programs() as compiled:
+            frequency_response(in_one_window(problem), model.alpha)
+        programs.append(compiled)
+    assert "jit(_parts)" in programs[0]
+    assert programs[1] == []
 
 
 @eqx.filter_jit

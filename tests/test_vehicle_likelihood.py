@@ -148,10 +148,10 @@ KINDS = {
 class Named(Data, VehicleAnswer):
     """Data with a name, and their answer."""
 
-    hides_answers, optimum = False, Optimum._make(len(Optimum._fields) * [None])
+    contains_answers, optimum = False, Optimum._make(len(Optimum._fields) * [None])
 
     def __init__(self, name):
-        self.__dict__.update(name=name, hides_answers=name in "dD")
+        self.__dict__.update(name=name, contains_answers=name in "dD")
 
 
 @pytest.mark.parametrize(("answered", "hidden", "order", "kept"), KINDS.values(), ids=KINDS)

@@ -33,7 +33,8 @@ def make_case(flights: int, steps: int, *, known: bool = True, share: float = CE
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     omega = np.asarray(jaxos4.multisine(model.airframe, duration=steps * DT, dt=DT))
     forcing = model.forcing(Inputs(omega, np.asarray(DT)), model.alpha)
-    columns = np.stack([np.asarray(x) for x in forcing[:4]], axis=1)  # torques and specific thrust
+    torques_and_thrust = forcing.roll, forcing.pitch, forcing.yaw, forcing.mean_specific_thrust
+    columns = np.stack([np.asarray(x) for x in torques_and_thrust], axis=1)
     truth, half_width = np.asarray(model.alpha), np.asarray(jaxos4.DEFAULT_HALF_WIDTH)
     sigma = np.asarray(jaxos4.SENSOR_SIGMA)
     blank = Case(

@@ -99,7 +99,7 @@ def _physics(loop: ClosedLoop) -> tuple[Callable[..., BodyMotion], Callable[...,
     alpha, reaction, damping = alpha_scalars(ix, iy, iz, rotor), rotor / iz, tuple(loop.damping)
 
     def specific_force(velocity: Vector | None, forcing: Forcing, wind: Vector | None) -> Vector:
-        thrust = forcing.specific_thrust
+        thrust = forcing.mean_specific_thrust
         if air is None or velocity is None or wind is None:
             return jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust
         each = zip((*air.drag, air.inflow), velocity, wind, strict=True)

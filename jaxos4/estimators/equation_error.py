@@ -57,7 +57,7 @@ class Regression(NamedTuple):
         linear = np.array([not each.in_forcing for each in problem.model.parameters])
         anchored = problem.initial_state is not None
         anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
-        half_width, measured = jnp.where(linear, unknowns.width, 0.0), rates.measured()[:, :3]
+        half_width, measured = jnp.where(linear, unknowns.free_half_width, 0.0), rates.measured()[:, :3]
         return cls(problem, unknowns.center, half_width, measured, anchor, anchored, settings)
 
     @property
@@ -67,11 +67,11 @@ class Regression(NamedTuple):
 
     def rows(self) -> RegressionRows:
         """Regressors, then the output: a row of unit noise for p, q and r at every sample, 0 if it was not measured."""
-        return self._rows(jnp.nan_to_num(self.rates))
+        return self._rows(jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
 
     def rows_and_pullback(self) -> tuple[RegressionRows, Callable[[RegressionRows], Float[Array, "samples 3"]]]:
         """The rows, and a function that turns a derivative with respect to them into one with respect to the rates."""
-        rows, back = jax.vjp(self._rows, jnp.nan_to_num(self.rates))
+        rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
         return rows, lambda slope: back(slope)[0]
 
     def _rows(self, rates: Float[Array, "samples 3"]) -> RegressionRows:

@@ -177,7 +177,7 @@ class SearchState(NamedTuple):
 class IBSS(AbstractSolver[SearchState]):
     """Iterative Bi-Section Shooting.
 
-    A *shot* simulates the flight at trial unknowns, and gives the cost with its gradient and information. **The sign of
+    A *shot* evaluates the likelihood at trial unknowns: the cost with its gradient and information. **The sign of
     the cost's slope along a direction decides** which side of the trial holds the minimum, and so which part of the
     search interval is dropped. The quadratic model and the secant through the last slopes **propose** where to shoot.
     The size of the slopes decides when to stop, and the cost whether a point is kept. A *sweep* is one iteration. A
@@ -202,14 +202,14 @@ class IBSS(AbstractSolver[SearchState]):
     shares: tuple[float, ...] = eqx.field(static=True, default=(0.1, 0.3, 1.0))
 
     def init(self, stage: Stage, before: Found) -> SearchState:
-        """The start, with closed intervals: the first step of the loop is a shot there, so a shot is compiled once."""
-        unknowns, closed = before.unknowns, jnp.zeros_like(before.unknowns)
+        """The start, with intervals of width 0: the first step shoots there, so that the shot is compiled once."""
+        unknowns, nothing = before.unknowns, jnp.zeros_like(before.unknowns)
         directions = Directions.none(unknowns)
         return SearchState(
             unknowns=unknowns,
             model=before_shots(before.model),
             directions=directions,
-            intervals=SearchIntervals.around(directions, closed, closed),
+            intervals=SearchIntervals.around(directions, nothing, nothing),
             spread=before.spread,
             growth=jnp.ones_like(unknowns),
             trust=jnp.ones((), dtype=float),
@@ -221,11 +221,11 @@ class IBSS(AbstractSolver[SearchState]):
     def step(self, stage: Stage, state: SearchState) -> SearchState:
         """The shot at the start, or one sweep, see docs/method/ibss.md.
 
-        A sweep bisects, keeps its last point if the cost is lower, looks for directions and slopes there, and opens new
-        intervals around the steps that they predict.
+        A sweep bisects, keeps its last point unless the cost rises by more than `_KEPT_RISE`, looks for directions and
+        slopes there, and opens new intervals around the steps that they predict.
         """
         is_start = state.shots == 0
-        # One shot is enough if all intervals are closed.
+        # One shot is enough if all intervals have a width of 0.
         most = jnp.where((state.intervals.highest > state.intervals.lowest).any(), self.halvings + 1, 1)
         intervals, unknowns, model, shots, _ = jax.lax.while_loop(
             lambda carry: (carry[3] < most) & ~carry[4],

@@ -108,7 +108,7 @@ def _pass(
     """
     count, size = prior.center.shape[0], problem.size
     start, off = problem.first_state()
-    spread = jnp.concatenate([prior.width, off[: problem.free_size]])
+    spread = jnp.concatenate([prior.free_half_width, off[: problem.free_size]])
     constants = jnp.diag(spread)
     # A known initial state has no tangent of its own.
     moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])

@@ -16,7 +16,7 @@ from ..estimate import AbstractEstimator, Estimate, as_estimate
 from ..linalg import covariance_of_shared
 from ..shooting import AbstractProblem, LocalModel, Stage, WindowUnknowns
 
-SearchState = TypeVar("SearchState")
+S = TypeVar("S")
 
 
 class Found(NamedTuple):
@@ -36,7 +36,7 @@ class Found(NamedTuple):
     done: Bool[Array, ""]
 
 
-class AbstractSolver(AbstractEstimator, Generic[SearchState]):
+class AbstractSolver(AbstractEstimator, Generic[S]):
     """An algorithm that minimises the cost of a likelihood. It uses only the members of `AbstractProblem`.
 
     - `is_local`: whether the answer depends on the start, so that the search is repeated from all starts of a problem.
@@ -51,19 +51,19 @@ class AbstractSolver(AbstractEstimator, Generic[SearchState]):
     reach: eqx.AbstractVar[Scalar]
 
     @abc.abstractmethod
-    def init(self, stage: Stage, before: Found) -> SearchState:
+    def init(self, stage: Stage, before: Found) -> S:
         """The first state of a stage's search, at `before.unknowns` with the covariance `before.spread`."""
 
     @abc.abstractmethod
-    def step(self, stage: Stage, state: SearchState) -> SearchState:
+    def step(self, stage: Stage, state: S) -> S:
         """One iteration."""
 
     @abc.abstractmethod
-    def terminate(self, stage: Stage, state: SearchState) -> Bool[Array, ""]:
+    def terminate(self, stage: Stage, state: S) -> Bool[Array, ""]:
         """Whether the stage has ended."""
 
     @abc.abstractmethod
-    def postprocess(self, stage: Stage, state: SearchState, before: Found) -> Found:
+    def postprocess(self, stage: Stage, state: S, before: Found) -> Found:
         """The findings of the stage, from its last state."""
 
     @eqx.filter_jit
@@ -105,19 +105,19 @@ def solve(
     stages = problem.stages(solver.shares)
     starts, skip = _starts(problem, start), jnp.asarray(skip)
     begin = before_search(problem, spread, skip)
-    number = stages.first if is_close is False else jnp.where(is_close, stages.whole, stages.first)
-    count = 1
+    first_stage = stages.first if is_close is False else jnp.where(is_close, stages.whole, stages.first)
+    different_starts = 1
     if starts.shape[0] > 1 and solver.is_local:
-        count = jnp.where((starts == starts[0]).all(), 1, starts.shape[0])
+        different_starts = jnp.where((starts == starts[0]).all(), 1, starts.shape[0])
 
     def search(place: Count, best: Found) -> Found:
         """Searches from a start in the first stage, or from the best answer in a later stage."""
-        from_start = place < count
+        from_start = place < different_starts
         own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameter_count) & (place > 0)
         own &= jnp.isfinite(cost_of(best.model))
-        first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, count - 1)]))
+        first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, different_starts - 1)]))
         before = chosen(from_start, first, best)
-        stage = stages.at(number + jnp.maximum(place - count + 1, 0), before.unknowns)
+        stage = stages.at(first_stage + jnp.maximum(place - different_starts + 1, 0), before.unknowns)
         # Traced once, although a solver may call it twice. `partial` makes another function of it: of an equal one, JAX
         # would find the trace of another search.
         stage = stage._replace(local_model=jax.jit(functools.partial(stage.local_model), inline=True))
@@ -135,7 +135,7 @@ def solve(
         return chosen(is_better, found, best)._replace(**total)
 
     # One loop, so that the search is compiled once for all starts and stages.
-    end = jax.lax.fori_loop(0, count + stages.number - 1 - number, search, begin)
+    end = jax.lax.fori_loop(0, different_starts + stages.number - 1 - first_stage, search, begin)
     shared = problem.unknowns.count
     return as_estimate(
         problem,

@@ -111,12 +111,12 @@ class SVSF(AbstractEstimator):
 
         none = jnp.zeros((samples, count), dtype=float)
         (last, history), _ = jax.lax.scan(fly, (at_center, none), length=self.passes)
-        parameters = box.center + box.width * (shares[:, None] * history).sum(axis=0)
+        parameters = box.center + box.free_half_width * (shares[:, None] * history).sum(axis=0)
         initial_state, cost, feasible, rollouts = fit_start(problem, parameters)
         return as_estimate(
             problem,
             parameters=parameters,
-            covariance=last.covariance[3 + count :, 3 + count :] * box.width[:, None] * box.width,
+            covariance=last.covariance[3 + count :, 3 + count :] * box.free_half_width[:, None] * box.free_half_width,
             initial_state=initial_state,
             cost=cost,
             rollouts=self.passes * (1 + 3 + count) + rollouts,
@@ -124,7 +124,7 @@ class SVSF(AbstractEstimator):
             feasible=feasible,
             prior=self.prior,
             done=jnp.ones((), dtype=bool),
-            history=box.center + box.width * history,
+            history=box.center + box.free_half_width * history,
         )
 
     def _step(
@@ -156,7 +156,7 @@ class SVSF(AbstractEstimator):
         parameters = jnp.clip(parameters + unit * gain * change, -REACH, REACH)
 
         def advance(x: Float[Array, "3"], u: Parameters) -> Float[Array, "3"]:
-            return stack(problem.advance(row.forcing, unstack(x), tuple(box.center + box.width * u))[0])
+            return stack(problem.advance(row.forcing, unstack(x), tuple(box.center + box.free_half_width * u))[0])
 
         following = advance(rates, parameters)
         by_rates, by_parameters = jax.jacfwd(advance, argnums=(0, 1))(rates, parameters)

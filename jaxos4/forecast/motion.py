@@ -93,7 +93,7 @@ def _fly_future(
         def derivative(motion: Motion) -> Motion:
             row = forcing._replace(velocity=rotated(conjugate(motion.attitude), motion.velocity))
             accelerations = _sum(model.angular_acceleration(motion.rates, row, scalars), turning)
-            force = _sum(model.specific_force(row.specific_thrust, row, scalars), pushing)
+            force = _sum(model.specific_force(row.mean_specific_thrust, row, scalars), pushing)
             x, y, z = rotated(motion.attitude, force)
             spin = quaternion_product(motion.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in motion.rates)))
             return Motion(motion.velocity, (x, y, z - model.airframe.gravity), spin, Rates(*accelerations))
@@ -164,7 +164,7 @@ def known_at_samples(
     def of_future(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
         turning = jnp.stack(model.angular_acceleration(Rates(*middle.T), forcing, scalars), axis=1)
-        pushing = jnp.stack(model.specific_force(forcing.specific_thrust, forcing, scalars), axis=1)
+        pushing = jnp.stack(model.specific_force(forcing.mean_specific_thrust, forcing, scalars), axis=1)
         residual = accelerations - jnp.concatenate([turning, pushing], axis=1)
         offset = weight * _past(jnp.nan_to_num(residual), kept)
         observe = jax.vmap(lambda rates, row: model.observe(State(Rates(*rates)), row, scalars))

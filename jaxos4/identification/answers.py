@@ -157,7 +157,7 @@ def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {
             note="" if known else missing.get(name, "not identifiable from this flight"),
             bracket=(float(lower[i]), float(upper[i])) if np.isfinite([lower[i], upper[i]]).all() else None,
         )
-        return msgspec.structs.replace(found, note="; ".join(notes_of(answer, name, found))) if known else found
+        return msgspec.structs.replace(found, note="; ".join(parameter_notes(answer, name, found))) if known else found
 
     return {unknowns.names[i]: row(i, unknowns.names[i]) for i in answer.free}
 
@@ -167,7 +167,7 @@ def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
     return estimate.std, estimate.half_width(0.95)
 
 
-def notes_of(answer: Answer, name: str, row: ParameterEstimate) -> list[str]:
+def parameter_notes(answer: Answer, name: str, row: ParameterEstimate) -> list[str]:
     """The warnings about a parameter that has an estimate."""
     i, seed, bracket = answer.problem.unknowns.names.index(name), answer.estimate.seed, answer.problem.unknowns.bracket
     value = float(answer.parameters[i])

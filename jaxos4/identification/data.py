@@ -120,7 +120,7 @@ class Data(Generic[L]):
     follows_commands: bool = False
 
     @property
-    def hides_answers(self) -> bool:
+    def contains_answers(self) -> bool:
         """Whether samples hold the controller's answers as commands: feedthroughs then explain most innovations."""
         return self.follows_commands and bool(getattr(self.likelihood, "answers_within", False))
 

@@ -24,6 +24,7 @@ from .._custom_types import as_float
 from ..airframe import AXES, YAW
 from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate, robust_covariance
+from ..bracket import Bracket
 from ..errors import InputError, TrainingError
 from ..estimate import REACH, AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
@@ -51,19 +52,24 @@ WIDER = 1.5  # intervals wider than at twice the sample time by this factor woul
 NEAR_LIMIT = 0.95  # share of the way to its limit; an unknown beyond it starts no other search
 
 
-def with_network(
-    data: Data[ShootingProblem], estimator: str | AbstractEstimator, *, seed: int, progress: Progress
+def os4_estimator(
+    data: Data[ShootingProblem],
+    estimator: str | AbstractEstimator,
+    bracket: Bracket,
+    *,
+    seed: int,
+    progress: Progress,
 ) -> tuple[Data[ShootingProblem], AbstractEstimator]:
-    """The data of an OS4 and their estimator, with a network trained for them if a name was given."""
+    """The data of an OS4 and their estimator, with a network trained for them in this bracket if a name was given."""
     if not isinstance(estimator, str):
         return data, estimator
     progress("training a network for this flight")
     problem, name, shoots = data.problem, str(data.provenance.flight), ESTIMATORS[estimator].shoots
-    trained = network_for(problem, problem.unknowns.bracket, name, shoots=shoots, seed=seed)
+    trained = network_for(problem, bracket, name, shoots=shoots, seed=seed)
     problem = problem if shoots else problem.within(trained.bracket)
     provenance = msgspec.structs.replace(data.provenance, network=network_provenance(None, trained))
-    own = dataclasses.replace(data, likelihood=problem, problem=problem, provenance=provenance)
-    return own, make_estimator(estimator, trained)
+    data = dataclasses.replace(data, likelihood=problem, problem=problem, provenance=provenance)
+    return data, make_estimator(estimator, trained)
 
 
 def fit_os4(estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = silent) -> OS4Answer:
@@ -150,7 +156,7 @@ def fit_vehicle(
         answer = answers[place]
     else:
         data = answers[place].optimum.data if answers else several[0]
-        data, solver = _with_estimator(data, estimator, seed=seed, progress=progress)
+        data, solver = _vehicle_estimator(data, estimator, seed=seed, progress=progress)
         answer = corrected(search(solver, data, progress=progress))
     answer = at_lowest(answer, solver, progress=progress)
     rows[place : place + 1] = [sample_time_of(answer)]
@@ -158,7 +164,7 @@ def fit_vehicle(
     return answer, (rows[place],) if answer.optimum.restarts else tuple(rows)
 
 
-def _with_estimator(
+def _vehicle_estimator(
     data: Data[InnovationsProblem], estimator: str | AbstractEstimator, *, seed: int, progress: Progress
 ) -> tuple[Data[InnovationsProblem], AbstractEstimator]:
     """The data, with a note if a network was trained for them, and the estimator, with that network."""
@@ -191,7 +197,7 @@ def fit_sample_times(
 
     `choose`: whether to choose the sample time; otherwise only the kind of the first is fitted.
     """
-    kinds = [[each for each in several if each.hides_answers == hides] for hides in (False, True)]
+    kinds = [[each for each in several if each.contains_answers == contains] for contains in (False, True)]
     order = [(kind, None) for kind in kinds if kind and (choose or kind[0] is several[0])]
     if len(order) > 1:
         (kind, _), other = order

@@ -20,9 +20,9 @@ from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..networks import TrainedNetwork
 from .data import class_name, silent
-from .fit import DEFAULT, fit_os4, fit_vehicle, vehicle_estimator, with_network
+from .fit import DEFAULT, fit_os4, fit_vehicle, os4_estimator, vehicle_estimator
 from .judge import judge_os4, judge_vehicle
-from .prepare_os4 import Intervals, OS4Settings, prepare_os4
+from .prepare_os4 import Intervals, OS4Settings, bracket_of, prepare_os4
 from .prepare_vehicle import VehicleSettings, prepare_vehicle
 from .results import Identification, OS4Identification, VehicleIdentification
 
@@ -86,7 +86,8 @@ def identify(
     - `settings`: `OS4Settings` for a model, `VehicleSettings` for an airframe.
     - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
       `"filter-error"` for a vehicle, which flies in closed loop. The other estimators of a vehicle, such as `"ibss"`,
-      search the same likelihood.
+      search the same likelihood. An object's settings count at every sample time; `"filter-error"` has a tolerance of
+      0.001.
     - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
     - `network`: for a model, a trained network or its file; without it, an estimator that needs a network trains one.
     - `validate`: another flight or path, which is not fitted but predicted.
@@ -119,7 +120,7 @@ def identify(
         data, name, estimator = prepare_os4(
             recordings, subject, wanted, estimator=estimator, bracket=bracket, network=network, validate=other
         )
-        data, solver = with_network(data, estimator, seed=seed, progress=progress)
+        data, solver = os4_estimator(data, estimator, bracket_of(bracket, subject), seed=seed, progress=progress)
         answer = fit_os4(solver, data.likelihood, progress=progress)
         found = judge_os4(data, answer, solver, name)
     return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)

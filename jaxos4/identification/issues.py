@@ -37,9 +37,10 @@ from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_B
 MIN_SECONDS = 10.0
 VIBRATION = 0.4  # if innovations correlate more, filter error is biased by more than its intervals say
 MAX_SAMPLE = 0.008  # s; longer samples would hide the motion along with the vibration
-# Factors by which an interval is widened. By chance, one of few parts is widened about twice; a larger factor makes a
-# warning. In 107 simulated logs, each of a single vehicle, no factor exceeds 2; a log of two vehicles has 9, and some
-# real logs have 3 to 6. From the second factor on, an issue about what depends on the parameter replaces the warning.
+# Factors by which an interval is widened. In a flight of few parts, chance alone widens an interval about twice; a
+# larger factor makes a warning. In 107 simulated logs, each of a single vehicle, no factor exceeds 2; a log of two
+# vehicles has 9, and some real logs have 3 to 6. From the second factor on, what depends on the parameter has a
+# reservation too.
 WIDENED, DISAGREE = 2.0, 4.0
 NO_SKILL = 2.0  # standard errors; an inertia is not identified if the skill at the shortest horizon is so far below 0
 _NOT_LOWEST = (
@@ -101,6 +102,7 @@ def issues_of_vehicle(
     widths = dict(zip(optimum.unknowns.names, np.asarray(optimum.unknowns.half_width).tolist(), strict=True))
     fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | dict(answer.negative)
     follow = partial(consequences, answer, constants)
+    at_limits = [*_issues_of_limits(answer)] if search == "at_bound" else []
     return [
         *(() if optimum.is_lowest else [Issue("max_sweeps", *_NOT_LOWEST, dict.fromkeys(quantities))]),
         *issues_of_log(data.findings),
@@ -118,7 +120,7 @@ def issues_of_vehicle(
         *issues_of_predictions(found.skill, still),
         *_issues_of_sample_time(answer, sample_times, constants),
         *stronger_or_weaker(response, constants),
-        *((search == "at_bound" and [*_issues_of_limits(answer)]) or _issues_of_search(search, quantities)),
+        *(at_limits or _issues_of_search(search, quantities)),
     ]
 
 
@@ -168,10 +170,8 @@ def few_parts(seconds: float) -> Iterator[Issue]:
 
 
 def much_widened(found: VehicleIdentification) -> dict[str, float]:
-    """The factors by which intervals were widened more than by chance, of the parameters that make no issue."""
-    # A file of version 0.6 has neither verdicts nor the issues of `parts_disagree`.
-    most = DISAGREE if found.verdicts else np.inf
-    return {name: factor for name, factor in found.widened.items() if WIDENED < factor <= most}
+    """The factors by which intervals were widened more than by chance."""
+    return {name: factor for name, factor in found.widened.items() if factor > WIDENED}
 
 
 def parts_disagree(model: AbstractModel, widened: Mapping[str, float], logs: int = 1) -> Iterator[Issue]:

@@ -36,6 +36,7 @@ from .answers import (
     OS4Answer,
     VehicleAnswer,
     dominated,
+    parameter_notes,
     parameter_table,
     shared_fields,
     vehicle_constants,
@@ -88,7 +89,9 @@ def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name:
     )
     # The answer of a method that does not shoot is not the best fit, so its residuals are not white.
     issues = issues_of_os4(data, found, found.fit if estimator.shoots else {})
-    verdicts = verdicts_of(os4_quantities(answer, found), issues)
+    estimated = {name: row for name, row in found.parameters.items() if row.estimate is not None}
+    notes = {name: parameter_notes(answer, name, row) for name, row in estimated.items()}
+    verdicts = verdicts_of(os4_quantities(found, notes), issues)
     # Only the alphas were requested. An alpha that the flight does not show is no fault of the answer.
     wrong = [name for name in found.parameters if verdicts[name].status == CONTRADICTED]
     result = result_of(verdicts, issues, search, wrong if search == "successful" else found.parameters)
@@ -186,7 +189,7 @@ def judge_vehicle(
         of_yaw = {YAW.coupling, YAW.inverse} & table.keys()
         table |= {name: msgspec.structs.replace(table[name], note=said) for name in of_yaw}
         still = (*still, *({YAW.motion} - {*still}))
-    response = frequency_response(padded(answer.problem), as_float(answer.parameters))
+    response = frequency_response(in_one_window(answer.problem), as_float(answer.parameters))
     predicted, paths = (None if each is None else each.thinned(_MOST_STARTS) for each in (predicted, paths))
     traces, correlations = vehicle_traces(answer, predicted)
     found = msgspec.structs.replace(
@@ -235,20 +238,25 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
             parameters = np.array([values[shared == name].mean() for name in problem.unknowns.names])
         known = None
         if noise is not None:
-            known, _ = _disturbances(data, _together(data, held_out), parameters, noise)
+            known, _ = _disturbances(_together(data, held_out), parameters, noise)
         return predictions(problem, as_float(parameters), horizons=horizons, disturbance=known, noise=noise)
 
     horizons = (*HORIZONS, *trajectory_horizons(float(problem.flight.dt)))
     every = predicted_by(answer.parameters, answer.optimum.noise, horizons)
     predicted, trajectories = every.at(np.s_[: len(HORIZONS)]), every.at(np.s_[len(HORIZONS) :])
     own, fixed = skill(predicted), [name in answer.fixed for name in names]
-    regressed = np.asarray(_regressed(padded(answer.problem), as_float(answer.parameters), np.asarray(fixed)))
+    regressed = np.asarray(_regressed(in_one_window(answer.problem), as_float(answer.parameters), np.asarray(fixed)))
     compared = skill(predicted_by(regressed, None))
     tables = (own.skill, own.std, own.rmse, own.persistence, compared.skill)
     rates = {
         rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
     }
     return predicted, trajectories, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
+
+
+def in_one_window(problem: ShootingProblem) -> ShootingProblem:
+    """The padded problem of a vehicle's flight, so that flights of other lengths share the programs that check them."""
+    return padded(dataclasses.replace(problem, windows=1))
 
 
 def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
@@ -261,7 +269,7 @@ def _together(data: Data, held_out: HeldOut) -> ShootingProblem:
 
 
 def _disturbances(
-    data: Data, problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise
+    problem: ShootingProblem, parameters: np.ndarray, noise: LogNoise
 ) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
     """The disturbance of each body rate [rad/s^2] and its innovation [rad/s; NaN: not measured] at each sample.
 
@@ -269,7 +277,7 @@ def _disturbances(
     its prediction from the sample before. The model is evaluated at the measured rates.
     """
     samples = problem.flight.time.shape[0]
-    problem = padded(problem)
+    problem = in_one_window(problem)
     flight, rates = problem.flight, np.asarray(problem.flight.states)[:, RATES]
     modelled = np.pad(modelled_acceleration(problem, as_float(parameters)), ((0, 1), (0, 0)))
     of_rates = jax.tree.map(lambda leaf: as_float(np.asarray(leaf)[: len(RATES)]), noise)
@@ -285,7 +293,7 @@ def vehicle_traces(answer: VehicleAnswer, predicted: Predictions | None) -> tupl
     optimum, data = answer.optimum, answer.optimum.data
     other = data.held_out
     problem = answer.problem if other is None or other.recording is not None else _together(data, other)
-    disturbance, innovation = _disturbances(data, problem, answer.parameters, optimum.noise)
+    disturbance, innovation = _disturbances(problem, answer.parameters, optimum.noise)
     flight = answer.problem.flight
     states, omega = np.asarray(flight.states, float), np.asarray(flight.omega, float)
     position = position_of(np.asarray(problem.flight.states, float))

@@ -61,7 +61,7 @@ def prepare_os4(
 ) -> tuple[Data[ShootingProblem], str, str | AbstractEstimator]:
     """The data of one flight, and the name and object of its estimator. Arguments as in `identify`.
 
-    An estimator whose network is not trained yet is no object, but the name; see `with_network`.
+    The estimator is still a name if its network must be trained first; see `os4_estimator`.
     """
     recording, *others = recordings
     if others:

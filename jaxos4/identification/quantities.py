@@ -1,6 +1,6 @@
 """The quantities of a vehicle and of an OS4 that get a verdict."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -9,7 +9,7 @@ from ..airframe import AXES, YAW
 from ..models.abstract import PARAMETER_NAMES
 from ..models.terms import SAG, VOLTAGE_EXPONENT
 from ..results import NINETY_FIVE
-from .answers import Answer, drag_error, notes_of
+from .answers import Answer, drag_error
 from .intervals import PRIOR_NOTE
 from .issues_of_values import MEASURE
 from .results import OS4Identification, ParameterEstimate, PredictionSkill, VehicleIdentification
@@ -119,13 +119,13 @@ def prediction_horizons(skill: PredictionSkill | None, still: Sequence[str]) -> 
     return Quantity(reach + worse, reservations=unchecked)
 
 
-def os4_quantities(answer: Answer, found: OS4Identification) -> dict[str, Quantity]:
-    """The alphas of an OS4, and its rigid body. `found`: the parameters and the rigid body of the answer."""
+def os4_quantities(found: OS4Identification, notes: Mapping[str, Sequence[str]]) -> dict[str, Quantity]:
+    """The alphas of an OS4, and its rigid body. `notes`: the warnings about each alpha that has an estimate."""
     quantities, remedy = {}, "fly what `jaxos4 design` proposes"
     for name, row in found.parameters.items():
         if row.estimate is None:
             quantities[name] = Quantity(missing=Reason(row.note, remedy))
         else:
-            quantities[name] = Quantity(reservations=tuple(map(Reason, notes_of(answer, name, row))))
+            quantities[name] = Quantity(reservations=tuple(map(Reason, notes[name])))
     unknown = None if found.rigid_body.constants else Reason("the alphas are not known well enough", remedy)
     return quantities | {RIGID_BODY: Quantity(missing=unknown)}

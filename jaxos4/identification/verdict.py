@@ -122,8 +122,8 @@ class Verdict(msgspec.Struct, frozen=True):
       that consist of parameters, whose table shows them.
     - `reasons`: the reservations, or the causes with their remedies; without a remedy if the size of the move is known,
       because `next_flight` gives it. Empty if the quantity is `identified`.
-    - `remedies`: what to do about these reasons, except flying more because the interval is too long.
-    - `flying_helps`: whether a longer or stronger flight shortens the interval.
+    - `remedies`: what to do about these reasons. How much more to fly is not among them: `next_flight` computes it.
+    - `flying_helps`: whether more flight, rather than a measured drag coefficient, is what a long interval needs.
     """
 
     status: str
@@ -139,14 +139,17 @@ class Verdict(msgspec.Struct, frozen=True):
 
 
 class Reason(NamedTuple):
-    """Why a quantity is not simply identified, in words, and what to do about it; empty if nothing can be done."""
+    """Why a quantity has a reservation or is refused.
+
+    - `words`: the cause, and the remedy if there is one. `remedy`: what to do; empty if nothing can be done.
+    """
 
     words: str
     remedy: str = ""
 
     @classmethod
     def of(cls, cause: str, remedy: str) -> "Reason":
-        """A reason whose words are the cause, then the remedy."""
+        """The reason with this cause and remedy."""
         return cls(f"{cause}; {remedy}", remedy)
 
 

@@ -103,7 +103,8 @@ def read_log(
     **Raises:** `InputError`, one line: the file, the place in it, what is wrong and what to do.
     """
     found = read_recording(log, airframe, full_scale=full_scale, columns=columns)
-    return found.flight, (*found.notes, *filter(None, (found.facts.too_slow_note,)))
+    note = found.facts.too_slow_note
+    return found.flight, (*found.notes, note) if note else found.notes
 
 
 def read_recording(

@@ -75,7 +75,7 @@ class Table(NamedTuple):
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
     - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
-    - `held`: whether measured rotor speeds are a zero-order hold, so means until the next row, and not instants.
+    - `held`: whether a measured rotor speed is the mean until the next row (zero-order hold), not that of an instant.
     - `impossible`: by column, how many values `jaxos4.logs.values` took out, and the first of them.
     """
 

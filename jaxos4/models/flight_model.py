@@ -176,7 +176,7 @@ class FlightModel(AbstractModel):
             fine = jax.tree.map(lambda leaf: leaf.reshape(-1, parts), fine)
             whole = jax.tree.map(lambda leaf: leaf.mean(axis=1), fine)
             early = jax.tree.map(lambda leaf: leaf @ left, fine)
-            return whole._replace(sensed_specific_thrust=fine.specific_thrust @ seen, early=early)
+            return whole._replace(sensed_specific_thrust=fine.mean_specific_thrust @ seen, early=early)
 
         return self._beside(inputs, self._rotors(inputs.divided, parameters, parts=parts, of_parts=averaged))
 
@@ -230,7 +230,7 @@ class FlightModel(AbstractModel):
             roll=roll,
             pitch=pitch,
             yaw=yaw,
-            specific_thrust=thrust / mass,
+            mean_specific_thrust=thrust / mass,
             residual_speed=(speeds.begin + speeds.end) @ spins / 2,
             spin_up=speeds.change @ spins / inputs.dt,
             sensed_specific_thrust=around.sum(axis=1) * airframe.thrust_coefficient / mass,
@@ -259,7 +259,7 @@ class FlightModel(AbstractModel):
         angles = None if orientation is None else attitude_rates(state.rates, orientation)
         translation = None
         if orientation is not None and t is not None:
-            ax, ay, az = to_earth(orientation, self.specific_force(forcing.specific_thrust, forcing, parameters))
+            ax, ay, az = to_earth(orientation, self.specific_force(forcing.mean_specific_thrust, forcing, parameters))
             translation = Translation(t.vx, ax, t.vy, ay, t.vz, az - self.airframe.gravity)
         return State(rates, angles, translation)
 

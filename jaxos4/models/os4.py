@@ -66,7 +66,7 @@ class AbstractOS4(AbstractModel):
         if t is None:
             return State(rates, attitude)
         x, y = self.horizontal_thrust(orientation)
-        thrust = forcing.specific_thrust
+        thrust = forcing.mean_specific_thrust
         az = orientation.cos_theta * orientation.cos_phi * thrust - self.airframe.gravity  # Eq. (9)
         return State(rates, attitude, Translation(t.vx, x * thrust, t.vy, y * thrust, t.vz, az))
 

@@ -78,8 +78,8 @@ class Forcing(NamedTuple):
     Only a `FlightModel` has the other fields:
 
     - `spin_up`: Omega_r' [rad/s^2].
-    - `sensed_specific_thrust`: U_c/m at the time of the sample, or averaged around it like the log, as an accelerometer
-      senses it [m/s^2].
+    - `sensed_specific_thrust`: U_c/m as an accelerometer senses it [m/s^2]: at the time of the sample, or averaged
+      around it like the log.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
     - `velocity`: along the body's axes, see `Flight.body_velocity` [m/s].
     - `early`: the forcing weighted by the time that remains in the sample, for its effect on a mean over the sample.
@@ -89,7 +89,7 @@ class Forcing(NamedTuple):
     roll: Samples
     pitch: Samples
     yaw: Samples
-    specific_thrust: Samples
+    mean_specific_thrust: Samples
     residual_speed: Samples
     spin_up: Samples | None = None
     sensed_specific_thrust: Samples | None = None
@@ -101,7 +101,7 @@ class Forcing(NamedTuple):
 # The positions of the leaves of a `State` in the paper's order, Eq. (14).
 CASCADE_ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])
 
-# The choices of `channels`, which of the states are compared, and the number of leaves that each needs.
+# The choices of `channels`, the states that are compared, and how many leaves of a state each needs.
 CHANNELS = {"rates": 3, "attitude": 6, "all": 12}
 
 

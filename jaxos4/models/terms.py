@@ -205,7 +205,7 @@ _OWN: dict[str, Term] = {
         "a torque proportional to thrust above hover, from an offset centre of mass: roll_thrust, pitch_thrust [rad/m]",
         # The bracket is an offset of 10 % of the arm.
         tuple(Parameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(MOTIONS[:2])),
-        angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.specific_thrust - GRAVITY,) * 2),
+        angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.mean_specific_thrust - GRAVITY,) * 2),
         verdict="center of mass",
     ),
     "damping": Term(

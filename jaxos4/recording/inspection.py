@@ -74,10 +74,10 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     """Describe a log that was read with this airframe and `full_scale=1.0`. Torques are unknown without an airframe."""
     seconds = fair_share([recording], finest(recording.dt, commands=recording.dt * recording.commanded))
     evidence, inspected = Evidence(recording, airframe, seconds=seconds), []
-    for stretch in evidence.every:
+    for stretch in evidence.all_stretches:
         excited = {} if stretch.reason else excitation(cut(evidence.recording, stretch), airframe)
         inspected.append(InspectedStretch(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited))
-    nothing = "" if evidence.usable else f"{unusable_note(evidence.every)}; give the log of a flight"
+    nothing = "" if evidence.usable else f"{unusable_note(evidence.all_stretches)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(evidence.stretches, airframe)
     refusals = tuple(filter(None, (nothing, recording.facts.too_slow_note, refused_note(opposite))))
     return Inspection(

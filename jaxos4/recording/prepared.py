@@ -209,7 +209,7 @@ def _usable(
     """The usable stretches, or those from `begin` to `end`; notes on the others. `slow`: why the log is too slow."""
     recording = evidence.recording
     name, (first, last), notes = recording.name, recording.time[[0, -1]].tolist(), []
-    parts, refused = evidence.usable, [stretch for stretch in evidence.every if stretch.reason]
+    parts, refused = evidence.usable, [stretch for stretch in evidence.all_stretches if stretch.reason]
     if begin is not None or end is not None:
         given = Stretch(first if begin is None else begin, last if end is None else end)
         with named(name):
@@ -218,7 +218,7 @@ def _usable(
     elif not parts:
         remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
         besides = f" Besides, {slow}." if slow else ""
-        raise InputError(f"{name}: {unusable_note(evidence.every)}; {remedy}.{besides}")
+        raise InputError(f"{name}: {unusable_note(evidence.all_stretches)}; {remedy}.{besides}")
     elif refused:
         longest = sorted(refused, key=lambda stretch: -stretch.length)[:3]
         reasons = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in longest)

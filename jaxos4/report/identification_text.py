@@ -34,7 +34,7 @@ Lines = Iterator[str | Listing]
 
 
 def print_identification(console: Console, found: Identification, *, verbose: bool = False) -> None:
-    """Prints verdicts, quantities, reservations and notes; or why there is no answer.
+    """Prints verdicts, quantities, reservations and notes; without an answer only notes, and why a trajectory diverged.
 
     `verbose`: for a vehicle, also all parameters, the noise and the quality of predictions. An OS4 always has its
     parameters.

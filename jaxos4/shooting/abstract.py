@@ -113,7 +113,7 @@ class Unknowns(eqx.Module):
         return dataclasses.replace(self, center=center, half_width=half_width)
 
     @property
-    def width(self) -> Values:
+    def free_half_width(self) -> Values:
         """The half-width of each free unknown, and 0 for fixed ones."""
         return jnp.where(self.free, self.half_width, 0.0)
 

@@ -11,14 +11,14 @@ from jaxtyping import Array
 
 from ..batching import with_batch
 from ..models.state import Forcing, State
-from .filters import Innovations, Point, Scalars, Segmented, innovations_at
+from .filters import Point, Scalars, Segmented, SegmentLikelihoods, innovations_at
 
 Move = Callable[[State, Forcing, Scalars], State]
 Observe = Callable[[State, Forcing, Scalars], Scalars]
 Functions = tuple[Move, Move, Observe]
 
 
-def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
+def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> SegmentLikelihoods:
     """Filter all segments. The likelihood of the innovations has derivatives in all unknowns.
 
     In the derivatives, the noise of a channel affects its own innovations only.
@@ -30,7 +30,7 @@ def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented
     return with_batch(_innovate, _innovate_lanes, functions, positions, flight, at)()
 
 
-def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
+def _innovate_lanes(lanes: int, many: Any, shared: Any) -> SegmentLikelihoods:
     """The innovations of a batch, whose lanes become segments. The segments of a lane are adjacent."""
     (moving, _, flight, at), (fixed, positions, fixed_flight, fixed_at) = many, shared
     segments = eqx.combine(flight, fixed_flight).measured.shape[-1]
@@ -71,7 +71,7 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
 
 
-def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> Innovations:
+def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> SegmentLikelihoods:
     """The innovations of one flight."""
     own = None if at.parameters.ndim == 1 else 0
     move, average, observe = (jax.vmap(function, in_axes=(0, 0, own)) for function in functions)

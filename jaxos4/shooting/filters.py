@@ -45,8 +45,8 @@ LAGS = 8
 """The largest lag at which innovations are compared, in samples."""
 
 
-class Innovations(NamedTuple):
-    """The innovations of each segment and their negative log-likelihood.
+class SegmentLikelihoods(NamedTuple):
+    """The negative log-likelihood of each segment, with derivatives.
 
     The unknowns of a channel are the parameters, then its `LogNoise`, gains of input innovations, and feedthroughs.
 
@@ -127,7 +127,7 @@ class _Row(NamedTuple):
 
 def innovations_at(
     functions: tuple[Callable, ...], positions: tuple[int, ...], flight: Segmented, at: Point
-) -> Innovations:
+) -> SegmentLikelihoods:
     """See `filter_lanes.innovate`. `functions` act on all segments. Arrays in `at` may have segments as last axis."""
     (count, *own), (time, channels, segments) = at.parameters.shape, flight.measured.shape
     driving = count + len(jax.tree.leaves((at.noise, at.input_gains)))  # the unknowns that change the estimates
@@ -185,7 +185,8 @@ def innovations_at(
         filters, found = jax.lax.scan(sample, filters, (forcing, tangents, row))
         (errors, slopes), variance, variance_slopes = found
         counts = row.is_measured & counts[:, None]
-        # Known feedthroughs explain a part of the innovations that counts as noise; the others are estimated.
+        # What input innovations explain is no longer an error. What they explained at the end of the first stage still
+        # counts as noise.
         both = at.feedthrough, at.noise_feedthrough
         explained, as_noise = (jax.vmap(by_inputs, in_axes=(None, 0))(each, row.inputs) for each in both)
         errors, slopes = errors - explained, jnp.concatenate([slopes, -jnp.moveaxis(row.inputs, 2, 1)], axis=2)
@@ -195,7 +196,7 @@ def innovations_at(
 
     begin = first, jnp.zeros((LAGS, channels, segments), dtype=float), nothing
     (*_, feasible), _, (cost, *sums) = jax.lax.fori_loop(0, -(-flight.rows // BLOCK), block, begin)
-    return Innovations(cost, feasible, *sums)
+    return SegmentLikelihoods(cost, feasible, *sums)
 
 
 def _start(flight: Segmented, noise: LogNoise, driving: int) -> tuple[tuple[Step, Step], tuple]:
@@ -243,11 +244,11 @@ def _advance(
 
     errors = computed_once(going, compared)
     # A missing measurement has a gain of 0.
-    driven = tuple(x + gain * e for x, gain, e in zip(before, feedback.driven, errors, strict=True))
-    rates = computed_once(going, lambda: move(State(Rates(*driven[:RATE_COUNT])), forcing, scalars).rates)
-    driven = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, driven, strict=True)][RATE_COUNT:]))
+    corrected = tuple(x + gain * e for x, gain, e in zip(before, feedback.driven, errors, strict=True))
+    rates = computed_once(going, lambda: move(State(Rates(*corrected[:RATE_COUNT])), forcing, scalars).rates)
+    moved = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, corrected, strict=True)][RATE_COUNT:]))
     added = tuple(by_inputs(gains, row.inputs) for gains in feedback.input_gains)
-    later = zip(driven, feedback.reach, disturbance, feedback.driven_later, errors, added[0], strict=True)
+    later = zip(moved, feedback.reach, disturbance, feedback.driven_later, errors, added[0], strict=True)
     driven = tuple(x + a * d + gain * e + v for x, a, d, gain, e, v in later)
     faded = zip(feedback.kept, disturbance, feedback.disturbance_later, errors, added[1], strict=True)
     disturbance = tuple(share * d + gain * e + v for share, d, gain, e, v in faded)
@@ -273,7 +274,7 @@ def _likelihood(
     `feedthrough_squares`: the squares of the explained part of the innovations, which counts as noise. `noise`: the
     indices of the noise among the unknowns.
 
-    **Returns:** `cost`, `gradient`, `information` and `products` of `Innovations`; then the next `last`.
+    **Returns:** `cost`, `gradient`, `information` and `products` of `SegmentLikelihoods`; then the next `last`.
     """
     weight = jnp.where(counts, 1 / variance, 0.0)
     logarithm = jnp.where(counts, jnp.log(variance), 0.0)

@@ -105,10 +105,10 @@ class Step(NamedTuple):
     - `transition`: propagates the disturbance over one sample, without noise.
     - `driven_seen`, `seen`: the change of the measurement for a unit of x and of d.
     - `since_seen`: what is left of x at the end of the sample, for each unit by which x changes the measurement.
-    - `added`: the covariance that its noise adds at the end of the sample.
-    - `noise`: the variance that its noise adds to the measurement; `with_driven`, `with_disturbance`: the covariance
-      with x and d at the end.
-    - `first`: the covariance before anything is measured; rates are known. `sensor`: the variance of its noise.
+    - `added`: the covariance that the disturbance's noise adds at the end of the sample.
+    - `noise`: the variance that the disturbance's noise adds to the measurement; `with_driven`, `with_disturbance`: the
+      covariance of this part of the measurement with x and d at the end.
+    - `first`: the covariance before anything is measured; rates are known. `sensor`: the variance of the sensor noise.
     """
 
     transition: Transition

@@ -27,7 +27,7 @@ from ..models.state import Forcing, State
 from ..simulation import midpoint_step
 from .abstract import AbstractProblem, InitialGuess, LocalModel, Parts, Stage, Stages, Unknowns, Values, WindowUnknowns
 from .filter_lanes import innovate
-from .filters import LAGS, Innovations, Point, Segmented
+from .filters import LAGS, Point, Segmented, SegmentLikelihoods
 from .gains import INSTANT, LogNoise
 from .layout import Segments, observe_in_segments
 from .noise_unknowns import TIMES, joined, levels, own_names, placed, with_noise
@@ -270,8 +270,8 @@ class InnovationsProblem(AbstractProblem):
         parameters: Parameters,
         noise: LogNoise,
         input_unknowns: Float[Array, "3 channels feedthroughs"] | None = None,
-    ) -> Innovations:
-        """The innovations of all segments, with derivatives in the parameters of the segment's recording.
+    ) -> SegmentLikelihoods:
+        """The likelihoods of all segments, with derivatives in the parameters of the segment's recording.
 
         `input_unknowns`: the gains of input innovations on rate and disturbance, and the feedthroughs; by default 0.
         """
@@ -280,14 +280,14 @@ class InnovationsProblem(AbstractProblem):
         noise_feedthrough = jnp.nan_to_num(self.noise_feedthrough)
         return self._innovations()(parameters, noise, input_unknowns, noise_feedthrough)
 
-    def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], Innovations]:
+    def _innovations(self) -> Callable[[Parameters, LogNoise, Array, Array], SegmentLikelihoods]:
         """`innovations` for a loop: everything that does not depend on parameters and noise is computed once."""
         observed = observe_in_segments(self)
-        problem, forced, each = self.problem, self._forced(), self._by_recording
+        problem, forced, by_recording = self.problem, self._forced(), self._by_recording
         places = None
-        if each is not None:
-            problem = dataclasses.replace(problem, model=each.model)
-            places = jnp.asarray(each.places)[self.segmentation.recording].T
+        if by_recording is not None:
+            problem = dataclasses.replace(problem, model=by_recording.model)
+            places = jnp.asarray(by_recording.places)[self.segmentation.recording].T
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[observed["place"]], 1, -1)
         rows, dt, window = self.segmentation.rows, self.flight.dt, INSTANT
@@ -295,7 +295,9 @@ class InnovationsProblem(AbstractProblem):
             window = (dt - self.flight.averaging_time) / 2, self.flight.averaging_time
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
-        def at(parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array) -> Innovations:
+        def at(
+            parameters: Parameters, noise: LogNoise, input_unknowns: Array, noise_feedthrough: Array
+        ) -> SegmentLikelihoods:
             forcing, tangents = forced(parameters)
             own = parameters if places is None else parameters[places]
             flight = Segmented(

@@ -340,7 +340,7 @@ class ShootingProblem(AbstractProblem):
         return np.where(within, index, ends[1:, None] - 1), within
 
     def advance(self, forcing: Forcing, state: State, parameters) -> tuple[State, tuple[Scalar, ...]]:
-        """The state one sample later, down to the same level of the cascade, and the output of noise-free sensors."""
+        """The state one sample later, down to the same level of the cascade; what ideal sensors show at this sample."""
         following = METHODS[self.method](self.model, state, forcing, parameters, self.flight.dt)
         return following, self.model.observe(state, forcing, parameters)
 

@@ -90,14 +90,14 @@ class Evidence:
         return in_body_axes(self.plausible.recording, self.airframe)
 
     @functools.cached_property
-    def every(self) -> tuple[Stretch, ...]:
+    def all_stretches(self) -> tuple[Stretch, ...]:
         """Every stretch of the flight: usable ones, and others with the reason."""
         return stretches(self.recording, self.airframe)
 
     @property
     def usable(self) -> list[Stretch]:
         """The stretches of the flight that can be used."""
-        return [each for each in self.every if not each.reason]
+        return [each for each in self.all_stretches if not each.reason]
 
     def richest(self, parts: Sequence[Stretch]) -> list[Stretch]:
         """The most informative pieces of some parts, of at most `seconds` together."""
