@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ._custom_types import Numeric, Parameters, as_float
 from .models.abstract import AbstractModel
 
-# How a bracket is used. Each number is the largest standard deviation of an identifiable parameter, in half-widths.
+# The largest standard deviation of an identifiable parameter, in half-widths, by how the bracket is used.
 NO_PRIOR = 1.0  # a region to search: the flight must contain more information than the bracket
 GAUSSIAN_PRIOR = 0.5**0.5  # a prior with a standard deviation of 1: the flight must tell at least as much
 UNIFORM_PRIOR = 0.5  # a prior with a standard deviation of 0.577
@@ -16,13 +16,13 @@ PROPER_PRIOR = float("inf")  # a prior of the likelihood itself, which has an an
 
 
 def is_identifiable(
-    std: Float[ArrayLike, "*parameters"], half_width: Float[ArrayLike, "*parameters"], prior: float = NO_PRIOR
+    std: Float[ArrayLike, "*parameters"], half_width: Float[ArrayLike, "*parameters"], largest: float = NO_PRIOR
 ) -> Bool[Numeric, "*parameters"]:
-    """The rule: a parameter is identifiable if its standard deviation is at most `prior` half-widths of its bracket.
+    """The rule: a parameter is identifiable if its standard deviation is at most `largest` half-widths of its bracket.
 
-    `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR`, `UNIFORM_PRIOR` or `PROPER_PRIOR`.
+    `largest`: by how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR`, `UNIFORM_PRIOR` or `PROPER_PRIOR`.
     """
-    return std <= prior * half_width  # type: ignore[return-value]
+    return std <= largest * half_width  # type: ignore[return-value]
 
 
 class Bracket(eqx.Module):

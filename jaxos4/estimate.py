@@ -106,7 +106,7 @@ def as_estimate(
     feasible: Bool[Array, ""],
     done: Bool[Array, ""],
     reach: Scalar | float = REACH,
-    prior: float | None = None,
+    largest_std: float | None = None,
     history: Float[Array, "samples parameters"] | None = None,
     **more: Any,
 ) -> Estimate:
@@ -114,7 +114,7 @@ def as_estimate(
 
     - `feasible`: whether the trajectory did not fail before its end. `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
-    - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`; by default as the cost does.
+    - `largest_std`: of an identifiable parameter, see `jaxos4.bracket`; by default that of the cost.
     - The others are fields of an `Estimate`.
     """
     unknowns = problem.unknowns
@@ -124,7 +124,7 @@ def as_estimate(
     covariance = jnp.where(free & free[:, None], covariance, 0.0)
     std = jnp.sqrt(jnp.diagonal(covariance))
     far = (jnp.abs(parameters - center) > (reach - 1e-2) * half_width) & free
-    identifiable = unknowns.identifiable(std, prior)
+    identifiable = unknowns.identifiable(std, largest_std)
     finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
     feasible = feasible & jnp.isfinite(cost) & finite
     result = RESULTS.where(far[:own].any(), RESULTS.at_bound, RESULTS.successful)
@@ -177,7 +177,7 @@ class AbstractEstimator(eqx.Module):
     - `looks_at`: the largest choice of a state's channels that it compares: `"rates"`, `"attitude"` or `"all"`.
     - `shoots`: whether it minimises the cost of a simulation of a `ShootingProblem`. If so, it can use windows, and
       `identify` replaces its covariance by the one that follows from the noise.
-    - `prior`: how it uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
+    - `largest_std`: of an identifiable parameter: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
     - `needs_network`: whether it needs a trained network, in a field `network`.
     - `in_closed_loop`: whether it searches a likelihood of innovations too, and so serves a vehicle that a controller
       flies. Its `Estimate` then has `parts`.
@@ -186,7 +186,7 @@ class AbstractEstimator(eqx.Module):
 
     looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = False
-    prior: ClassVar[float] = NO_PRIOR
+    largest_std: ClassVar[float] = NO_PRIOR
     needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = False
     in_comparison: ClassVar[bool] = True

@@ -93,7 +93,7 @@ def test_later_speeds_have_no_influence(delay):
     def forced(within):
         inputs = Inputs(within.mean(axis=1), jnp.asarray(0.004), within=within)
         at = model.alpha.at[8].set(delay)
-        return jax.jvp(lambda parameters: model.mean_forcing(inputs, parameters), (at,), (jnp.eye(at.size)[8],))
+        return jax.jvp(lambda parameters: model.centered_forcing(inputs, parameters), (at,), (jnp.eye(at.size)[8],))
 
     (found, slopes), (others, other_slopes) = (forced(jnp.asarray(each)) for each in (speeds, other))
     for one, another in zip(*map(jax.tree.leaves, ((found, slopes), (others, other_slopes))), strict=True):

@@ -165,7 +165,7 @@ def test_stretches_padding_and_batches_do_not_change_the_forcing_of_means(monkey
 
 @eqx.filter_jit
 def both_forcings(model, inputs, parameters):
-    return model.forcing(inputs, parameters), model.mean_forcing(inputs, parameters)
+    return model.forcing(inputs, parameters), model.centered_forcing(inputs, parameters)
 
 
 # A flight.

@@ -73,7 +73,7 @@ def data_of(flight, sample_time):
 
 @eqx.filter_jit
 def mean_forcing_of(model, inputs, parameters):
-    return model.mean_forcing(inputs, parameters)
+    return model.centered_forcing(inputs, parameters)
 
 
 # The choice of the sample time.

@@ -167,7 +167,7 @@ def _measured_rates(problem: ShootingProblem) -> Float[Array, "samples 3"]:
 @compiled_cheaply
 def _parts(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[Array, "steps 3"], Float[Array, "steps 3"]]:
     """The model's change of the measured rates over each step [rad/s^2]: by the rotors, and by the rates."""
-    rates, forcing = _measured_rates(problem), problem.model.mean_forcing(problem.flight.inputs, parameters)
+    rates, forcing = _measured_rates(problem), problem.model.centered_forcing(problem.flight.inputs, parameters)
 
     def at(rates: Array, forcing: Forcing) -> Array:
         return jnp.stack(problem.model.angular_acceleration(Rates(*rates.T), forcing, tuple(parameters)), axis=1)

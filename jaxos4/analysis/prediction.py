@@ -202,7 +202,7 @@ class Filtered(NamedTuple):
 
     def later(self, over: Transition, driven: Numeric, disturbance: Numeric | float = 0.0) -> "Filtered":
         """One sample later, if nothing is measured. `driven`, `disturbance`: what each gains besides."""
-        driven = over.driven_kept * self.driven + over.reach * self.disturbance + driven
+        driven = over.driven_kept * self.driven + over.driven_by * self.disturbance + driven
         return Filtered(driven, over.kept * self.disturbance + disturbance)
 
 
@@ -255,7 +255,7 @@ def open_loop(
     - `rows`: the forcing of each step. `gusts`: random increments of each channel in each step.
     - `over`: the transition of the disturbance over a step.
     """
-    rate = is_rate(over.reach)
+    rate = is_rate(over.driven_by)
 
     def step(carry: tuple[Motion, Filtered], row: tuple[Any, Filtered]) -> tuple[tuple[Motion, Filtered], Motion]:
         (motion, known), (forcing, gust) = carry, row

@@ -43,7 +43,7 @@ class JointEKF(AbstractEstimator):
     iterated updates.
     """
 
-    prior: ClassVar[float] = GAUSSIAN_PRIOR
+    largest_std: ClassVar[float] = GAUSSIAN_PRIOR
 
     passes: Count = eqx.field(converter=integer("passes", 1), default=10)
 
@@ -88,7 +88,7 @@ class JointEKF(AbstractEstimator):
             rollouts=passes * (unknowns + 1) + 1,
             sweeps=passes,
             feasible=feasible,
-            prior=self.prior,
+            largest_std=self.largest_std,
             done=done,
             history=history,
         )

@@ -61,7 +61,7 @@ class FilterError(AbstractEstimator):
 
     looks_at: ClassVar[str] = "rates"
     shoots: ClassVar[bool] = False
-    prior: ClassVar[float] = GAUSSIAN_PRIOR
+    largest_std: ClassVar[float] = GAUSSIAN_PRIOR
     in_closed_loop: ClassVar[bool] = True
 
     tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=3e-3)
@@ -106,5 +106,5 @@ class FilterError(AbstractEstimator):
             sweeps=found.sweeps,
             feasible=feasible & jnp.isfinite(found.cost),
             done=found.result != RESULTS.max_sweeps,
-            prior=self.prior,
+            largest_std=self.largest_std,
         )

@@ -69,7 +69,7 @@ class SVSF(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "rates"
-    prior: ClassVar[float] = GAUSSIAN_PRIOR
+    largest_std: ClassVar[float] = GAUSSIAN_PRIOR
 
     rates_layer: Scalar = eqx.field(converter=setting("rates_layer", positive=True), default=110.0)
     parameter_layer: Scalar = eqx.field(converter=setting("parameter_layer", positive=True), default=50.0)
@@ -122,7 +122,7 @@ class SVSF(AbstractEstimator):
             rollouts=self.passes * (1 + 3 + count) + rollouts,
             sweeps=self.passes,
             feasible=feasible,
-            prior=self.prior,
+            largest_std=self.largest_std,
             done=jnp.ones((), dtype=bool),
             history=box.center + box.free_half_width * history,
         )

@@ -112,7 +112,7 @@ def _sizes(
 
     The names are those of moments of inertia and parameters.
     """
-    terms = {x.name: (term.verdict, x.half_width) for term in TERMS.values() for x in term.parameters}
+    terms = {x.name: (term.quantity, x.half_width) for term in TERMS.values() for x in term.parameters}
     sizes = {name: (name, mean[name], _GUESS * mean[name]) for name in INERTIAS}
     for name in parameters:
         quantity, half_width = terms.get(without_recording(name), ("", 0.0))

@@ -229,5 +229,5 @@ def settled(noise: LogNoise, dt: Scalar, rows: int) -> tuple[Covariance, Covaria
     p, gains = jax.lax.scan(lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=rows)
     driven, disturbance = gains.driven[-1], gains.disturbance[-1]
     after, _ = next_gains(p, step_of(noise, jnp.zeros_like(dt)), measured, never)
-    absorbed = disturbance * dt / (disturbance * step.transition.reach + (1 - step.transition.kept) * driven)
+    absorbed = disturbance * dt / (disturbance * step.transition.driven_by + (1 - step.transition.kept) * driven)
     return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

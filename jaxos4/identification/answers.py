@@ -127,18 +127,20 @@ def shared_fields(data: Data, answer: Answer, estimator: str) -> dict[str, Any]:
     }
 
 
-def parameter_table(answer: Answer, prior: float, missing: Mapping[str, str] = {}) -> dict[str, ParameterEstimate]:
+def parameter_table(
+    answer: Answer, largest_std: float, missing: Mapping[str, str] = {}
+) -> dict[str, ParameterEstimate]:
     """Estimates by parameter name, without those that are fixed.
 
     Parameters that are not identifiable (`jaxos4.bracket.is_identifiable`) have a note instead of an estimate.
 
-    **Arguments:** `prior`: how the estimator uses the bracket. `missing`: why a parameter is not identifiable, by name.
+    **Arguments:** `largest_std`: see `AbstractEstimator`. `missing`: why a parameter is not identifiable, by name.
     """
     estimate, unknowns = answer.estimate, answer.problem.unknowns
     std, width = map(np.asarray, _intervals(estimate))
     values, half_width = answer.parameters, np.asarray(unknowns.half_width)
     lower, upper = np.asarray(unknowns.bracket.lower), np.asarray(unknowns.bracket.upper)
-    identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
+    identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, largest_std))
     # No likelihood shows an error of the accelerometer's scale.
     scale = np.zeros_like(std)
     for gain in answer.gains:

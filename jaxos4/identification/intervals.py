@@ -54,7 +54,7 @@ def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAns
 
     `profile`: the factors of the profile, by parameter.
     """
-    names, units, values = optimum.unknowns.names, optimum.unknowns.units, optimum.values
+    names, units, values = optimum.parameter_unknowns.names, optimum.parameter_unknowns.units, optimum.values
     problem, logs = optimum.data.problem, optimum.data.log
     notes, jackknife, longer = dict.fromkeys(optimum.nominal, _NOMINAL_NOTE), np.ones(values.size), np.ones(values.size)
     if has_answer(optimum.estimate.result):
@@ -62,7 +62,7 @@ def corrected(optimum: Optimum, profile: Mapping[str, float] = {}) -> VehicleAns
         jackknife[free] = _widening(optimum, free, logs)
         longer[: len(names)] = [profile.get(name, 1.0) for name in names]
         std = (jackknife * longer)[: len(names)] * optimum.std
-        known = np.asarray(is_identifiable(std, np.asarray(optimum.unknowns.half_width), GAUSSIAN_PRIOR))
+        known = np.asarray(is_identifiable(std, np.asarray(optimum.parameter_unknowns.half_width), GAUSSIAN_PRIOR))
         notes = {name: PRIOR_NOTE for name, is_known in zip(names, known, strict=True) if not is_known} | notes
 
     def of_free(factor: Float[np.ndarray, " unknowns"]) -> dict[str, float]:
@@ -96,7 +96,7 @@ def at_lowest(answer: VehicleAnswer, estimator: AbstractEstimator, *, progress: 
         if not optimum.converged:
             return answer
         factors, lower = {}, None
-        poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.unknowns.count])
+        poor = optimum.std > WELL_KNOWN * np.abs(optimum.values[: optimum.parameter_unknowns.count])
         for place in sorted({*INVERSES} & {*answer.free} & {*np.flatnonzero(poor).tolist()}):
             progress("computing intervals")
             end, fit = upper_end(optimum, place)
@@ -104,7 +104,7 @@ def at_lowest(answer: VehicleAnswer, estimator: AbstractEstimator, *, progress: 
             if fit.converged and optimum.cost - fit.cost > LOWER:
                 lower = fit.values
                 break
-            factors[optimum.unknowns.names[place]] = max(end / NINETY_FIVE, 1.0)
+            factors[optimum.parameter_unknowns.names[place]] = max(end / NINETY_FIVE, 1.0)
         if lower is None:
             return corrected(optimum, factors)
         if not left:
@@ -137,7 +137,7 @@ def upper_end(optimum: Optimum, place: int) -> tuple[float, Optimum]:
     unknowns, at, root, end, other = optimum.values, 0.0, 0.0, NINETY_FIVE, optimum
     for _ in range(MAX_FITS):
         unknowns, before, at = unknowns + (end - at) * along, at, end
-        fixed = {optimum.unknowns.names[place]: float(unknowns[place])}
+        fixed = {optimum.parameter_unknowns.names[place]: float(unknowns[place])}
         other = optimum._replace(rollouts=other.rollouts).restricted(solver, fixed, unknowns)
         rise, unknowns, last = other.cost - optimum.cost, other.values, root
         if not other.converged or rise < -LOWER:
@@ -193,7 +193,7 @@ def _widening(
     number = recording[np.minimum(middle, recording.size - 1)][used]
     gradient = np.asarray(segments.gradient)[used][:, free]
     information = np.asarray(segments.information)[used][:, free[:, None], free]
-    prior = np.diag(1 / np.square(np.asarray(optimum.unknowns.half_width)[free]))
+    prior = np.diag(1 / np.square(np.asarray(optimum.parameter_unknowns.half_width)[free]))
     ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
     return np.max([np.ones(free.size), *ways], axis=0)
 

@@ -99,7 +99,9 @@ def issues_of_vehicle(
     if YAW.motion in weak:
         judged = {name: row for name, row in judged.items() if name not in (YAW.coupling, YAW.inverse)}
     # A fixed parameter is known by its bracket only.
-    widths = dict(zip(optimum.unknowns.names, np.asarray(optimum.unknowns.half_width).tolist(), strict=True))
+    widths = dict(
+        zip(optimum.parameter_unknowns.names, np.asarray(optimum.parameter_unknowns.half_width).tolist(), strict=True)
+    )
     fixed = {name: (row.value, widths[name]) for name, row in answer.fixed.items()} | dict(answer.negative)
     follow = partial(consequences, answer, constants)
     at_limits = [*_issues_of_limits(answer)] if search == "at_bound" else []

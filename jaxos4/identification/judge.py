@@ -71,7 +71,7 @@ def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name:
     search, flown = str(result_names(answer.estimate.result)), answer.evaluation
     found = OS4Identification(
         model=class_name(answer.problem.model, MODELS),
-        parameters=_alphas(answer, estimator.prior),
+        parameters=_alphas(answer, estimator.largest_std),
         result=search,
         issues=tuple(issues_of_log(data.findings)),
         **shared_fields(data, answer, name),
@@ -98,7 +98,7 @@ def judge_os4(data: Data, answer: OS4Answer, estimator: AbstractEstimator, name:
     return msgspec.structs.replace(found, verdicts=verdicts, issues=tuple(issues), result=result)
 
 
-def _alphas(answer: OS4Answer, prior: float) -> dict[str, ParameterEstimate]:
+def _alphas(answer: OS4Answer, largest_std: float) -> dict[str, ParameterEstimate]:
     """The estimate of each alpha, with the noise above which it cannot be distinguished from 0."""
     names, missing, limits = answer.problem.unknowns.names, {}, {}
     if answer.evaluation is not None:
@@ -106,7 +106,7 @@ def _alphas(answer: OS4Answer, prior: float) -> dict[str, ParameterEstimate]:
         notes, known = information.notes(names), information.identifiable & information.excited
         missing = {name: notes[name] for i, name in enumerate(names) if not known[i] and name in notes}
         limits = {name: finite_or_none(x) for name, x in zip(names, information.noise_limit, strict=True)}
-    table = parameter_table(answer, prior, missing)
+    table = parameter_table(answer, largest_std, missing)
     return {name: msgspec.structs.replace(row, noise_limit=limits.get(name)) for name, row in table.items()}
 
 

@@ -35,7 +35,7 @@ class Optimum(NamedTuple):
 
     - `data`: of the search. `likelihood`: theirs, with some parameters fixed.
     - `estimate`: of all its unknowns, with the covariance of the search.
-    - `unrestricted`, `unknowns`: the estimate and the parameters before any parameter was fixed.
+    - `unrestricted`, `parameter_unknowns`: the estimate, and the unknowns that are parameters, before any was fixed.
     - `rollouts`: of all searches together.
     - `nominal`: the parameters that are fixed at their nominal values.
     - `negative`: value and standard deviation of those that came out negative, and are fixed at 0.
@@ -49,7 +49,7 @@ class Optimum(NamedTuple):
     likelihood: InnovationsProblem
     estimate: Estimate
     unrestricted: Estimate
-    unknowns: Unknowns
+    parameter_unknowns: Unknowns
     rollouts: int
     nominal: tuple[str, ...] = ()
     negative: dict[str, tuple[float, float]] = {}
@@ -76,14 +76,16 @@ class Optimum(NamedTuple):
     @property
     def std(self) -> Float[np.ndarray, " parameters"]:
         """Standard deviations of the parameters, by `covariance`."""
-        return deviations(self.covariance)[: self.unknowns.count]
+        return deviations(self.covariance)[: self.parameter_unknowns.count]
 
     @property
     def cost(self) -> float:
         """The cost with that of all brackets, which are Gaussian priors, also of parameters that are fixed."""
         own = self.likelihood.problem.unknowns
         fixed = ~np.asarray(own.free)
-        off = (np.asarray(own.center) - np.asarray(self.unknowns.center)) / np.asarray(self.unknowns.half_width)
+        off = (np.asarray(own.center) - np.asarray(self.parameter_unknowns.center)) / np.asarray(
+            self.parameter_unknowns.half_width
+        )
         return float(self.estimate.cost) + float(np.square(off[fixed]).sum()) / 2
 
     @property
@@ -159,7 +161,7 @@ def _lowest_in_delay(
     A delay near the one that was `compared` for longer samples is not compared again. Minima are compared with what is
     negative in them at 0: at a wrong delay, a negative value can predict the noise of the gyro.
     """
-    likelihood, found, names = first.likelihood, first.estimate, first.unknowns.names
+    likelihood, found, names = first.likelihood, first.estimate, first.parameter_unknowns.names
     if likelihood.answers_within or "rotor_delay" not in names or not has_answer(found.result):
         return first
     delay, near_it = float(first.values[names.index("rotor_delay")]), float(likelihood.flight.dt) / 2
@@ -204,7 +206,7 @@ def _without_negative(estimator: Search, before: Optimum, progress: Progress) ->
     if not negative or not before.converged:  # away from a minimum, signs and standard deviations mean nothing
         return before
     progress("fitting again without what came out negative")
-    places = [before.unknowns.names.index(name) for name in negative]
+    places = [before.parameter_unknowns.names.index(name) for name in negative]
     covariance = np.asarray(before.estimate.covariance)
     freed = covariance[:, places] @ np.linalg.pinv(covariance[np.ix_(places, places)]) @ covariance[places]
     after = _with_negative_at_zero(estimator, before)

@@ -64,8 +64,8 @@ def physical_quantities(found: Identification) -> list[PhysicalQuantity]:
     # The name of the verdict on each parameter.
     judged = {name: name for name in found.parameters}
     if found.is_vehicle:
-        terms = [term for term in TERMS.values() if term.verdict]
-        judged = {x.name: term.verdict for term in terms for x in term.parameters if x.force_axis is None}
+        terms = [term for term in TERMS.values() if term.quantity]
+        judged = {x.name: term.quantity for term in terms for x in term.parameters if x.force_axis is None}
     for name, row in found.parameters.items():
         if row.estimate is None or row.std is None or row.ci95 is None:
             continue

@@ -108,7 +108,7 @@ class AbstractModel(eqx.Module):
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The forcing of a whole flight. Row k acts from sample k to sample k + 1."""
 
-    def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
+    def centered_forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The forcing of a whole flight whose measurements may be means, see `Forcing.early`. Default: instants."""
         return self.forcing(inputs, parameters)
 

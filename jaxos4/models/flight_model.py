@@ -100,11 +100,11 @@ class FlightModel(AbstractModel):
 
     @property
     def quantities(self) -> dict[str, list[str]]:
-        """The quantities that the terms describe, with their parameters but without biases; see `Term.verdict`."""
+        """The quantities that the terms describe, with their parameters but without biases; see `Term.quantity`."""
         found: dict[str, list[str]] = {}
         for term, _, parameter in self._table:
-            if term.verdict and parameter.force_axis is None:
-                found.setdefault(term.verdict, []).append(parameter.name)
+            if term.quantity and parameter.force_axis is None:
+                found.setdefault(term.quantity, []).append(parameter.name)
         return found
 
     @property
@@ -157,7 +157,7 @@ class FlightModel(AbstractModel):
         fine = self._rotors(inputs.divided, parameters, parts=parts)
         return self._beside(inputs, jax.tree.map(lambda leaf: leaf[following].mean(axis=1), fine))
 
-    def mean_forcing(self, inputs: Inputs, parameters) -> Forcing:
+    def centered_forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The mean forcing of each sample, around its time like the rotor speeds in `Flight.within`."""
         if inputs.within is None:
             return self.forcing(inputs, parameters)

@@ -50,7 +50,7 @@ class Term:
     - `needs`: the data that logs or airframe must have, named by the constants at the top of this file.
     - `by_default`: whether an estimate uses the term if the user names none, as a function of the available data.
     - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
-    - `verdict`: the name of the verdict that its parameters get together, see `Identification.verdicts`; empty: none.
+    - `quantity`: what its parameters describe together; it gets a verdict, see `Identification.verdicts`. Empty: none.
 
     The other fields are contributions; a term has at least one. A contribution is a function of the quantity without
     the term, and of the values of the term's parameters by name. It returns the quantity with the term. Contributions
@@ -73,7 +73,7 @@ class Term:
     needs: frozenset[str] = frozenset()
     by_default: Callable[[frozenset[str]], bool] = lambda available: True
     force_axes: tuple[int, ...] = ()
-    verdict: str = ""
+    quantity: str = ""
     command: Callable[[Commands, Values, Grid], Commands] | None = None
     speed: Callable[[RotorSpeeds, Values, Batch, Airframe], Speeds] | None = None
     angular_acceleration: Callable[[Rates, Values, Rates, Forcing], Rates] | None = None
@@ -206,7 +206,7 @@ _OWN: dict[str, Term] = {
         # The bracket is an offset of 10 % of the arm.
         tuple(Parameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(MOTIONS[:2])),
         angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.mean_specific_thrust - GRAVITY,) * 2),
-        verdict="center of mass",
+        quantity="center of mass",
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
@@ -216,7 +216,7 @@ _OWN: dict[str, Term] = {
             for x, center, half_width, most in zip(MOTIONS, (0.0, 0.0, 0.5), (5.0, 5.0, 0.5), _DAMPED, strict=True)
         ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
-        verdict="damping",
+        quantity="damping",
     ),
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
@@ -255,21 +255,21 @@ _OWN: dict[str, Term] = {
         # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),
         speed=_drive,
-        verdict="motors",
+        quantity="motors",
     ),
     "lag": Term(
         "rotors follow their commands as first-order systems: rotor_lag [s]; for logs without the data for `motor`",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
         speed=lambda omega, values, batch, airframe: commanded_speeds(omega, Motor(values["rotor_lag"]), batch),
-        verdict="motors",
+        quantity="motors",
     ),
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
         # The delay of the motors plus an offset between the clocks of motors and gyro, which may have either sign.
         (Parameter("rotor_delay", "s", 0.02, center=0.005),),
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
-        verdict="motors",
+        quantity="motors",
     ),
     "reaction": Term(
         "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
@@ -290,7 +290,7 @@ _OWN: dict[str, Term] = {
         force_axes=(2,),
         specific_force=lambda force, values, forcing: (force[0], force[1], values["thrust_gain"] * force[2]),
         accelerometer=_add_force_bias,
-        verdict="thrust",
+        quantity="thrust",
     ),
     "inflow": Term(
         "thrust falls with the velocity along z, which changes the inflow of the rotors: z_drag [1/s]",
@@ -298,7 +298,7 @@ _OWN: dict[str, Term] = {
         (Parameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
         needs=frozenset({VELOCITY, VERTICAL_FORCE}),
         specific_force=_add_drag,
-        verdict="drag",
+        quantity="drag",
     ),
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
@@ -306,7 +306,7 @@ _OWN: dict[str, Term] = {
         needs=frozenset({VELOCITY, MEASURED_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
         force_axes=(0, 1),
         specific_force=_add_drag,
-        verdict="drag",
+        quantity="drag",
     ),
     "gyro_bias": Term(
         "rates are measured with an offset, for each recording: p_bias, q_bias, r_bias [rad/s]",

@@ -146,7 +146,7 @@ class TrainedNetwork(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "rates"
-    prior: ClassVar[float] = UNIFORM_PRIOR
+    largest_std: ClassVar[float] = UNIFORM_PRIOR
     needs_network: ClassVar[bool] = True
 
     settings: NetworkEstimator
@@ -251,7 +251,7 @@ class TrainedNetwork(AbstractEstimator):
         cost, flies = problem.shots(parameters, initial_state)
         free = problem.unknowns.free
         outside = (jnp.abs(u[:count]) > 1 + factors[-1] * std) & free
-        unidentifiable = (std > self.prior) & free
+        unidentifiable = (std > self.largest_std) & free
 
         differences = self._differences(problem)
         other = jnp.stack(list(differences.values())).any()

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import INERTIAS, Airframe
+from ..airframe import Airframe
 from ..errors import InputError, counted, named
 from ..flight import RATES, STATE_NAMES, Flight
 from ..logs import Recording
@@ -181,7 +181,7 @@ def _cleaned(
     notes, judged = [], []
     for found in filter(None, (*findings(evidence), opposite_yaw(opposite))):
         found = msgspec.structs.replace(found, cause=f"{name}: {found.cause}")
-        if {*found.quantities} & {*INERTIAS} or (found.contradicted and not found.of_attitude_alone):
+        if found.counts_for_vehicles:
             judged.append(found)
         else:
             notes.append(str(found))

@@ -33,7 +33,7 @@ class Unknowns(eqx.Module):
 
     - `names`, `units`: of each unknown.
     - `parameter_count`: the number of the model's parameters, which come first.
-    - `prior`: how the cost uses the bracket: `NO_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
+    - `largest_std`: of an identifiable unknown: `NO_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
     - `center`, `half_width`: of the bracket in which each unknown is searched.
     - `free`: whether an unknown is searched. The others are fixed at `center`.
     - `precision`: of a Gaussian prior around `center`, as the reciprocal of a variance; 0: no prior.
@@ -45,7 +45,7 @@ class Unknowns(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     parameter_count: int = eqx.field(static=True)
-    prior: float = eqx.field(static=True)
+    largest_std: float = eqx.field(static=True)
     center: Values = eqx.field(converter=as_float)
     half_width: Values = eqx.field(converter=as_float)
     free: Bool[Array, " unknowns"] = eqx.field(converter=_as_mask)
@@ -63,7 +63,7 @@ class Unknowns(eqx.Module):
             names=model.parameter_names,
             units=model.parameter_units,
             parameter_count=count,
-            prior=NO_PRIOR,
+            largest_std=NO_PRIOR,
             center=nothing,
             half_width=infinite,
             free=np.ones(count, dtype=bool),
@@ -127,9 +127,12 @@ class Unknowns(eqx.Module):
         lower, upper = self.center - reach * self.half_width, self.center + reach * self.half_width
         return jnp.maximum(lower, self.lowest), jnp.minimum(upper, self.highest)
 
-    def identifiable(self, std: Float[Array, " unknowns"], prior: float | None = None) -> Bool[Array, " unknowns"]:
-        """Whether each unknown is identifiable or fixed. `prior`: of an estimator; by default the prior of the cost."""
-        return jnp.asarray(is_identifiable(std, self.half_width, self.prior if prior is None else prior)) | ~self.free
+    def identifiable(
+        self, std: Float[Array, " unknowns"], largest_std: float | None = None
+    ) -> Bool[Array, " unknowns"]:
+        """Whether each unknown is identifiable or fixed. `largest_std`: by default that of the cost."""
+        largest = self.largest_std if largest_std is None else largest_std
+        return jnp.asarray(is_identifiable(std, self.half_width, largest)) | ~self.free
 
 
 @eqx.filter_jit  # one compiled program instead of one for each operation

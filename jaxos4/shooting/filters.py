@@ -248,7 +248,7 @@ def _advance(
     rates = computed_once(going, lambda: move(State(Rates(*corrected[:RATE_COUNT])), forcing, scalars).rates)
     moved = (*rates, *(share * x for share, x in [*zip(feedback.driven_kept, corrected, strict=True)][RATE_COUNT:]))
     added = tuple(by_inputs(gains, row.inputs) for gains in feedback.input_gains)
-    later = zip(moved, feedback.reach, disturbance, feedback.driven_later, errors, added[0], strict=True)
+    later = zip(moved, feedback.driven_by, disturbance, feedback.driven_later, errors, added[0], strict=True)
     driven = tuple(x + a * d + gain * e + v for x, a, d, gain, e, v in later)
     faded = zip(feedback.kept, disturbance, feedback.disturbance_later, errors, added[1], strict=True)
     disturbance = tuple(share * d + gain * e + v for share, d, gain, e, v in faded)

@@ -85,12 +85,12 @@ class Covariance(NamedTuple):
 class Transition(NamedTuple):
     """The propagation of d and x over one sample, without noise.
 
-    - `kept`, `driven_kept`: the shares of d and of x that remain. `reach`: the change of x for a unit of d.
+    - `kept`, `driven_kept`: the shares of d and of x that remain. `driven_by`: the change of x for a unit of d.
     """
 
     kept: Channels
     driven_kept: Channels
-    reach: Channels
+    driven_by: Channels
 
     @classmethod
     def of(cls, noise: LogNoise, dt: Float[Array, "..."]) -> "Transition":
@@ -209,14 +209,14 @@ def next_gains(
     first = first_covariance(step, p.driven.shape[-1])
     first = first._replace(driven=first.driven + jnp.where(is_rate(first.driven), _UNKNOWN_RATE**2, 0.0))
     driven, cross, disturbance = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
-    (kept, _, reach), seen, since = step.transition, step.seen, step.since_seen
+    (kept, _, driven_by), seen, since = step.transition, step.seen, step.since_seen
     # Covariances with the measurement, and with `gap`: x at the end minus `since` times the measurement. The gap does
     # not depend on x at the beginning, whose variance may be huge. So no difference of large numbers is computed.
     driven_seen = step.driven_seen * driven + seen * cross
     disturbance_seen = step.driven_seen * cross + seen * disturbance
     own = seen * disturbance_seen + step.noise
     measured = step.driven_seen * driven_seen + own
-    lead = reach - since * seen
+    lead = driven_by - since * seen
     gap_seen = lead * disturbance_seen + step.with_driven - since * step.noise
     gap = lead**2 * disturbance + step.added.driven - since * (2 * step.with_driven - since * step.noise)
     later_seen = kept * disturbance_seen + step.with_disturbance
@@ -264,7 +264,7 @@ class Feedback(NamedTuple):
     seen: tuple[PerSegment, ...]
     kept: tuple[PerSegment, ...]
     driven_kept: tuple[PerSegment, ...]
-    reach: tuple[PerSegment, ...]
+    driven_by: tuple[PerSegment, ...]
     input_gains: InputGains
 
     @classmethod

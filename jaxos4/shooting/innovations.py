@@ -321,7 +321,7 @@ class InnovationsProblem(AbstractProblem):
 
         def of(parameters: Parameters) -> Forcing:
             # A segment belongs to one recording, so its forcing names none.
-            return model.mean_forcing(inputs, parameters)._replace(recording=())
+            return model.centered_forcing(inputs, parameters)._replace(recording=())
 
         if not model.forcing_parameters:
             known = of(model.alpha)

@@ -86,7 +86,7 @@ def with_noise(problem: "InnovationsProblem") -> Unknowns:
         names=own.names + names,
         units=own.units + tuple(_unit(name) for name in names),
         parameter_count=own.count,
-        prior=PROPER_PRIOR,
+        largest_std=PROPER_PRIOR,
         center=jnp.concatenate([own.center, first.ravel()]),
         half_width=jnp.concatenate([own.half_width, 1 / jnp.sqrt(precision)]),
         free=jnp.concatenate([own.free, free.ravel()]),

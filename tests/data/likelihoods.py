@@ -113,7 +113,7 @@ def squares(residuals, center=(0.0, 0.0), half_width=1.0, **more):
         names=NAMES,
         units=("1", "1"),
         parameter_count=more.pop("parameter_count", 2),
-        prior=NO_PRIOR,
+        largest_std=NO_PRIOR,
         center=np.array(center),
         half_width=np.full(2, half_width),
         free=np.ones(2, dtype=bool),

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ...airframe import GRAVITY, Airframe
+from ...airframe import GRAVITY, INERTIAS, Airframe
 from ...flight import RATES
 from ...logs import Recording
 from ...logs.sampling import held_regularly
@@ -32,8 +32,7 @@ class Finding(msgspec.Struct, frozen=True):
     - `size`: the figure behind it, with its unit.
     - `remedy`: what to do.
     - `quantities`: the quantities that the fault concerns: `Ix`, `Iy`, `Iz`, `thrust`, `motors`, `damping`, `attitude`.
-    - `contradicted`: whether the log contradicts these quantities. Otherwise they get a reservation if a
-      moment of inertia is among them, and else a note. A fault `of_attitude_alone` is a note where rates are fitted.
+    - `contradicted`: whether the log contradicts these quantities.
     """
 
     name: str
@@ -47,6 +46,11 @@ class Finding(msgspec.Struct, frozen=True):
     def of_attitude_alone(self) -> bool:
         """Whether it concerns the attitude alone, on which the body rates do not depend."""
         return self.quantities == ("attitude",)
+
+    @property
+    def counts_for_vehicles(self) -> bool:
+        """Whether it is an issue of a vehicle's answer, a contradiction or a reservation. Otherwise it is a note."""
+        return bool({*self.quantities} & {*INERTIAS}) or (self.contradicted and not self.of_attitude_alone)
 
     def __str__(self) -> str:
         return f"{self.cause} ({self.size}); {self.remedy}"
