@@ -27,7 +27,8 @@ ESTIMATORS: "Registry[type[AbstractEstimator]]" = Registry(
 )
 """The estimators by name, as command line, studies and figures offer them. A new estimator is one line here
 (and in `__init__.pyi`, if its class is to be public), or an entry point of another package in the group
-`jaxos4.estimators` that gives the class."""
+`jaxos4.estimators` that gives the class. For a vehicle, the name of an estimator that needs a network means the
+hybrid."""
 
 
 def make_estimator(name: str, network: "TrainedNetwork | None" = None) -> "AbstractEstimator":

@@ -157,7 +157,10 @@ def before_search(
     spread: Float[Array, "given given"] | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Found:
-    """The knowledge before a search: the first start and its covariance, and nothing about the cost."""
+    """The knowledge before a search: the first start and its covariance, and nothing about the cost.
+
+    `spread`: see `solve`. By default, `off` of the initial guess counts as two standard deviations.
+    """
     guess, zero = problem.initial_guess, jnp.zeros((), dtype=int)
     start, wide = guess.starts[0], jax.vmap(jnp.diag)(jnp.square(guess.off / 2))
     windows, count = start.shape

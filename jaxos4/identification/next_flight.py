@@ -37,6 +37,7 @@ def next_flight(results: Sequence[Identification], spreads: Mapping[str, float])
         advised[f"fly {', '.join(motions)}"] = [f"known now: {', '.join(known)}; needed: {100 * UNCERTAIN:.0f} %"]
     for name, own in counted.items():
         remedies = dict.fromkeys(remedy for each in own for remedy in each.verdicts[name].remedies)
+        # "fly more roll, or ..." adds nothing to how much more roll to fly.
         for remedy in (each for each in remedies if each.split(",")[0] not in flown):
             # A remedy that begins another one adds nothing to it.
             same = next((each for each in advised if each.startswith(remedy)), remedy)

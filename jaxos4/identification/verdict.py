@@ -120,8 +120,9 @@ class Verdict(msgspec.Struct, frozen=True):
     - `status`: `identified`, `identified with a reservation`, `not identified` or `contradicted`.
     - `value`: the quantity's value, 95 % interval and conditions, in words; empty for quantities
       that consist of parameters, whose table shows them.
-    - `reasons`: the reservations, or the causes with their remedies; without a remedy if the size of the move is known,
-      because `next_flight` gives it. Empty if the quantity is `identified`.
+    - `reasons`: the reservations, or the causes with their remedies; without a remedy if the size of the move is known:
+      `next_flight` gives it, unless a vehicle's quantity other than an inertia has a reservation only. Empty if the
+      quantity is `identified`.
     - `remedies`: what to do about these reasons. How much more to fly is not among them: `next_flight` computes it.
     - `flying_helps`: whether more flight, rather than a measured drag coefficient, is what a long interval needs.
     """

@@ -100,7 +100,7 @@ class Point(NamedTuple):
 
     - `parameters`: common to all segments, or of each segment.
     - `feedthrough`: the coefficients by which input innovations explain the innovations of the same samples.
-    - `noise_feedthrough`: feedthroughs that were found before; the innovations that they explain count as noise.
+    - `noise_feedthrough`: see `InnovationsProblem`.
     - `input_gains`: the gains of input innovations.
     """
 

@@ -60,8 +60,9 @@ class InnovationsProblem(AbstractProblem):
     - `answers_within`: whether the controller answers a rate within its sample; otherwise feedthroughs are 0.
     - `lagged`: whether input innovations after the first belong to earlier samples, see `feedthrough.lagged`. They get
       no gain on the disturbance of a rate, which would repeat a gain of the earlier sample, less a step of the rate.
-    - `noise_feedthrough`: feedthroughs that were found before. What they explain still counts as noise. NaN (default):
-      unknown. A search then has two stages: the first finds them, the second counts what they explain.
+    - `noise_feedthrough`: feedthroughs that were found before. The squares of what they explain are added to those of
+      the innovations, but only in the cost and its slope along the noise: the noise is then as large as without
+      feedthroughs. NaN (default): unknown. A search then has two stages: the first finds them, the second adds.
     - `start`: where searches start. NaN (default): the center of the bracket, with each of several time constants.
     """
 
@@ -219,7 +220,7 @@ class InnovationsProblem(AbstractProblem):
         )
 
     def stages(self, shares: tuple[float, ...] = ()) -> Stages:
-        """The whole problem. If it has feedthroughs, a second stage counts as noise the innovations they explain."""
+        """The whole problem. With input innovations, a second stage counts as noise what their feedthroughs explain."""
         del shares
         number, model_at, unknowns = 2 if self.noise_feedthrough.size else 1, self._local_model(), self.unknowns
         is_known = ~jnp.isnan(self.noise_feedthrough).any()
@@ -291,7 +292,8 @@ class InnovationsProblem(AbstractProblem):
         model = problem.model
         inputs = jnp.moveaxis(self.input_innovations[observed["place"]], 1, -1)
         rows, dt, window = self.segmentation.rows, self.flight.dt, INSTANT
-        if self.flight.within is not None:  # measurements are means
+        # Samples are centred on `time[k]`, and measurements are means around it, or instants in the middle.
+        if self.flight.within is not None:
             window = (dt - self.flight.averaging_time) / 2, self.flight.averaging_time
         functions = eqx.Partial(_move, problem), eqx.Partial(_average, problem), model.observe
 
@@ -335,7 +337,7 @@ class InnovationsProblem(AbstractProblem):
 
 
 def _move(problem: ShootingProblem, state: State, forcing: Forcing, parameters) -> State:
-    """The rates one sample later: by the midpoint rule if measurements are means, else by the problem's method."""
+    """The rates one sample later: by the midpoint rule if samples are centred, else by the problem's method."""
     if forcing.early is None:
         return problem.advance(forcing, state, parameters)[0]
     return midpoint_step(problem.model, state, forcing, parameters, problem.flight.dt)
@@ -343,7 +345,7 @@ def _move(problem: ShootingProblem, state: State, forcing: Forcing, parameters) 
 
 def _average(problem: ShootingProblem, state: State, forcing: Forcing, parameters) -> State:
     """The mean of the state over a measurement's window, from the rates at the beginning of a sample."""
-    if forcing.early is None:  # measured at the beginning
+    if forcing.early is None:  # samples begin with their measurement
         return state
     early = forcing.early._replace(recording=forcing.recording, velocity=forcing.velocity)
     slope = problem.model.angular_acceleration(state.rates, early, parameters)
