@@ -37,7 +37,7 @@ def test_a_sample_has_the_covariance_of_state_disturbance_and_measurement(begin,
         total, added = sample(dt, tau, begin, length, own)
         drive = strength**2 * (1.0 if own is None else (tau + own) / tau)
         over = found.transition
-        found_total = [over.driven_kept, found.driven_seen, over.reach, over.kept, found.seen]
+        found_total = [over.driven_kept, found.driven_seen, over.driven_by, over.kept, found.seen]
         expected = [total[0, 0], total[2, 0], *total[:, 1]]
         np.testing.assert_allclose([leaf[channel, 0] for leaf in found_total], expected, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose((found.since_seen * found.driven_seen)[channel], total[0, 0], rtol=1e-9)
