@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
 P = ParamSpec("P")
@@ -49,9 +50,20 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *fi
 
     differentiable = jax.custom_jvp(one)
 
-    @differentiable.defjvp
+    @functools.partial(differentiable.defjvp, symbolic_zeros=True)
     def derivative(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(lambda arrays, *others: function(*eqx.combine(arrays, settings), *others), primals, tangents)
+        values, structure = jax.tree.flatten(primals)
+        slopes = jax.tree.leaves(tangents)
+        moving = [place for place, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
+
+        def of_moving(*some: Array) -> Any:
+            every = [*values]
+            for place, value in zip(moving, some, strict=True):
+                every[place] = value
+            arrays, *others = jax.tree.unflatten(structure, every)
+            return function(*eqx.combine(arrays, settings), *others)
+
+        return jax.jvp(of_moving, tuple(values[place] for place in moving), tuple(slopes[place] for place in moving))
 
     @one.def_vmap
     def batch(lanes: int, is_batched: list, *arguments: Any) -> tuple[Any, Any]:
@@ -95,8 +107,8 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
 def where_needed(needed: Bool[Array, ""], function: Callable[..., R], otherwise: R, *arguments: Any) -> R:
     """`function(*arguments)` if `needed`, else `otherwise`. A batch computes the function if any lane needs it.
 
-    The function must not close over arrays that differ between lanes. A batch of `jax.lax.cond` always computes
-    both branches, and a batch of batches always computes the function.
+    A batch of `jax.lax.cond` always computes both branches; here, only a batch of batches always computes the function.
+    The function must not close over arrays that differ between lanes.
     """
 
     def one(needed: Bool[Array, ""], otherwise: R, *arguments: Any) -> R:

@@ -16,13 +16,14 @@ PROPER_PRIOR = float("inf")  # a prior of the likelihood itself, which has an an
 
 
 def is_identifiable(
-    std: Float[ArrayLike, "*parameters"], half_width: Float[ArrayLike, "*parameters"], largest: float = NO_PRIOR
+    std: Float[ArrayLike, "*parameters"], half_width: Float[ArrayLike, "*parameters"], largest_std: float = NO_PRIOR
 ) -> Bool[Numeric, "*parameters"]:
-    """The rule: a parameter is identifiable if its standard deviation is at most `largest` half-widths of its bracket.
+    """The rule: a parameter is identifiable if its standard deviation is at most `largest_std`.
 
-    `largest`: by how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR`, `UNIFORM_PRIOR` or `PROPER_PRIOR`.
+    `largest_std`: in half-widths of its bracket, by how the estimator used it: `NO_PRIOR`, `GAUSSIAN_PRIOR`,
+    `UNIFORM_PRIOR` or `PROPER_PRIOR`.
     """
-    return std <= largest * half_width  # type: ignore[return-value]
+    return std <= largest_std * half_width  # type: ignore[return-value]
 
 
 class Bracket(eqx.Module):

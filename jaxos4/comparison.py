@@ -127,7 +127,7 @@ def compare_results(results: Sequence[ResultSource], *, level: float = 0.05) -> 
         statuses |= {name: max(statuses[name], RESERVED, key=STATUSES.index) for name in judged & statuses.keys()}
         which = ", ".join(each.name for each in different)
         advice = f"first find out why the results differ in {which}; {advice}"
-    return found._replace(statuses=statuses, next_flight=f"next: {advice}")
+    return found._replace(statuses=statuses, next_flight=advice)
 
 
 def _reference(name: str, every: Sequence[Identification]) -> float:

@@ -114,7 +114,7 @@ def as_estimate(
 
     - `feasible`: whether the trajectory did not fail before its end. `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
-    - `largest_std`: of an identifiable parameter, see `jaxos4.bracket`; by default that of the cost.
+    - `largest_std`: of an identifiable parameter, in half-widths, see `jaxos4.bracket`; by default that of the cost.
     - The others are fields of an `Estimate`.
     """
     unknowns = problem.unknowns
@@ -177,7 +177,8 @@ class AbstractEstimator(eqx.Module):
     - `looks_at`: the largest choice of a state's channels that it compares: `"rates"`, `"attitude"` or `"all"`.
     - `shoots`: whether it minimises the cost of a simulation of a `ShootingProblem`. If so, it can use windows, and
       `identify` replaces its covariance by the one that follows from the noise.
-    - `largest_std`: of an identifiable parameter: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
+    - `largest_std`: the largest standard deviation of an identifiable parameter, in half-widths of its bracket:
+      `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
     - `needs_network`: whether it needs a trained network, in a field `network`.
     - `in_closed_loop`: whether it searches a likelihood of innovations too, and so serves a vehicle that a controller
       flies. Its `Estimate` then has `parts`.

@@ -111,7 +111,7 @@ class Flight(eqx.Module):
     """A recorded or simulated flight on a uniform time grid. A new signal is a field here and in `Recording`.
 
     Its unit must be in `jaxos4.logs.values`. `report.log_figures` says where it is drawn. Fits compare states and
-    specific force only (`CHANNEL_NAMES`). An input of a model is also in `Inputs`, `Flight.inputs`, and what
+    specific force only (`CHANNEL_NAMES`). A signal that drives a model is also in `Inputs`, `Flight.inputs`, and what
     `recording.prepared` offers to terms.
 
     - `time`: sample times [s], uniform.
@@ -129,7 +129,7 @@ class Flight(eqx.Module):
     - `within`: the root mean square of each rotor's speed in equal parts of the sample, from `time[k]` - dt/2 to
       `time[k]` + dt/2 [rad/s]. `None`: unknown.
     - `averaging_time`: how long measurements are averaged around `time[k]` [s]; 0: they are those at this instant. The
-      mean of n instants counts as a mean over sqrt(1 - 1/n^2) of the sample, which has the same variance in time.
+      mean of n instants counts as a mean over sqrt(1 - 1/n^2) of the sample: their times have equal variance.
 
     **Raises:** `ValueError` for arrays whose shapes do not agree, or fewer than two samples.
     """

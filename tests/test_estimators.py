@@ -126,10 +126,10 @@ def test_failing_lanes_leave_their_neighbours_alone(name):
     assert np.isinf(np.asarray(broken.cost)[failed]).all()
     np.testing.assert_allclose(broken.parameters[1:9:2], (lower[1:9:2] + upper[1:9:2]) / 2)
     # A flight without measurements adds nothing to the bracket.
-    prior = ESTIMATORS[name].largest_std
-    assert (np.asarray(broken.std)[vague] > prior * HALF).any(axis=1).all()
+    largest_std = ESTIMATORS[name].largest_std
+    assert (np.asarray(broken.std)[vague] > largest_std * HALF).any(axis=1).all()
     np.testing.assert_allclose(broken.parameters[6], (lower[6] + upper[6]) / 2)
-    if prior == GAUSSIAN_PRIOR:
+    if largest_std == GAUSSIAN_PRIOR:
         np.testing.assert_allclose(broken.std[6], HALF)
 
 

@@ -376,7 +376,7 @@ def test_a_comparison_is_not_more_confident_than_its_results(tmp_path, run):
     says(page, "Next: ")
     other = of_inertias(2.3e-5, 1e-7, provenance={"flights": ["3.csv"]})
     differs = jaxos4.compare_results([*results, msgspec.structs.replace(other, verdicts=good)])
-    assert differs.next_flight.startswith("next: first find out why the results differ in Ix; ")
+    assert differs.next_flight.startswith("first find out why the results differ in Ix; ")
 
 
 def test_what_cannot_be_compared_is_refused_or_noted(run, tmp_path, files):

@@ -72,7 +72,7 @@ def data_of(flight, sample_time):
 
 
 @eqx.filter_jit
-def mean_forcing_of(model, inputs, parameters):
+def centered_forcing_of(model, inputs, parameters):
     return model.centered_forcing(inputs, parameters)
 
 
@@ -437,7 +437,7 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples(share)
     noise = LogNoise(*map(jnp.asarray, noise.T))
     of_all, of_rates = (cost_of(each, jnp.asarray(parameters), noise) for each in (problem, silent))
     named = dict(zip(problem.unknowns.names, parameters.tolist(), strict=False))
-    forcing = mean_forcing_of(problem.model, flight.inputs, jnp.asarray(parameters))
+    forcing = centered_forcing_of(problem.model, flight.inputs, jnp.asarray(parameters))
     expected = named["thrust_gain"] * np.asarray(forcing.sensed_specific_thrust)[rows] + named["az_bias"]
     apart = np.abs(np.subtract.outer(rows, rows))
 

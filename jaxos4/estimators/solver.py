@@ -106,18 +106,18 @@ def solve(
     starts, skip = _starts(problem, start), jnp.asarray(skip)
     begin = before_search(problem, spread, skip)
     first_stage = stages.first if is_close is False else jnp.where(is_close, stages.whole, stages.first)
-    different_starts = 1
+    start_count = 1
     if starts.shape[0] > 1 and solver.is_local:
-        different_starts = jnp.where((starts == starts[0]).all(), 1, starts.shape[0])
+        start_count = jnp.where((starts == starts[0]).all(), 1, starts.shape[0])
 
     def search(place: Count, best: Found) -> Found:
         """Searches from a start in the first stage, or from the best answer in a later stage."""
-        from_start = place < different_starts
+        from_start = place < start_count
         own = (jnp.arange(starts.shape[2]) < problem.unknowns.parameter_count) & (place > 0)
         own &= jnp.isfinite(cost_of(best.model))
-        first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, different_starts - 1)]))
+        first = begin._replace(unknowns=jnp.where(own, best.unknowns, starts[jnp.minimum(place, start_count - 1)]))
         before = chosen(from_start, first, best)
-        stage = stages.at(first_stage + jnp.maximum(place - different_starts + 1, 0), before.unknowns)
+        stage = stages.at(first_stage + jnp.maximum(place - start_count + 1, 0), before.unknowns)
         # Traced once, although a solver may call it twice. `partial` makes another function of it: of an equal one, JAX
         # would find the trace of another search.
         stage = stage._replace(local_model=jax.jit(functools.partial(stage.local_model), inline=True))
@@ -135,7 +135,7 @@ def solve(
         return chosen(is_better, found, best)._replace(**total)
 
     # One loop, so that the search is compiled once for all starts and stages.
-    end = jax.lax.fori_loop(0, different_starts + stages.number - 1 - first_stage, search, begin)
+    end = jax.lax.fori_loop(0, start_count + stages.number - 1 - first_stage, search, begin)
     shared = problem.unknowns.count
     return as_estimate(
         problem,

@@ -86,8 +86,8 @@ def identify(
     - `settings`: `OS4Settings` for a model, `VehicleSettings` for an airframe.
     - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
       `"filter-error"` for a vehicle, which flies in closed loop. The other estimators of a vehicle, such as `"ibss"`,
-      search the same likelihood. An object's settings count at every sample time; `"filter-error"` has a tolerance of
-      0.001.
+      search the same likelihood. An object keeps its settings at every sample time; for a vehicle, the name
+      `"filter-error"` means a tolerance of 0.001.
     - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
     - `network`: for a model, a trained network or its file; without it, an estimator that needs a network trains one.
     - `validate`: another flight or path, which is not fitted but predicted.

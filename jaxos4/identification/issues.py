@@ -37,9 +37,9 @@ from .verdict import CONTRADICTION, MAX_SHARE, PREDICTIONS, RESERVATION, RIGID_B
 MIN_SECONDS = 10.0
 VIBRATION = 0.4  # if innovations correlate more, filter error is biased by more than its intervals say
 MAX_SAMPLE = 0.008  # s; longer samples would hide the motion along with the vibration
-# Factors by which an interval is widened. In a flight of few parts, chance alone widens an interval about twice; a
-# larger factor makes a warning. In 107 simulated logs, each of a single vehicle, no factor exceeds 2; a log of two
-# vehicles has 9, and some real logs have 3 to 6. From the second factor on, what depends on the parameter has a
+# Factors by which an interval is widened. In a flight of few parts, chance alone widens an interval by a factor of
+# about 2; a larger one makes a warning. In 107 simulated logs, each of a single vehicle, no factor exceeds 2; a log of
+# two vehicles has 9, and some real logs have 3 to 6. From the second factor on, what depends on the parameter has a
 # reservation too.
 WIDENED, DISAGREE = 2.0, 4.0
 NO_SKILL = 2.0  # standard errors; an inertia is not identified if the skill at the shortest horizon is so far below 0
@@ -172,7 +172,7 @@ def few_parts(seconds: float) -> Iterator[Issue]:
 
 
 def much_widened(found: VehicleIdentification) -> dict[str, float]:
-    """The factors by which intervals were widened more than by chance."""
+    """The factors of intervals that were widened more than chance explains."""
     return {name: factor for name, factor in found.widened.items() if factor > WIDENED}
 
 

@@ -255,7 +255,10 @@ def predict_held_out(answer: VehicleAnswer, held_out: HeldOut) -> tuple[Predicti
 
 
 def in_one_window(problem: ShootingProblem) -> ShootingProblem:
-    """The padded problem of a vehicle's flight, so that flights of other lengths share the programs that check them."""
+    """The padded problem of a vehicle's flight, so that flights of other lengths share the programs that check them.
+
+    These checks do not simulate, so windows do not matter.
+    """
     return padded(dataclasses.replace(problem, windows=1))
 
 

@@ -123,8 +123,8 @@ class Verdict(msgspec.Struct, frozen=True):
     - `reasons`: the reservations, or the causes with their remedies; without a remedy if the size of the move is known:
       `next_flight` gives it, unless a vehicle's quantity other than an inertia has a reservation only. Empty if the
       quantity is `identified`.
-    - `remedies`: what to do about these reasons. How much more to fly is not among them: `next_flight` computes it.
-    - `flying_helps`: whether more flight, rather than a measured drag coefficient, is what a long interval needs.
+    - `remedies`: what to do about these reasons, except those for a long interval.
+    - `flying_helps`: whether a long interval calls for more flight, not for a measured drag coefficient.
     """
 
     status: str

@@ -109,7 +109,10 @@ class AbstractModel(eqx.Module):
         """The forcing of a whole flight. Row k acts from sample k to sample k + 1."""
 
     def centered_forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The forcing of a whole flight whose measurements may be means, see `Forcing.early`. Default: instants."""
+        """The forcing of a whole flight whose samples may be centred on their measurements, see `Forcing.early`.
+
+        By default, samples begin with their measurements.
+        """
         return self.forcing(inputs, parameters)
 
     @abc.abstractmethod

@@ -82,8 +82,8 @@ class Forcing(NamedTuple):
       around it like the log.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
     - `velocity`: along the body's axes, see `Flight.body_velocity` [m/s].
-    - `early`: the mean of the forcing, weighted by twice the share of the measurement that comes later. Of an instant
-      in the middle of the sample, this is 2 before it and 0 after it. `None`: samples begin with their measurement.
+    - `early`: the mean of the forcing with a weight: twice the share of the measurement that is still to come. For an
+      instant in mid-sample, the weight is 2 before it and 0 after it. `None`: samples begin with their measurement.
     """
 
     roll: Samples

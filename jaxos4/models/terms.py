@@ -52,9 +52,8 @@ class Term:
     - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
     - `quantity`: what its parameters describe together; it gets a verdict, see `Identification.verdicts`. Empty: none.
 
-    The other fields are contributions; a term has at least one. A contribution is a function of the quantity without
-    the term, and of the values of the term's parameters by name. It returns the quantity with the term. Contributions
-    act in this order:
+    The other fields are contributions; a term has at least one. A contribution is a function of the value without the
+    term, and of the term's parameters by name. It returns the value with the term. Contributions act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s], a function of the numbers of the samples.
     - `speed(omega, values, batch, airframe)`: the rotor speeds that follow the commands over some samples. Only one of

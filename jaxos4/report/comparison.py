@@ -47,7 +47,7 @@ def print_comparison(console: Console, found: Comparison) -> None:
     for note in found.notes:
         say(console, f"note: {note}")
     say(console, f"p: the probability that results of one value scatter this much or more. {SHARED}")
-    say(console, found.next_flight)
+    say(console, f"next: {found.next_flight}")
 
 
 SHARED = "A wrong mass or arm length is wrong in all results and does not show."
@@ -126,7 +126,7 @@ def write_comparison(path: str | os.PathLike[str], found: Comparison, *, command
         lines = text([f"{line}." for line in found.reasons])
         top.append(folded(counted(len(found.reasons), "reason"), lines, id="reasons"))
     top.append(text([f"{note}." for note in found.notes], id="notes"))
-    top.append(text(found.next_flight[0].upper() + found.next_flight[1:], id="next"))
+    top.append(text(f"Next: {found.next_flight}", id="next"))
     write_page(
         path,
         title=f"{len(found.names)} results compared",

@@ -33,7 +33,7 @@ class Unknowns(eqx.Module):
 
     - `names`, `units`: of each unknown.
     - `parameter_count`: the number of the model's parameters, which come first.
-    - `largest_std`: of an identifiable unknown: `NO_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
+    - `largest_std`: of an identifiable unknown, in half-widths: `NO_PRIOR` or `PROPER_PRIOR` of `jaxos4.bracket`.
     - `center`, `half_width`: of the bracket in which each unknown is searched.
     - `free`: whether an unknown is searched. The others are fixed at `center`.
     - `precision`: of a Gaussian prior around `center`, as the reciprocal of a variance; 0: no prior.

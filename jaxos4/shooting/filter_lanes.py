@@ -31,7 +31,7 @@ def innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented
 
 
 def _innovate_lanes(lanes: int, many: Any, shared: Any) -> SegmentLikelihoods:
-    """The innovations of a batch, whose lanes become segments. The segments of a lane are adjacent."""
+    """The likelihoods of a batch, whose lanes become segments. The segments of a lane are adjacent."""
     (moving, _, flight, at), (fixed, positions, fixed_flight, fixed_at) = many, shared
     segments = eqx.combine(flight, fixed_flight).measured.shape[-1]
 
@@ -72,7 +72,7 @@ def _innovate_lanes(lanes: int, many: Any, shared: Any) -> SegmentLikelihoods:
 
 
 def _innovate(functions: Functions, positions: tuple[int, ...], flight: Segmented, at: Point) -> SegmentLikelihoods:
-    """The innovations of one flight."""
+    """The likelihoods of one flight."""
     own = None if at.parameters.ndim == 1 else 0
     move, average, observe = (jax.vmap(function, in_axes=(0, 0, own)) for function in functions)
     return innovations_at((move, average, observe), positions, flight, at)

@@ -62,7 +62,8 @@ class InnovationsProblem(AbstractProblem):
       no gain on the disturbance of a rate, which would repeat a gain of the earlier sample, less a step of the rate.
     - `noise_feedthrough`: feedthroughs that were found before. The squares of what they explain are added to those of
       the innovations, but only in the cost and its slope along the noise: the noise is then as large as without
-      feedthroughs. NaN (default): unknown. A search then has two stages: the first finds them, the second adds.
+      feedthroughs. NaN (default): unknown. A search then has two stages: the first finds them, the second
+      adds these squares.
     - `start`: where searches start. NaN (default): the center of the bracket, with each of several time constants.
     """
 

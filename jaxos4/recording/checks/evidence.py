@@ -49,7 +49,7 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def counts_for_vehicles(self) -> bool:
-        """Whether it is an issue of a vehicle's answer, a contradiction or a reservation. Otherwise it is a note."""
+        """Whether a vehicle's answer gets an issue from it, a contradiction or a reservation; if not, a note."""
         return bool({*self.quantities} & {*INERTIAS}) or (self.contradicted and not self.of_attitude_alone)
 
     def __str__(self) -> str:
