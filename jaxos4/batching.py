@@ -52,18 +52,14 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *fi
 
     @functools.partial(differentiable.defjvp, symbolic_zeros=True)
     def derivative(primals: Any, tangents: Any) -> Any:
-        values, structure = jax.tree.flatten(primals)
-        slopes = jax.tree.leaves(tangents)
-        moving = [place for place, slope in enumerate(slopes) if not isinstance(slope, SymbolicZero)]
+        moves = jax.tree.map(lambda slope: not isinstance(slope, SymbolicZero), tangents)
+        moving, fixed = eqx.partition(primals, moves)
 
-        def of_moving(*some: Array) -> Any:
-            every = [*values]
-            for place, value in zip(moving, some, strict=True):
-                every[place] = value
-            arrays, *others = jax.tree.unflatten(structure, every)
+        def of_moving(moving: Any) -> Any:
+            arrays, *others = eqx.combine(moving, fixed)
             return function(*eqx.combine(arrays, settings), *others)
 
-        return jax.jvp(of_moving, tuple(values[place] for place in moving), tuple(slopes[place] for place in moving))
+        return jax.jvp(of_moving, (moving,), (eqx.filter(tangents, moves),))
 
     @one.def_vmap
     def batch(lanes: int, is_batched: list, *arguments: Any) -> tuple[Any, Any]:

@@ -24,7 +24,6 @@ from .._custom_types import as_float
 from ..airframe import AXES, YAW
 from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate, robust_covariance
-from ..bracket import Bracket
 from ..errors import InputError, TrainingError
 from ..estimate import REACH, AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
@@ -34,6 +33,7 @@ from ..shooting import InnovationsProblem, ShootingProblem, padded
 from .answers import OS4Answer, VehicleAnswer, dominated, vehicle_constants
 from .data import Data, Progress, name_and_class, silent
 from .intervals import at_lowest, corrected
+from .prepare_os4 import Intervals, bracket_of
 from .results import COLOURED, Constant, SampleTime
 from .search import Optimum, search, search_all
 
@@ -55,7 +55,7 @@ NEAR_LIMIT = 0.95  # share of the way to its limit; an unknown beyond it starts 
 def os4_estimator(
     data: Data[ShootingProblem],
     estimator: str | AbstractEstimator,
-    bracket: Bracket,
+    bracket: Intervals,
     *,
     seed: int,
     progress: Progress,
@@ -65,7 +65,7 @@ def os4_estimator(
         return data, estimator
     progress("training a network for this flight")
     problem, name, shoots = data.problem, str(data.provenance.flight), ESTIMATORS[estimator].shoots
-    trained = network_for(problem, bracket, name, shoots=shoots, seed=seed)
+    trained = network_for(problem, bracket_of(bracket, problem.model), name, shoots=shoots, seed=seed)
     problem = problem if shoots else problem.within(trained.bracket)
     provenance = msgspec.structs.replace(data.provenance, network=network_provenance(None, trained))
     data = dataclasses.replace(data, likelihood=problem, problem=problem, provenance=provenance)

@@ -22,7 +22,7 @@ from ..networks import TrainedNetwork
 from .data import class_name, silent
 from .fit import DEFAULT, fit_os4, fit_vehicle, os4_estimator, vehicle_estimator
 from .judge import judge_os4, judge_vehicle
-from .prepare_os4 import Intervals, OS4Settings, bracket_of, prepare_os4
+from .prepare_os4 import Intervals, OS4Settings, prepare_os4
 from .prepare_vehicle import VehicleSettings, prepare_vehicle
 from .results import Identification, OS4Identification, VehicleIdentification
 
@@ -120,7 +120,7 @@ def identify(
         data, name, estimator = prepare_os4(
             recordings, subject, wanted, estimator=estimator, bracket=bracket, network=network, validate=other
         )
-        data, solver = os4_estimator(data, estimator, bracket_of(bracket, subject), seed=seed, progress=progress)
+        data, solver = os4_estimator(data, estimator, bracket, seed=seed, progress=progress)
         answer = fit_os4(solver, data.likelihood, progress=progress)
         found = judge_os4(data, answer, solver, name)
     return msgspec.structs.replace(found, seconds=time.perf_counter() - begin)
